@@ -1,0 +1,31 @@
+"""Errors a user can act on. Commands print them as one sentence and exit with code 2."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class PlaygroundError(ValueError):
+  """Base of every error whose cause is the user's input or machine, not a bug."""
+
+
+class ConfigError(PlaygroundError):
+  """A key, value or combination in the configuration that cannot work."""
+
+
+class UnknownNameError(ConfigError):
+  """A task, experiment, group option or key that does not exist."""
+
+
+class CheckpointError(PlaygroundError):
+  """A checkpoint or run directory that is missing, foreign or damaged."""
+
+
+class HardwareError(PlaygroundError):
+  """More, or other, hardware asked for than this machine has."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+  """Returns ' Did you mean X?' for the closest known name, or '' if none is close."""
+  lowered = {k.lower(): k for k in known}
+  match = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+  return f" Did you mean {lowered[match[0]]!r}?" if match else ""
