@@ -1,0 +1,140 @@
+"""What a task is: a pure `reset` and `step` for one environment, and the three calls a step is made of."""
+
+import abc
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import jax
+import mujoco
+from flax import struct
+from ml_collections import ConfigDict
+
+from playground.envs.physics import DERIVED_FIELDS, Physics, PhysicsData, mjx
+from playground.errors import ConfigError
+
+Observation = jax.Array | dict[str, jax.Array]
+
+
+@struct.dataclass
+class State:
+  """What a task carries from one control step to the next.
+
+  Attributes:
+    data: simulator state.
+    obs: observation, one vector or a dict of vectors ("state" for the actor, "privileged_state" for the critic).
+    reward: scalar reward of the step just taken.
+    done: scalar 0/1 float, the episode ended in this step.
+    metrics: scalars logged each step; the key set is the same at reset and step.
+    info: whatever else the task carries (random key, command, histories); the key set is fixed after reset.
+  """
+
+  data: PhysicsData
+  obs: Observation
+  reward: jax.Array
+  done: jax.Array
+  metrics: dict[str, jax.Array]
+  info: dict[str, Any]
+
+
+class Env(abc.ABC):
+  """A task. Everything is for one environment; callers vmap (`playground.envs.wrappers`).
+
+  A step is three calls: `control` turns the action into `ctrl`, the physics advances, `evaluate` turns the new physics
+  into observation, reward, termination and bookkeeping. `evaluate` never touches physics, so it can be run on recorded
+  data. A disturbance that acts on the physics (a push) goes into `disturb`, called before them.
+  """
+
+  derived: ClassVar[tuple[str, ...]] = DERIVED_FIELDS  # narrow it to what the task reads: what is not kept is not moved
+
+  def __init__(self, config: ConfigDict, mj_model: mujoco.MjModel):
+    """Sets the time step and puts the model on the device.
+
+    Args:
+      config: the task's config: `ctrl_dt` and `sim_dt` in seconds, `episode_length` in control steps, `action_repeat`,
+        `impl` (auto, jax, warp), `cuda_impl` (what auto means on an NVIDIA GPU), `naconmax`, `naccdmax`, `njmax` (Warp's
+        buffer sizes, see `Physics`) and `parity` (reproduce playground 0.2.0, quirks included).
+      mj_model: the compiled model.
+
+    Raises:
+      ConfigError: the control step is not a multiple of the physics step, or the backend is unknown.
+    """
+    self.config = config
+    self.parity: bool = config.parity
+    self.dt: float = config.ctrl_dt
+    self.sim_dt: float = config.sim_dt
+    self.n_substeps = round(self.dt / self.sim_dt)
+    if self.n_substeps < 1 or abs(self.n_substeps * self.sim_dt - self.dt) > 1e-6 * self.dt:
+      raise ConfigError(f"env.ctrl_dt={self.dt} must be a whole multiple of env.sim_dt={self.sim_dt}.")
+    self.episode_length: int = config.episode_length
+    self.action_repeat: int = config.action_repeat
+    mj_model.opt.timestep = self.sim_dt
+    self.mj_model = mj_model
+    self.impl = choose_impl(config.impl, config.cuda_impl)
+    self.physics = Physics(
+      mj_model,
+      impl=self.impl,
+      derived=self.derived,
+      naconmax=config.naconmax,
+      naccdmax=config.naccdmax,
+      njmax=config.njmax,
+    )
+
+  @abc.abstractmethod
+  def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
+    """Starts an episode from one random key, on `model` if given (a randomised one), else on the task's own."""
+
+  @abc.abstractmethod
+  def control(self, state: State, action: jax.Array) -> jax.Array:
+    """Returns the actuators' `ctrl` (shape [nu]) for an action (shape [action_size])."""
+
+  @abc.abstractmethod
+  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+    """Returns the state after a step, from the physics after it, the info before it and the action that was applied."""
+
+  def disturb(self, state: State) -> State:
+    """Acts on the physics from outside before the step (kicks, pushes); by default nothing."""
+    return state
+
+  def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
+    """Advances one control step of `dt` seconds."""
+    state = self.disturb(state)
+    ctrl = self.control(state, action)
+    data = self.physics.step(self.mjx_model if model is None else model, state.data, ctrl, self.n_substeps)
+    return self.evaluate(data, state.info, action)
+
+  @property
+  def mjx_model(self) -> mjx.Model:
+    """The model on the device, before any randomisation."""
+    return self.physics.model
+
+  @property
+  def action_size(self) -> int:
+    return self.mj_model.nu
+
+  @property
+  def observation_size(self) -> int | dict[str, tuple[int, ...]]:
+    """Length of the observation vector, or the shape of each entry of a dict observation."""
+    obs = jax.eval_shape(self.reset, jax.random.PRNGKey(0)).obs
+    return {k: v.shape for k, v in obs.items()} if isinstance(obs, Mapping) else obs.shape[-1]
+
+  @property
+  def unwrapped(self) -> "Env":
+    return self
+
+
+def choose_impl(impl: str, cuda_impl: str) -> str:
+  """Resolves `impl: auto` to the backend that was measured faster on this kind of device.
+
+  Raises:
+    ConfigError: unknown name, or Warp asked for where it is not installed.
+  """
+  if impl == "auto":
+    impl = cuda_impl if jax.default_backend() == "gpu" else "jax"
+  if impl not in ("jax", "warp"):
+    raise ConfigError(f"env.impl={impl!r} must be one of auto, jax, warp.")
+  if impl == "warp":
+    try:
+      import warp  # noqa: F401  # pyright: ignore[reportMissingImports]
+    except ImportError:
+      raise ConfigError("env.impl=warp needs MuJoCo-Warp: pip install 'mujoco-mjx[warp]', or set env.impl=jax.") from None
+  return impl

@@ -1,0 +1,127 @@
+"""Physics on MJX: advances the few fields that a task keeps between steps.
+
+`mjx.Data` carries 40-150 KB an environment, nearly all of it scratch that the next forward pass writes again. A
+`PhysicsData` holds only the simulator's state and the derived fields that the task reads; the rest is rebuilt from one
+template inside every step. So a state is small, complete (what is saved is what is needed to go on, bit for bit) and
+the same for both backends.
+"""
+
+import contextlib
+import io
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from flax import struct
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
+  from mujoco import mjx
+
+# What the next step depends on. Everything else in `mjx.Data` follows from these.
+STATE_FIELDS = (
+  "time", "qpos", "qvel", "act", "history", "ctrl", "qacc_warmstart", "qfrc_applied", "xfrc_applied", "eq_active",
+  "mocap_pos", "mocap_quat",
+)  # fmt: skip
+# What observations, rewards and terminations may read besides.
+DERIVED_FIELDS = (
+  "qacc", "sensordata", "actuator_force", "qfrc_actuator", "xpos", "xquat", "xmat", "xipos", "xanchor", "site_xpos",
+  "site_xmat", "geom_xpos", "geom_xmat", "subtree_com", "cvel", "ten_length",
+)  # fmt: skip
+
+
+@struct.dataclass
+class PhysicsData:
+  """One environment's simulator state, named as in `mujoco.MjData`; derived fields a task does not read are None.
+
+  After a step the derived fields belong to the state before the last integration, `qpos` and `qvel` to the one after
+  it (`mj_step` is forward, then integrate).
+  """
+
+  time: jax.Array
+  qpos: jax.Array
+  qvel: jax.Array
+  act: jax.Array
+  history: jax.Array
+  ctrl: jax.Array
+  qacc_warmstart: jax.Array
+  qfrc_applied: jax.Array
+  xfrc_applied: jax.Array
+  eq_active: jax.Array
+  mocap_pos: jax.Array
+  mocap_quat: jax.Array
+  qacc: Any = None
+  sensordata: Any = None
+  actuator_force: Any = None
+  qfrc_actuator: Any = None
+  xpos: Any = None
+  xquat: Any = None
+  xmat: Any = None
+  xipos: Any = None
+  xanchor: Any = None
+  site_xpos: Any = None
+  site_xmat: Any = None
+  geom_xpos: Any = None
+  geom_xmat: Any = None
+  subtree_com: Any = None
+  cvel: Any = None
+  ten_length: Any = None
+
+
+class Physics:
+  """A compiled model on one backend, with the two operations tasks need: `forward` and `step`."""
+
+  def __init__(
+    self,
+    mj_model: mujoco.MjModel,
+    *,
+    impl: str = "jax",
+    derived: tuple[str, ...] = DERIVED_FIELDS,
+    naconmax: int | None = None,
+    naccdmax: int | None = None,
+    njmax: int | None = None,
+  ):
+    """Puts the model on the device.
+
+    Args:
+      mj_model: the compiled model; its `opt.timestep` is the physics step in seconds.
+      impl: 'jax' or 'warp'.
+      derived: the names out of `DERIVED_FIELDS` that the task reads.
+      naconmax: Warp only, contacts to allocate over all environments together.
+      naccdmax: Warp only, contacts of the convex collision routines over all environments together.
+      njmax: Warp only, constraint rows to allocate for each environment.
+    """
+    self.mj_model = mj_model
+    self.impl = impl
+    self.derived = derived
+    self.model = mjx.put_model(mj_model, impl=impl)
+    self._sizes = {} if impl == "jax" else {"naconmax": naconmax, "naccdmax": naccdmax, "njmax": njmax}
+
+  def make(self, **fields: jax.Array) -> PhysicsData:
+    """Returns the model's default state with `fields` replaced; derived fields are those of fresh data."""
+    fields = {name: jnp.asarray(value) for name, value in fields.items()}
+    return self._keep(self._template().replace(**fields))
+
+  def forward(self, model: mjx.Model, data: PhysicsData) -> PhysicsData:
+    """Computes the derived fields of the present state, without advancing it."""
+    return self._keep(mjx.forward(model, self._full(data)))
+
+  def step(self, model: mjx.Model, data: PhysicsData, ctrl: jax.Array, num_substeps: int) -> PhysicsData:
+    """Advances by `num_substeps` physics steps under a constant `ctrl` (shape [nu])."""
+    data = data.replace(ctrl=ctrl)
+
+    def substep(data: PhysicsData, _: None) -> tuple[PhysicsData, None]:
+      return self._keep(mjx.step(model, self._full(data))), None
+
+    if num_substeps == 1:
+      return substep(data, None)[0]
+    return jax.lax.scan(substep, data, None, num_substeps)[0]
+
+  def _template(self) -> mjx.Data:
+    return mjx.make_data(self.mj_model, impl=self.impl, **self._sizes)
+
+  def _full(self, data: PhysicsData) -> mjx.Data:
+    return self._template().replace(**{name: getattr(data, name) for name in STATE_FIELDS})
+
+  def _keep(self, data: mjx.Data) -> PhysicsData:
+    return PhysicsData(**{name: getattr(data, name) for name in (*STATE_FIELDS, *self.derived)})

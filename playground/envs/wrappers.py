@@ -1,0 +1,252 @@
+"""From one task to a batch that trains for ever: vectorise, guard the numbers, limit episodes, reset.
+
+Each wrapper takes and returns batches of `State` (leading axis N). A randomised model travels as an argument: a dict
+from field name ("geom_friction", dotted for nested ones) to values with leading axis N, or None for the task's own.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+
+from playground.envs.base import Env, State
+from playground.envs.physics import STATE_FIELDS, mjx
+
+ModelFields = Mapping[str, jax.Array]
+# `info` keys that wrappers own; a fresh reset of a task never touches them.
+EPISODE_KEYS = ("steps", "truncation", "episode_done", "episode_metrics")
+PREFIX = "AutoResetWrapper_"
+PRESERVE_INFO = PREFIX + "preserve_info"  # what a task puts here survives a full reset (a curriculum's level, say)
+
+
+def where_done(done: jax.Array, new: Any, old: Any) -> Any:
+  """Selects the leaves of `new` where `done` (shape [N], 0/1 or bool), else those of `old`; leaves have leading N."""
+  mask = done.astype(bool)
+  return jax.tree.map(lambda n, o: jnp.where(mask.reshape(mask.shape + (1,) * (n.ndim - 1)), n, o), new, old)
+
+
+class Wrapper:
+  """Passes everything on to the environment it wraps."""
+
+  def __init__(self, env: Any):
+    self.env = env
+
+  def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
+    return self.env.reset(rng, model)
+
+  def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
+    return self.env.step(state, action, model)
+
+  def __getattr__(self, name: str) -> Any:
+    if name.startswith("__"):
+      raise AttributeError(name)
+    return getattr(self.env, name)
+
+
+class Vectorize(Wrapper):
+  """Runs N copies of a task: `reset(keys [N])`, `step(state, actions [N, action_size])`, each on its own model."""
+
+  def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
+    return jax.vmap(lambda key, fields: self.env.reset(key, self._model(fields)))(rng, dict(model or {}))
+
+  def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
+    step = lambda s, a, fields: self.env.step(s, a, self._model(fields))
+    return jax.vmap(step)(state, action, dict(model or {}))
+
+  def _model(self, fields: dict[str, jax.Array]) -> mjx.Model | None:
+    return self.env.mjx_model.tree_replace(fields) if fields else None
+
+
+class FiniteGuard(Wrapper):
+  """Ends an episode whose numbers went NaN or infinite, before they reach anything that learns.
+
+  Such a step gives done = 1, reward 0, the previous observation, metrics 0 and the previous info; `info["nonfinite"]`
+  is 1 for it. The simulator's state is left as it came, for `AutoReset` to replace.
+  """
+
+  def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
+    state = self.env.reset(rng, model)
+    return state.replace(info=state.info | {"nonfinite": jnp.zeros_like(state.done)})
+
+  def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
+    after = self.env.step(state, action, model)
+    watched = (after.data.qpos, after.data.qvel, after.reward, after.obs)
+    finite = jnp.ones_like(after.done, bool)
+    for leaf in jax.tree.leaves(watched):
+      if jnp.issubdtype(leaf.dtype, jnp.floating):
+        finite &= jnp.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim)))
+    bad = ~finite
+    zeros = jax.tree.map(jnp.zeros_like, (after.reward, after.metrics))
+    reward, metrics = where_done(bad, zeros, (after.reward, after.metrics))
+    obs, info = where_done(bad, (state.obs, state.info), (after.obs, after.info))
+    if "rng" in info:  # time goes on: the same draws again would lead to the same place
+      info = info | {"rng": after.info["rng"]}
+    return after.replace(
+      obs=obs,
+      reward=reward,
+      metrics=metrics,
+      done=jnp.where(bad, 1.0, after.done),
+      info=info | {"nonfinite": bad.astype(after.done.dtype)},
+    )
+
+
+class Episode(Wrapper):
+  """Ends episodes after `length` control steps, repeats each action and sums the rewards and metrics of an episode.
+
+  A time-out gives done = 1 with `info["truncation"]` = 1, kept apart from the task's own termination. With repeats an
+  episode that terminates in an earlier one stays done and earns nothing in the later ones.
+  """
+
+  def __init__(self, env: Any, length: int, action_repeat: int = 1):
+    super().__init__(env)
+    self.length = length
+    self.repeat = action_repeat
+
+  def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
+    state = self.env.reset(rng, model)
+    zero = jnp.zeros_like(state.reward)
+    sums = {"sum_reward": zero, "length": zero} | {name: zero for name in state.metrics}
+    info = {"steps": zero, "truncation": zero, "episode_done": zero, "episode_metrics": sums}
+    return state.replace(info=state.info | info)
+
+  def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
+    def repeat(carry: tuple[State, jax.Array, jax.Array], _: None) -> tuple[Any, None]:
+      state, reward, done = carry
+      state = self.env.step(state, action, model)
+      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done)), None
+
+    was_done = state.info["episode_done"]
+    if self.repeat == 1:
+      after = self.env.step(state, action, model)
+      reward, ended = after.reward, after.done
+    else:
+      start = (state, jnp.zeros_like(state.reward), jnp.zeros_like(state.done))
+      (after, reward, ended), _ = jax.lax.scan(repeat, start, None, self.repeat)
+
+    steps = state.info["steps"] + self.repeat
+    timed_out = steps >= self.length
+    done = jnp.where(timed_out, 1.0, ended)
+    sums = {k: jnp.where(was_done > 0, 0.0, v) for k, v in state.info["episode_metrics"].items()}
+    step_values = {"sum_reward": reward, "length": jnp.full_like(reward, self.repeat)} | after.metrics
+    info = after.info | {
+      "steps": steps,
+      "truncation": jnp.where(timed_out, 1 - ended, 0.0),
+      "episode_done": done,
+      "episode_metrics": {k: sums[k] + step_values[k] for k in sums},
+    }
+    return after.replace(reward=reward, done=done, info=info)
+
+
+class AutoReset(Wrapper):
+  """Starts the next episode in the step that ends one: done = 1 comes with the next episode's first observation.
+
+  By default an episode starts again from the environment's state of the last outer `reset`, of which only the
+  simulator's state and the observation are kept (not the derived fields, which the next step writes anyway), and the
+  task's `info` goes on. With `full_reset` it starts from a fresh `reset`, `info` included, except what the task put
+  under `info["AutoResetWrapper_preserve_info"]`.
+  """
+
+  def __init__(self, env: Any, full_reset: bool = False):
+    super().__init__(env)
+    self.full_reset = full_reset
+
+  def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
+    keys = jax.vmap(jax.random.split)(rng)
+    state = self.env.reset(keys[:, 0], model)
+    own = {PREFIX + "rng": keys[:, 1], PREFIX + "done_count": jnp.zeros(state.done.shape, jnp.int32)}
+    if not self.full_reset:
+      own[PREFIX + "first_data"] = _start_of(state)
+      own[PREFIX + "first_obs"] = state.obs
+    return state.replace(info=state.info | own)
+
+  def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
+    own = {k: v for k, v in state.info.items() if k.startswith(PREFIX) and k != PRESERVE_INFO}
+    info = {k: v for k, v in state.info.items() if k not in own}
+    info["steps"] = jnp.where(state.done > 0, 0.0, info["steps"])
+    after = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action, model)
+    own[PREFIX + "done_count"] += after.done.astype(jnp.int32)
+    if self.full_reset:
+      keys = jax.vmap(jax.random.split)(own[PREFIX + "rng"])
+      own[PREFIX + "rng"] = keys[:, 0]
+      # A reset costs a forward pass over the whole batch: skip it in the steps in which nobody is done.
+      after = jax.lax.cond(after.done.any(), self._restart, lambda s, *_: s, after, keys[:, 1], model)
+    else:
+      data = after.data.replace(**where_done(after.done, own[PREFIX + "first_data"], _start_of(after)))
+      after = after.replace(data=data, obs=where_done(after.done, own[PREFIX + "first_obs"], after.obs))
+    return after.replace(info=after.info | own)
+
+  def _restart(self, after: State, keys: jax.Array, model: ModelFields | None) -> State:
+    fresh = self.env.reset(keys, model)
+    kept = {k: after.info[k] for k in (*EPISODE_KEYS, "nonfinite", PRESERVE_INFO) if k in after.info}
+    data, obs, info = where_done(after.done, (fresh.data, fresh.obs, fresh.info), (after.data, after.obs, after.info))
+    return after.replace(data=data, obs=obs, info=info | kept)
+
+
+def _start_of(state: State) -> dict[str, jax.Array]:
+  return {name: getattr(state.data, name) for name in STATE_FIELDS}
+
+
+def wrap_for_training(env: Env, *, full_reset: bool = False) -> AutoReset:
+  """The stack that trainers step: a batch of guarded, limited, self-resetting episodes of one task."""
+  guarded = FiniteGuard(Vectorize(env))
+  return AutoReset(Episode(guarded, env.episode_length, env.action_repeat), full_reset)
+
+
+def wrap_for_evaluation(env: Env) -> Episode:
+  """As for training, but an episode that ends stays ended."""
+  return Episode(FiniteGuard(Vectorize(env)), env.episode_length, env.action_repeat)
+
+
+class _FixedModels(Wrapper):
+  """Binds a batch of randomised models to a vectorised environment, for trainers that pass none."""
+
+  def __init__(self, env: Any, fields: ModelFields | None):
+    super().__init__(env)
+    self._fields = fields
+
+  def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
+    return self.env.reset(rng, self._fields if model is None else model)
+
+  def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
+    return self.env.step(state, action, self._fields if model is None else model)
+
+
+def wrap_for_brax_training(
+  env: Env,
+  episode_length: int = 1000,
+  action_repeat: int = 1,
+  randomization_fn: Callable[[mjx.Model], tuple[mjx.Model, mjx.Model]] | None = None,
+  full_reset: bool = False,
+) -> Wrapper:
+  """Wraps a task for Brax's own trainers (`ppo.train(wrap_env_fn=wrap_for_brax_training)`).
+
+  Args:
+    env: a task.
+    episode_length: control steps after which an episode is truncated.
+    action_repeat: control steps for each action.
+    randomization_fn: from the device model to (model with a leading axis N on the randomised fields, tree of the same
+      structure with 0 at those fields and None elsewhere), as `registry.get_domain_randomizer` gives it with its keys
+      bound.
+    full_reset: see `AutoReset`.
+
+  Returns:
+    An environment with batched `reset(keys [N])` and `step(state, actions [N, action_size])`.
+  """
+  fields = None if randomization_fn is None else _batched_fields(*randomization_fn(env.mjx_model))
+  guarded = FiniteGuard(Vectorize(env))
+  return _FixedModels(AutoReset(Episode(guarded, episode_length, action_repeat), full_reset), fields)
+
+
+def _batched_fields(model: mjx.Model, in_axes: mjx.Model) -> dict[str, jax.Array]:
+  """The fields of `model` that `in_axes` marks with 0, by dotted name."""
+  axes, _ = jax.tree_util.tree_flatten_with_path(in_axes, is_leaf=lambda x: x is None)
+  paths = [path for path, axis in axes if axis == 0]
+  fields = {}
+  for path in paths:
+    names = [cast(jax.tree_util.GetAttrKey, key).name for key in path]
+    value: Any = model
+    for name in names:
+      value = getattr(value, name)
+    fields[".".join(names)] = value
+  return fields
