@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import jax
 import mujoco
 from flax import struct
-from ml_collections import ConfigDict
 
 from playground.envs.physics import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.errors import ConfigError
@@ -15,8 +14,7 @@ from playground.errors import ConfigError
 Observation = jax.Array | dict[str, jax.Array]
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
   """What a task carries from one control step to the next.
 
   Attributes:
@@ -46,13 +44,13 @@ class Env(abc.ABC):
 
   derived: ClassVar[tuple[str, ...]] = DERIVED_FIELDS  # narrow it to what the task reads: what is not kept is not moved
 
-  def __init__(self, config: ConfigDict, mj_model: mujoco.MjModel):
+  def __init__(self, config: Any, mj_model: mujoco.MjModel):
     """Sets the time step and puts the model on the device.
 
     Args:
-      config: the task's config: `ctrl_dt` and `sim_dt` in seconds, `episode_length` in control steps, `action_repeat`,
-        `impl` (auto, jax, warp), `cuda_impl` (what auto means on an NVIDIA GPU), `naconmax`, `naccdmax`, `njmax` (Warp's
-        buffer sizes, see `Physics`) and `parity` (reproduce playground 0.2.0, quirks included).
+      config: the task's ConfigDict: `ctrl_dt`, `sim_dt` in seconds, `episode_length` in control steps, `action_repeat`,
+        `impl` (auto, jax, warp), `cuda_impl` (what auto means on an NVIDIA GPU), `naconmax`, `naccdmax`, `njmax`
+        (Warp's buffer sizes, see `Physics`) and `parity` (reproduce playground 0.2.0, quirks included).
       mj_model: the compiled model.
 
     Raises:
@@ -136,5 +134,6 @@ def choose_impl(impl: str, cuda_impl: str) -> str:
     try:
       import warp  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
-      raise ConfigError("env.impl=warp needs MuJoCo-Warp: pip install 'mujoco-mjx[warp]', or set env.impl=jax.") from None
+      remedy = "pip install 'mujoco-mjx[warp]', or set env.impl=jax"
+      raise ConfigError(f"env.impl=warp needs MuJoCo-Warp, which is not installed: {remedy}.") from None
   return impl

@@ -30,8 +30,7 @@ DERIVED_FIELDS = (
 )  # fmt: skip
 
 
-@struct.dataclass
-class PhysicsData:
+class PhysicsData(struct.PyTreeNode):
   """One environment's simulator state, named as in `mujoco.MjData`; derived fields a task does not read are None.
 
   After a step the derived fields belong to the state before the last integration, `qpos` and `qvel` to the one after
@@ -95,7 +94,7 @@ class Physics:
     self.impl = impl
     self.derived = derived
     self.model = mjx.put_model(mj_model, impl=impl)
-    self._sizes = {} if impl == "jax" else {"naconmax": naconmax, "naccdmax": naccdmax, "njmax": njmax}
+    self._sizes: dict[str, Any] = {} if impl == "jax" else {"naconmax": naconmax, "naccdmax": naccdmax, "njmax": njmax}
 
   def make(self, **fields: jax.Array) -> PhysicsData:
     """Returns the model's default state with `fields` replaced; derived fields are those of fresh data."""

@@ -154,7 +154,7 @@ class AutoReset(Wrapper):
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
     keys = jax.vmap(jax.random.split)(rng)
     state = self.env.reset(keys[:, 0], model)
-    own = {PREFIX + "rng": keys[:, 1], PREFIX + "done_count": jnp.zeros(state.done.shape, jnp.int32)}
+    own: dict[str, Any] = {PREFIX + "rng": keys[:, 1], PREFIX + "done_count": jnp.zeros(state.done.shape, jnp.int32)}
     if not self.full_reset:
       own[PREFIX + "first_data"] = _start_of(state)
       own[PREFIX + "first_obs"] = state.obs
@@ -244,7 +244,7 @@ def _batched_fields(model: mjx.Model, in_axes: mjx.Model) -> dict[str, jax.Array
   paths = [path for path, axis in axes if axis == 0]
   fields = {}
   for path in paths:
-    names = [cast(jax.tree_util.GetAttrKey, key).name for key in path]
+    names = [cast(Any, key).name for key in path]
     value: Any = model
     for name in names:
       value = getattr(value, name)

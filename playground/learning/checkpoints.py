@@ -1,0 +1,165 @@
+"""Checkpoints: the whole training state, written atomically by Orbax and verified when read.
+
+A checkpoint has three items: `policy` (normaliser and networks: what evaluation, export and `init_from` need), `state`
+(the rest of what training goes on from) and `meta` (step, task, config, the name and shape of every array, a checksum).
+"""
+
+import hashlib
+import logging
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from playground.errors import CheckpointError
+
+FORMAT = "playground-run/1"
+Arrays = list[np.ndarray]
+
+
+class CheckpointStore:
+  """The `checkpoints/` folder of one run. Saving happens on a thread of its own; one save at a time."""
+
+  def __init__(self, folder: str | Path, keep: int = 3):
+    """Opens (and makes) the folder; the newest `keep` checkpoints are kept."""
+    logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every save at warning level
+    options = ocp.CheckpointManagerOptions(
+      max_to_keep=keep, step_format_fixed_length=12, enable_async_checkpointing=False, cleanup_tmp_directories=True
+    )
+    self._manager = ocp.CheckpointManager(Path(folder).absolute(), options=options)
+    self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+    self._pending: Future[None] | None = None
+
+  def save(self, step: int, policy: Any, state: Any, meta: Mapping[str, Any]) -> None:
+    """Starts saving. The trees' arrays must not be donated or deleted meanwhile; an earlier failure is raised here."""
+    self.wait()
+    self._pending = self._thread.submit(self._write, step, policy, state, dict(meta))
+
+  def wait(self) -> None:
+    """Returns when what was saved lies on disk; raises what went wrong with it."""
+    if self._pending is not None:
+      pending, self._pending = self._pending, None
+      pending.result()
+
+  def close(self) -> None:
+    self.wait()
+    self._thread.shutdown()
+    self._manager.close()
+
+  def _write(self, step: int, policy: Any, state: Any, meta: dict[str, Any]) -> None:
+    trees = {"policy": policy, "state": state}
+    arrays = {name: [np.asarray(x) for x in jax.device_get(jax.tree.leaves(tree))] for name, tree in trees.items()}
+    meta |= {
+      "format": FORMAT,
+      "step": step,
+      "leaves": {name: describe(tree) for name, tree in trees.items()},
+      "sha256": {name: checksum(values) for name, values in arrays.items()},
+    }
+    items = {name: ocp.args.StandardSave(_numbered(values)) for name, values in arrays.items()}  # pyright: ignore[reportCallIssue]
+    self._manager.save(step, args=ocp.args.Composite(**items, meta=ocp.args.JsonSave(meta)), force=True)  # pyright: ignore[reportCallIssue]
+
+
+class Checkpoint:
+  """One checkpoint on disk, checked to be whole and ours."""
+
+  def __init__(self, folder: str | Path):
+    """Reads what the checkpoint says of itself.
+
+    Raises:
+      CheckpointError: no checkpoint there, or not one of ours.
+    """
+    self.path = Path(folder).absolute()
+    if not self.path.is_dir():
+      raise CheckpointError(f"No checkpoint at {folder}: there is no such folder.")
+    try:
+      self.meta: dict[str, Any] = self._read("meta", ocp.args.JsonRestore())  # pyright: ignore[reportCallIssue]
+    except Exception as error:
+      raise CheckpointError(f"{folder} is not a checkpoint of playground-run, or its meta data is damaged.") from error
+    if not isinstance(self.meta, dict) or self.meta.get("format") != FORMAT:
+      raise CheckpointError(f"{folder} is not a checkpoint of playground-run ({FORMAT}).")
+
+  @property
+  def step(self) -> int:
+    return self.meta["step"]
+
+  def restore(self, item: str, template: Any) -> Any:
+    """Returns the tree of item 'policy' or 'state' as host arrays.
+
+    Args:
+      item: which one.
+      template: a tree with the expected structure, shapes and dtypes (`jax.eval_shape`'s result will do).
+
+    Raises:
+      CheckpointError: damaged, or made for other shapes (another task, network or number of environments).
+    """
+    expected, found = describe(template), self.meta["leaves"][item]
+    if expected != found:
+      raise CheckpointError(f"{self.path} does not fit this run: {_first_difference(expected, found)}.")
+    try:
+      numbered = self._read(item, ocp.args.StandardRestore())  # pyright: ignore[reportCallIssue]
+      leaves = [np.asarray(numbered[name]) for name in sorted(numbered)]
+      whole = checksum(leaves) == self.meta["sha256"][item]
+    except Exception as error:
+      raise CheckpointError(f"{self.path} is damaged: its {item!r} cannot be read.") from error
+    if not whole:
+      raise CheckpointError(f"{self.path} is damaged: the checksum of its {item!r} does not match.")
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+  def _read(self, item: str, args: Any) -> Any:
+    options = ocp.CheckpointManagerOptions(read_only=True, step_format_fixed_length=12)
+    manager = ocp.CheckpointManager(self.path.parent, options=options)
+    try:
+      return manager.restore(int(self.path.name), args=ocp.args.Composite(**{item: args}))[item]
+    finally:
+      manager.close()
+
+
+def find_checkpoints(path: str | Path) -> list[Path]:
+  """The checkpoints at `path`, newest first: those of a run directory, or the one that `path` itself is.
+
+  Raises:
+    CheckpointError: there is none.
+  """
+  path = Path(path).expanduser()
+  if not path.exists():
+    raise CheckpointError(f"{path} does not exist: give a run directory or one of its checkpoints.")
+  if path.name.isdigit() and path.parent.name == "checkpoints":
+    return [path]
+  folder = path if path.name == "checkpoints" else path / "checkpoints"
+  found = sorted((p for p in folder.glob("*") if p.name.isdigit() and p.is_dir()), key=lambda p: int(p.name))
+  if not found:
+    raise CheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
+  return found[::-1]
+
+
+def describe(tree: Any) -> list[list[Any]]:
+  """Name, shape and dtype of every leaf."""
+  flat, _ = jax.tree_util.tree_flatten_with_path(tree)
+  return [[jax.tree_util.keystr(path), list(np.shape(leaf)), str(np.dtype(leaf.dtype))] for path, leaf in flat]
+
+
+def checksum(leaves: Arrays) -> str:
+  """SHA-256 over the bytes of all arrays."""
+  digest = hashlib.sha256()
+  for leaf in leaves:
+    digest.update(np.ascontiguousarray(leaf).tobytes())
+  return digest.hexdigest()
+
+
+def _numbered(leaves: Arrays) -> dict[str, np.ndarray]:
+  return {f"{i:05d}": leaf for i, leaf in enumerate(leaves)}
+
+
+def _first_difference(expected: list[list[Any]], found: list[list[Any]]) -> str:
+  theirs = {name: (tuple(shape), dtype) for name, shape, dtype in found}
+  for name, shape, dtype in expected:
+    if name not in theirs:
+      return f"it has no {name}"
+    if theirs[name] != (tuple(shape), dtype):
+      return f"{name} is {theirs[name][1]}{list(theirs[name][0])} there and {dtype}{list(shape)} here"
+  extra = set(theirs) - {name for name, *_ in expected}
+  return f"it has {sorted(extra)[0]} besides" if extra else "the order of its arrays differs"

@@ -1,0 +1,238 @@
+"""The host's side of training, the same for every algorithm: when to train, evaluate, reset, save and stop.
+
+The device is never kept waiting: work is queued one mark of the schedule ahead, and results are fetched, logged and
+saved while it runs.
+"""
+
+import dataclasses
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from playground.envs.wrappers import ModelFields
+
+Metrics = dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Mark:
+  """A point of the schedule: what happens once `update` training steps are done."""
+
+  update: int
+  evaluate: bool = False
+  reset: bool = False
+
+
+def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_updates: int) -> list[Mark]:
+  """Divides a run of `num_updates` training steps into calls of at most `max_updates`.
+
+  Evaluations lie evenly, the first before training and the last at its end (a single one at the end). Resets of all
+  environments lie evenly too, `num_resets_per_eval` to each stretch between two evaluations, none at the very end.
+  """
+  stretches = max(num_evals - 1, 1)
+  evals = {round(i * num_updates / stretches) for i in range(stretches + 1)}
+  evals -= set() if num_evals > 1 else {0}
+  points = stretches * num_resets_per_eval
+  resets = {round(i * num_updates / points) for i in range(1, points)} - {0, num_updates} if points else set()
+  marks, at = [], 0
+  for stop in sorted(evals | resets | {num_updates}):
+    marks += [Mark(update) for update in range(at + max_updates, stop, max_updates)]
+    marks.append(Mark(stop, stop in evals and num_evals > 0, stop in resets))
+    at = stop
+  return marks
+
+
+class Learner(Protocol):
+  """What an algorithm offers the loop: jitted functions over its mesh."""
+
+  mesh: Mesh
+  steps_per_update: int
+  init: Any  # (key, model) -> state
+  train: Any  # (state, model, number of updates) -> (state, metrics); takes the state's buffers over
+  reset: Any  # (state, key, model) -> state; takes the state's buffers over
+
+  def policy(self, state: Any) -> Any:
+    """The part of the state that acting needs."""
+    ...
+
+
+class Hooks(Protocol):
+  """What a run does with what happens; called on the host while the device works on."""
+
+  def on_metrics(self, step: int, metrics: Metrics, state: Any) -> None:
+    """A row of the log. `state` is the newest state there is: it may be ahead of the row."""
+    ...
+
+  def on_save(self, update: int, step: int, state: Any) -> None:
+    """A state to keep, on the device; its buffers stay valid."""
+    ...
+
+  def should_stop(self) -> bool:
+    """Whether to save and leave at the next mark."""
+    ...
+
+
+@dataclasses.dataclass
+class Program:
+  """The compiled functions of one run, and how long they took to make (s)."""
+
+  init: Any
+  train: Any
+  reset: Any
+  evaluate: Any
+  copy: Any
+  trace_s: float
+  compile_s: float
+
+
+def compile_program(learner: Learner, evaluate: Any, model: ModelFields, eval_model: ModelFields) -> Program:
+  """Traces each function once and compiles them side by side, ahead of the first step."""
+  key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+  start, trace_s = time.perf_counter(), 0.0
+  with ThreadPoolExecutor() as pool:
+
+    def submit(function: Any, *args: Any) -> tuple[Any, Any]:
+      nonlocal trace_s
+      begin = time.perf_counter()
+      traced = function.trace(*args)
+      lowered = traced.lower()
+      trace_s += time.perf_counter() - begin
+      return pool.submit(lowered.compile), traced.out_info
+
+    init, state = submit(learner.init, key, model)
+    train, _ = submit(learner.train, state, model, jax.ShapeDtypeStruct((), jnp.int32))
+    evaluated, _ = submit(evaluate, learner.policy(state), key, eval_model)
+    reset, _ = submit(learner.reset, state, key, model)
+    compiled = [future.result() for future in (init, train, reset, evaluated)]
+  copy = jax.jit(lambda state: jax.tree.map(jnp.copy, state))
+  return Program(*compiled, copy=copy, trace_s=trace_s, compile_s=time.perf_counter() - start - trace_s)
+
+
+@dataclasses.dataclass
+class Pending:
+  """Work that is queued on the device for one mark, to be fetched later."""
+
+  mark: Mark
+  num_updates: int
+  trained: Any = None
+  evaluated: Any = None
+  snapshot: Any = None
+
+
+class Loop:
+  """One run: from a state at some mark of the schedule to its end."""
+
+  def __init__(
+    self,
+    learner: Learner,
+    program: Program,
+    marks: list[Mark],
+    seed: int,
+    hooks: Hooks,
+    model: ModelFields,
+    eval_model: ModelFields,
+    save_every_s: float = 300.0,
+  ):
+    """Args:
+      learner: the algorithm.
+      program: its compiled functions.
+      marks: the schedule.
+      seed: of the run; evaluations and resets draw from it and the mark they belong to, so they do not depend on
+        where the run was interrupted.
+      hooks: called with rows, states to keep and for whether to stop.
+      model: randomised model fields of the training environments.
+      eval_model: of the evaluation environments.
+      save_every_s: a state is kept at every evaluation, and at marks when this long has passed since the last.
+    """
+    self._learner = learner
+    self._program = program
+    self._marks = marks
+    self._hooks = hooks
+    self._model = model
+    self._eval_model = eval_model
+    self._save_every_s = save_every_s
+    self._replicated = NamedSharding(learner.mesh, P())
+    self._init_key, self._eval_key, self._reset_key = jax.random.split(jax.random.PRNGKey(seed), 3)
+    self.train_s = 0.0  # device time of training alone
+    self.trained_steps = 0
+    self.first_update_s: float | None = None
+
+  def init(self) -> Any:
+    """The state of a new run."""
+    return self._program.init(jax.device_put(self._init_key, self._replicated), self._model)
+
+  def run(self, state: Any, update: int | None = None) -> tuple[Any, bool]:
+    """Runs to the end of the schedule, or until the hooks say stop.
+
+    Args:
+      state: the state to go on from; its buffers are taken over.
+      update: the mark it was saved at, None for a new run.
+
+    Returns:
+      The last state, and whether the schedule was completed.
+    """
+    marks = [mark for mark in self._marks if update is None or mark.update > update]
+    at, pending = update or 0, None
+    self._clock = self._last_save = time.perf_counter()
+    for mark in marks:
+      state, queued = self._queue(state, mark, mark.update - at)
+      at = mark.update
+      if pending:
+        self._fetch(pending, state)
+      pending = queued
+      if self._hooks.should_stop() and mark is not marks[-1]:
+        pending.snapshot = state
+        self._fetch(pending, state)
+        return state, False
+    if pending:
+      self._fetch(pending, state)
+    return state, True
+
+  def _queue(self, state: Any, mark: Mark, num_updates: int) -> tuple[Any, Pending]:
+    queued = Pending(mark, num_updates)
+    if num_updates:
+      state, queued.trained = self._program.train(state, self._model, np.int32(num_updates))
+    if mark.evaluate:
+      policy = self._learner.policy(state)
+      queued.evaluated = self._program.evaluate(policy, self._key(self._eval_key, mark), self._eval_model)
+    if mark.reset:
+      state = self._program.reset(state, self._key(self._reset_key, mark), self._model)
+    due = mark.evaluate or time.perf_counter() - self._last_save > self._save_every_s
+    if due and mark.update:
+      # A copy, because the next training call takes the state's buffers over while this one is written to disk.
+      queued.snapshot = self._program.copy(state)
+      self._last_save = time.perf_counter()
+    return state, queued
+
+  def _fetch(self, done: Pending, newest: Any) -> None:
+    """Waits for queued work, then hands it to the hooks."""
+    row: Metrics = {}
+    step = done.mark.update * self._learner.steps_per_update
+    if done.trained is not None:
+      row |= {f"training/{k}": float(v) for k, v in jax.device_get(done.trained).items()}
+      seconds = self._lap()
+      steps = done.num_updates * self._learner.steps_per_update
+      row["time/steps_per_second"] = steps / seconds
+      self.train_s += seconds
+      self.trained_steps += steps
+      self.first_update_s = self.first_update_s or seconds / done.num_updates
+    if done.evaluated is not None:
+      row |= {f"eval/{k}": float(v) for k, v in jax.device_get(done.evaluated).items()}
+      row["time/eval_s"] = self._lap()
+    self._hooks.on_metrics(step, row, newest)
+    if done.snapshot is not None:
+      self._hooks.on_save(done.mark.update, step, done.snapshot)
+
+  def _lap(self) -> float:
+    now = time.perf_counter()
+    seconds, self._clock = now - self._clock, now
+    return seconds
+
+  def _key(self, key: jax.Array, mark: Mark) -> jax.Array:
+    return jax.device_put(jax.random.fold_in(key, mark.update), self._replicated)

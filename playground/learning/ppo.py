@@ -1,0 +1,285 @@
+"""Proximal Policy Optimisation (Schulman et al., 2017) on batched environments, over a mesh of devices.
+
+Names, meaning and defaults of the hyperparameters are Brax's (paper, Appendix E). One training step collects
+`batch_size * num_minibatches` trajectories of `unroll_length` steps and passes over them `num_updates_per_batch` times.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme import running_statistics
+from flax import struct
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+
+from playground.envs.base import Env, Observation, State
+from playground.envs.wrappers import ModelFields, wrap_for_training
+from playground.errors import ConfigError
+from playground.hardware.mesh import AXIS, jit_on_mesh
+from playground.learning.losses import Batch, ppo_loss
+from playground.learning.networks import ActorCritic, ActorCriticParams, NetworkConfig, Normalizer, normalize
+from playground.learning.rollout import NonfiniteCapture, repeat_unroll, unroll
+
+Metrics = dict[str, jax.Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+  """Hyperparameters of PPO."""
+
+  num_timesteps: int  # total budget in control steps (action repeats counted), met to within one batch
+  num_evals: int = 10  # evaluations, the one before training and the one at the end included
+  num_resets_per_eval: int = 0  # fresh starts of all environments between two evaluations
+  num_envs: int = 2048
+  num_eval_envs: int = 128
+  unroll_length: int = 10  # control steps (decisions) of one trajectory
+  batch_size: int = 32  # trajectories of one minibatch
+  num_minibatches: int = 16
+  num_updates_per_batch: int = 2  # passes over the collected trajectories
+  learning_rate: float = 1e-4  # Adam's
+  max_grad_norm: float | None = None  # gradients are scaled down to this global norm
+  discounting: float = 0.9
+  gae_lambda: float = 0.95
+  entropy_cost: float = 1e-4
+  clipping_epsilon: float = 0.3
+  clipping_epsilon_value: float | None = None  # clips the value loss too, if set
+  vf_loss_coefficient: float = 0.5
+  reward_scaling: float = 1.0
+  normalize_observations: bool = False
+  normalize_advantage: bool = True
+  bootstrap_on_timeout: bool = False  # a time-out pays the discounted value of its state instead of being masked out
+  deterministic_eval: bool = False
+  network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
+
+  @classmethod
+  def from_config(cls, config: Any) -> "PPOConfig":
+    """Builds it from the `agent` config (a mapping); `name` is not a hyperparameter."""
+    values = {k: v for k, v in dict(config).items() if k not in ("name", "network")}
+    return cls(**values, network=NetworkConfig(**dict(config["network"])))
+
+  def steps_per_update(self, action_repeat: int) -> int:
+    """Control steps of one training step, over all devices."""
+    return self.batch_size * self.num_minibatches * self.unroll_length * action_repeat
+
+  def check(self, num_devices: int) -> None:
+    """Raises ConfigError where the sizes do not divide."""
+    if (self.batch_size * self.num_minibatches) % self.num_envs:
+      raise ConfigError(
+        f"agent.batch_size * agent.num_minibatches = {self.batch_size * self.num_minibatches} must be a multiple of "
+        f"agent.num_envs={self.num_envs}, so that every environment gives the same number of trajectories."
+      )
+    for name in ("num_envs", "num_eval_envs", "batch_size"):
+      if getattr(self, name) % num_devices:
+        size = getattr(self, name)
+        raise ConfigError(f"agent.{name}={size} must be a multiple of the number of devices, {num_devices}.")
+
+
+class Policy(struct.PyTreeNode):
+  """What acting needs (the critic comes along for runs that start from it)."""
+
+  params: ActorCriticParams
+  normalizer: Normalizer
+
+
+class TrainState(struct.PyTreeNode):
+  """Everything training goes on from: a run restored from it ends with the same parameters, bit for bit.
+
+  `env_state` and `capture` are divided over the devices; the rest is the same on all of them.
+  """
+
+  params: ActorCriticParams
+  opt_state: optax.OptState
+  normalizer: Normalizer
+  key: jax.Array
+  env_state: State
+  capture: NonfiniteCapture
+
+
+TRAIN_STATE_SPEC = TrainState(params=P(), opt_state=P(), normalizer=P(), key=P(), env_state=P(AXIS), capture=P(AXIS))  # pyright: ignore[reportArgumentType]
+
+
+class PPO:
+  """The algorithm for one task: pure functions, jitted over the mesh by `compile` of the loop that runs them."""
+
+  def __init__(self, env: Env, config: PPOConfig, mesh: Mesh, model: ModelFields, network_precision: str | None = None):
+    """Args:
+      env: the task.
+      config: hyperparameters.
+      mesh: devices, one axis named "data".
+      model: randomised model fields, each [num_envs, ...]; empty for the task's own model.
+      network_precision: matrix-product precision of the networks.
+
+    Raises:
+      ConfigError: sizes that do not divide, or networks that do not fit the task.
+    """
+    config.check(mesh.size)
+    self.config = config
+    self.mesh = mesh
+    self.env = wrap_for_training(env)
+    self.networks = ActorCritic(env.observation_size, env.action_size, config.network, network_precision)
+    self.steps_per_update = config.steps_per_update(env.action_repeat)
+    clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm else optax.identity()
+    self.optimizer = optax.chain(clip, optax.adam(config.learning_rate))
+    self.loss = partial(
+      ppo_loss,
+      networks=self.networks,
+      clipping_epsilon=config.clipping_epsilon,
+      clipping_epsilon_value=config.clipping_epsilon_value,
+      entropy_cost=config.entropy_cost,
+      discounting=config.discounting,
+      gae_lambda=config.gae_lambda,
+      reward_scaling=config.reward_scaling,
+      normalize_advantage=config.normalize_advantage,
+      vf_loss_coefficient=config.vf_loss_coefficient,
+    )
+    self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS)), TRAIN_STATE_SPEC)
+    self.reset = jit_on_mesh(self._reset, mesh, (TRAIN_STATE_SPEC, P(), P(AXIS)), TRAIN_STATE_SPEC, donate_argnums=0)
+    self.train = jit_on_mesh(
+      self._train, mesh, (TRAIN_STATE_SPEC, P(AXIS), P()), (TRAIN_STATE_SPEC, P()), donate_argnums=0
+    )
+
+  def policy(self, state: TrainState) -> Policy:
+    """Normaliser and networks: what acting needs, and what a new run can start from."""
+    return Policy(state.params, state.normalizer)
+
+  def act(self, policy: Policy, obs: Observation, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
+    """Actions in [-1, 1], [..., action_size]; deterministic as `deterministic_eval` says if not given."""
+    normalizer = policy.normalizer if self.config.normalize_observations else None
+    deterministic = self.config.deterministic_eval if deterministic is None else deterministic
+    return self.networks.act(policy.params.policy, normalizer, obs, key, deterministic)
+
+  def _init(self, key: jax.Array, model: ModelFields) -> TrainState:
+    key, net_key, env_key = jax.random.split(key, 3)
+    params: Any = self.networks.init(net_key)
+    env_state = self._fresh(env_key, model)
+    return TrainState(
+      params=params,
+      opt_state=self.optimizer.init(params),
+      normalizer=self.networks.init_normalizer(),
+      key=key,
+      env_state=env_state,
+      capture=NonfiniteCapture.empty(env_state, self.env.action_size, model),
+    )
+
+  def _reset(self, state: TrainState, key: jax.Array, model: ModelFields) -> TrainState:
+    return state.replace(env_state=self._fresh(key, model))
+
+  def _fresh(self, key: jax.Array, model: ModelFields) -> State:
+    """Freshly reset environments: this device's share, with keys no other device has."""
+    key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
+    return self.env.reset(jax.random.split(key, self.config.num_envs // self.mesh.size), model)
+
+  def _train(self, state: TrainState, model: ModelFields, num_updates: jax.Array) -> tuple[TrainState, Metrics]:
+    """`num_updates` training steps; the number is an argument, so any number of them is one compiled program."""
+
+    def body(_: int, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
+      state, total = carry
+      state, metrics = self._training_step(state, model)
+      return state, jax.tree.map(jnp.add, total, metrics)
+
+    shapes = jax.eval_shape(self._training_step, state, model)[1]
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    state, total = jax.lax.fori_loop(0, num_updates, body, (state, zeros))
+    return state, self._report(total, num_updates)
+
+  def _training_step(self, state: TrainState, model: ModelFields) -> tuple[TrainState, Metrics]:
+    config = self.config
+    key, shared = jax.random.split(state.key)
+    rollout_key, update_key = jax.random.split(jax.random.fold_in(shared, jax.lax.axis_index(AXIS)))
+
+    # Collect: every environment gives the same number of trajectories.
+    normalizer: Normalizer | None = state.normalizer if config.normalize_observations else None
+    one = lambda env_state, capture, key: unroll(
+      self.env, env_state, capture, model, self.networks, state.params.policy, normalizer, key, config.unroll_length
+    )
+    keys = jax.random.split(rollout_key, config.batch_size * config.num_minibatches // config.num_envs)
+    env_state, capture, data, last_obs, episodes = repeat_unroll(one, state.env_state, state.capture, keys)
+
+    # Normalise once for all passes, with statistics that include this data.
+    if config.normalize_observations:
+      normalizer = running_statistics.update(state.normalizer, data.obs, pmap_axis_name=AXIS)
+    obs, last_obs = normalize(data.obs, normalizer), normalize(self.networks.select(last_obs), normalizer)
+
+    batch = Batch(obs, last_obs, data.raw_action, data.log_prob, data.reward, data.termination, data.truncation)
+    if config.bootstrap_on_timeout or config.clipping_epsilon_value is not None:
+      batch = self._with_values(batch, state.params, normalize(data.obs, state.normalizer))
+
+    # Learn: several passes, each over its own shuffle of the trajectories.
+    def one_pass(carry: tuple[Any, Any], key: jax.Array) -> tuple[Any, Metrics]:
+      shuffle_key, loss_key = jax.random.split(key)
+      local = batch.reward.shape[1]
+      columns = jax.random.permutation(shuffle_key, local).reshape(config.num_minibatches, -1)
+      keys = jax.random.split(loss_key, config.num_minibatches)
+      return jax.lax.scan(partial(self._sgd_step, batch), carry, (columns, keys))
+
+    start = (state.params, state.opt_state)
+    passes = jax.random.split(update_key, config.num_updates_per_batch)
+    (params, opt_state), losses = jax.lax.scan(one_pass, start, passes)
+
+    metrics = jax.tree.map(lambda x: jax.lax.pmean(x.mean(), AXIS), losses) | jax.lax.psum(episodes, AXIS)
+    metrics["policy_std"] = jax.lax.pmean(self._mean_std(params, obs), AXIS)
+    after = TrainState(
+      params=params,
+      opt_state=opt_state,
+      normalizer=state.normalizer if normalizer is None else normalizer,
+      key=key,
+      env_state=env_state,
+      capture=capture,
+    )
+    return after, metrics
+
+  def _sgd_step(self, batch: Batch, carry: tuple[Any, Any], x: tuple[jax.Array, jax.Array]) -> tuple[Any, Metrics]:
+    """One gradient step on the trajectories in `columns`."""
+    params, opt_state = carry
+    columns, key = x
+    rows = batch.replace(last_obs=None)
+    picked = jax.tree.map(lambda x: x[:, columns], rows).replace(
+      last_obs=jax.tree.map(lambda x: x[columns], batch.last_obs)
+    )
+    (_, parts), grads = jax.value_and_grad(self.loss, has_aux=True)(params, picked, key)
+    grads = jax.lax.pmean(grads, AXIS)
+    norm = optax.global_norm(grads)
+    updates, new_opt_state = self.optimizer.update(grads, opt_state, params)
+    new = (optax.apply_updates(params, updates), new_opt_state)
+    finite = jnp.isfinite(norm)  # a bad gradient is counted and left out
+    carry = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, (params, opt_state))
+    parts = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), parts)
+    return carry, parts | {"grad_norm": jnp.where(finite, norm, 0.0), "nonfinite_updates": 1.0 - finite}
+
+  def _with_values(self, batch: Batch, params: ActorCriticParams, obs: dict[str, jax.Array]) -> Batch:
+    """Adds the critic's values at acting time, and pays time-outs with them if they are to be bootstrapped."""
+    value = self.networks.value(params.value, obs)
+    if not self.config.bootstrap_on_timeout:
+      return batch.replace(value=value)
+    return batch.replace(
+      value=value,
+      # Values are of scaled rewards, rewards here are not scaled yet.
+      reward=batch.reward + self.config.discounting * batch.truncation * value / self.config.reward_scaling,
+      termination=jnp.maximum(batch.termination, batch.truncation),
+      truncation=jnp.zeros_like(batch.truncation),
+    )
+
+  def _mean_std(self, params: ActorCriticParams, obs: dict[str, jax.Array]) -> jax.Array:
+    """Mean standard deviation of the actor, before squashing, on the first step of the data."""
+    logits = self.networks.logits(params.policy, jax.tree.map(lambda x: x[0], obs))
+    return self.networks.distribution.create_dist(logits).scale.mean()
+
+  def _report(self, total: Metrics, num_updates: jax.Array) -> Metrics:
+    """Means over training steps and, for what ended, over episodes; counts stay counts."""
+    episodes = jnp.maximum(total["episodes"], 1)
+    report = {}
+    for name, value in total.items():
+      if name.startswith("episode_"):
+        short = {"episode_sum_reward": "episode_reward"}.get(name, name)
+        report[short] = jnp.where(total["episodes"] > 0, value / episodes, jnp.nan)
+      elif name in ("episodes", "nonfinite"):
+        report[name] = value
+      elif name == "nonfinite_updates":
+        report[name] = value * (self.config.num_updates_per_batch * self.config.num_minibatches)
+      else:
+        report[name] = value / num_updates
+    return report

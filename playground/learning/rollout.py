@@ -1,0 +1,125 @@
+"""Collecting experience: an actor steps a batch of environments for a fixed number of control steps."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from playground.envs.base import State
+from playground.envs.wrappers import ModelFields, Wrapper
+from playground.learning.networks import ActorCritic, Normalizer, normalize
+
+
+class Transitions(struct.PyTreeNode):
+  """Steps of N environments, each array [T, N, ...]; see `losses.Batch` for the fields. Observations are raw."""
+
+  obs: dict[str, jax.Array]
+  raw_action: jax.Array
+  log_prob: jax.Array
+  reward: jax.Array
+  termination: jax.Array
+  truncation: jax.Array
+
+
+class NonfiniteCapture(struct.PyTreeNode):
+  """The first step of a run in which some environment's numbers went NaN or infinite, for replay.
+
+  Attributes:
+    found: whether there is one, [1] bool (one a device).
+    state: the last good state of that environment, every leaf [1, ...].
+    action: the action that broke it, [1, action_size].
+    model: its randomised model fields, each [1, ...].
+  """
+
+  found: jax.Array
+  state: State
+  action: jax.Array
+  model: dict[str, jax.Array]
+
+  @classmethod
+  def empty(cls, state: State, action_size: int, model: ModelFields) -> "NonfiniteCapture":
+    first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
+    return cls(jnp.zeros(1, bool), first(state), jnp.zeros((1, action_size)), first(dict(model)))
+
+  def look(self, before: State, action: jax.Array, model: ModelFields, bad: jax.Array) -> "NonfiniteCapture":
+    """Keeps the step of the first bad environment (`bad` [N], 0/1), if none was kept before."""
+    which = jnp.argmax(bad)
+    take = (bad[which] > 0) & ~self.found[0]
+    pick = lambda new, old: jnp.where(take, jax.lax.dynamic_slice_in_dim(new, which, 1), old)
+    return NonfiniteCapture(
+      found=self.found | take,
+      state=jax.tree.map(pick, before, self.state),
+      action=pick(action, self.action),
+      model=jax.tree.map(pick, dict(model), self.model),
+    )
+
+
+EpisodeSums = dict[str, jax.Array]
+
+
+def episode_sums(state: State) -> EpisodeSums:
+  """Sums over the batch of what ended in this step: episodes, their returns, lengths and metrics, and bad numbers."""
+  ended = state.info["episode_done"]
+  sums = {f"episode_{name}": (ended * total).sum() for name, total in state.info["episode_metrics"].items()}
+  return sums | {"episodes": ended.sum(), "nonfinite": state.info["nonfinite"].sum()}
+
+
+def unroll(
+  env: Wrapper,
+  state: State,
+  capture: NonfiniteCapture,
+  model: ModelFields,
+  networks: ActorCritic,
+  policy_params: Any,
+  normalizer: Normalizer | None,
+  key: jax.Array,
+  length: int,
+) -> tuple[State, NonfiniteCapture, Transitions, EpisodeSums]:
+  """Steps the environments `length` times with sampled actions.
+
+  Returns:
+    The last state, the capture, the transitions and the sums over all steps of what ended.
+  """
+
+  def step(carry: tuple[State, NonfiniteCapture], key: jax.Array) -> tuple[Any, tuple[Transitions, EpisodeSums]]:
+    state, capture = carry
+    obs = networks.select(state.obs)
+    logits = networks.logits(policy_params, normalize(obs, normalizer))
+    raw_action = networks.distribution.sample_no_postprocessing(logits, key)
+    action = networks.distribution.postprocess(raw_action)
+    after = env.step(state, action, model)
+    truncation = after.info["truncation"]
+    transitions = Transitions(
+      obs=obs,
+      raw_action=raw_action,
+      log_prob=networks.distribution.log_prob(logits, raw_action),
+      reward=after.reward,
+      termination=after.done * (1 - truncation),
+      truncation=truncation,
+    )
+    capture = capture.look(state, action, model, after.info["nonfinite"])
+    return (after, capture), (transitions, episode_sums(after))
+
+  (state, capture), (transitions, sums) = jax.lax.scan(step, (state, capture), jax.random.split(key, length))
+  return state, capture, transitions, jax.tree.map(lambda x: x.sum(axis=0), sums)
+
+
+def repeat_unroll(one: Callable[..., Any], state: State, capture: NonfiniteCapture, keys: jax.Array) -> Any:
+  """Runs `one(state, capture, key)`, an `unroll`, once for each key and lays the trajectories side by side.
+
+  Returns:
+    The last state, the capture, transitions [T, len(keys) * N, ...] with the observations after each trajectory's last
+    step [len(keys) * N, ...], and the sums.
+  """
+
+  def body(carry: tuple[State, NonfiniteCapture], key: jax.Array) -> Any:
+    state, capture, transitions, sums = one(*carry, key)
+    return (state, capture), (transitions, state.obs, sums)
+
+  (state, capture), (transitions, last_obs, sums) = jax.lax.scan(body, (state, capture), keys)
+  side_by_side = lambda x: x.swapaxes(0, 1).reshape(x.shape[1], -1, *x.shape[3:])
+  flat = lambda x: x.reshape(-1, *x.shape[2:])
+  sums = jax.tree.map(lambda x: x.sum(axis=0), sums)
+  return state, capture, jax.tree.map(side_by_side, transitions), jax.tree.map(flat, last_obs), sums
