@@ -1,0 +1,306 @@
+"""Domain randomisation: declarative terms, drawn once per environment, become model fields with a batch axis.
+
+A term says which entries of a model field change, how, and what is drawn:
+
+```yaml
+terms:
+  - {field: body_mass, target: all, operation: scale, range: [0.9, 1.1]}
+  - {field: body_mass, target: trunk, operation: add, distribution: normal, mean: 0.0, std: 0.5}
+```
+
+Terms apply in order, each to the result of those before. Derived quantities (`body_subtreemass`, `dof_invweight0`,
+`body_invweight0`, `dof_M0`) keep their nominal values, as in Playground 0.2.0.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from playground.errors import ConfigError, UnknownNameError, nearest
+
+# Whose rows a field has, by the prefix of its name: object type and number of objects.
+_OBJECTS = {
+  "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
+  "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
+  "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
+  "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
+  "tendon": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
+  "pair": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
+  "jnt": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+  "dof": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+  "qpos": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+}
+# A servo pulls with gain * ctrl + bias * q: the position gain stands in two fields, with opposite signs.
+_LINKED = {"actuator_kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0))}
+
+_OPERATIONS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+  "set": lambda nominal, draw: jnp.broadcast_to(draw, nominal.shape),
+  "scale": lambda nominal, draw: nominal * draw,
+  "add": lambda nominal, draw: nominal + draw,
+}
+_DISTRIBUTIONS: dict[str, Callable[[jax.Array, tuple[int, ...], float, float], jax.Array]] = {
+  "uniform": lambda key, shape, lo, hi: jax.random.uniform(key, shape, minval=lo, maxval=hi),
+  "log_uniform": lambda key, shape, lo, hi: jnp.exp(
+    jax.random.uniform(key, shape, minval=math.log(lo), maxval=math.log(hi))
+  ),
+  "normal": lambda key, shape, mean, std: mean + std * jax.random.normal(key, shape),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+  """One randomisation term, as written in `configs/randomization/*.yaml`.
+
+  Attributes:
+    field: a float field of `mjx.Model` with a row per geom, body, site, actuator, tendon, pair, joint, dof or qpos
+      entry, or `actuator_kp`, which moves a position servo's gain and bias together.
+    target: whose rows: a name, a list of names, `all`, or `joints` (every joint but the free ones).
+    operation: `set`, `scale` or `add`.
+    range: (low, high) of `uniform` and `log_uniform`.
+    mean: of `normal`.
+    std: of `normal`.
+    distribution: `uniform`, `log_uniform` or `normal`.
+    column: column, or columns, of a two-dimensional field; None is all.
+    shared: one draw for all entries, instead of one for each.
+  """
+
+  field: str
+  target: str | Sequence[str]
+  operation: str
+  range: Sequence[float] | None = None
+  mean: float | None = None
+  std: float | None = None
+  distribution: str = "uniform"
+  column: int | Sequence[int] | None = None
+  shared: bool = False
+
+  @property
+  def parameters(self) -> tuple[float, float]:
+    """The distribution's two parameters: (low, high) or (mean, std)."""
+    first, second = (self.mean, self.std) if self.distribution == "normal" else (self.range or (None, None))
+    return first, second  # pyright: ignore[reportReturnType]  # parse has seen that they are numbers
+
+  @classmethod
+  def parse(cls, term: Mapping[str, Any], key: str) -> "Term":
+    """Checks a term that `key`, e.g. `randomization.terms[0]`, holds; raises ConfigError."""
+    term = dict(term)
+    known = [field.name for field in dataclasses.fields(cls)]
+    for name in term:
+      _choose(f"{key} key", name, known)
+    for name in ("field", "target", "operation"):
+      if name not in term:
+        raise ConfigError(f"{key} lacks the key {name!r}.")
+    parsed = cls(**term)
+    _choose(f"{key}.operation", parsed.operation, _OPERATIONS)
+    _choose(f"{key}.distribution", parsed.distribution, _DISTRIBUTIONS)
+    needed = ("mean", "std") if parsed.distribution == "normal" else ("range",)
+    for name in ("range", "mean", "std"):
+      if (name in needed) != (getattr(parsed, name) is not None):
+        verb = "needs" if name in needed else "has no"
+        raise ConfigError(f"{key}: distribution {parsed.distribution!r} {verb} key {name!r}.")
+    if not isinstance(parsed.target, str) and not _is_list_of(parsed.target, str):
+      raise ConfigError(f"{key}.target={parsed.target!r} is neither a name nor a list of names.")
+    if parsed.range is not None and not (_is_list_of(parsed.range, int | float) and len(parsed.range) == 2):
+      raise ConfigError(f"{key}.range={parsed.range!r} is not a pair [low, high].")
+    values = parsed.parameters
+    if not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values):
+      raise ConfigError(f"{key}.{needed[0]}: {values} are not two finite numbers.")
+    if parsed.distribution == "normal" and values[1] < 0:
+      raise ConfigError(f"{key}.std={values[1]} is negative.")
+    if parsed.distribution != "normal" and values[0] > values[1]:
+      raise ConfigError(f"{key}.range={list(values)} has its low end above its high end.")
+    if parsed.distribution == "log_uniform" and values[0] <= 0:
+      raise ConfigError(f"{key}.range={list(values)} must be above 0 for log_uniform.")
+    return parsed
+
+
+class _Slot(NamedTuple):
+  """Entries of a field that a term changes: `field[index]`, times `sign`."""
+
+  field: str
+  index: tuple[np.ndarray, ...]
+  sign: float
+
+
+class _Draw(NamedTuple):
+  """A term on a model: `shape` is what is drawn for, `slots` where it goes."""
+
+  term: Term
+  slots: tuple[_Slot, ...]
+  shape: tuple[int, ...]
+
+  @property
+  def count(self) -> int:
+    return 1 if self.term.shared else math.prod(self.shape)
+
+  def __call__(self, key: jax.Array) -> jax.Array:
+    # One flat draw, a scalar if single: the order and shapes of Playground 0.2.0, so that the numbers are the same.
+    scalar = self.count == 1
+    draw = _DISTRIBUTIONS[self.term.distribution](key, () if scalar else (self.count,), *self.term.parameters)
+    return draw if scalar else draw.reshape(self.shape)
+
+
+class Randomizer:
+  """Draws model fields for environments.
+
+  Attributes:
+    fields: names of the `mjx.Model` fields that any term touches, in order of first use.
+  """
+
+  def __init__(self, mj_model: mujoco.MjModel, terms: Iterable[Mapping[str, Any]]):
+    """Binds terms to a model, whose values of now are the nominal ones.
+
+    Raises:
+      ConfigError: a term that cannot work, with its place in the list.
+      UnknownNameError: a key, field, target, operation or distribution that does not exist.
+    """
+    self._draws = [_bind(mj_model, Term.parse(t, key), key) for key, t in _keyed(terms)]
+    self.fields: tuple[str, ...] = tuple(dict.fromkeys(slot.field for draw in self._draws for slot in draw.slots))
+    self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
+
+  def sample(self, key: jax.Array) -> dict[str, jax.Array]:
+    """Draws one environment's fields, each whole and in its model shape. Pure: jit and vmap freely."""
+    values = {field: jnp.asarray(nominal) for field, nominal in self._nominal.items()}
+    for draw in self._draws:
+      key, draw_key = jax.random.split(key)
+      drawn, operation = draw(draw_key), _OPERATIONS[draw.term.operation]
+      for field, index, sign in draw.slots:
+        new = sign * operation(sign * values[field][index], drawn)
+        values[field] = values[field].at[index].set(new)
+    return values
+
+  def sample_batch(self, keys: jax.Array) -> dict[str, jax.Array]:
+    """Draws N environments' fields from keys [N]: each field gets a leading axis N."""
+    return jax.vmap(self.sample)(keys)
+
+  def describe(self) -> list[dict[str, str]]:
+    """One row per term for people: field, target, operation, draw (distribution and parameters), and values drawn."""
+    rows = []
+    for draw in self._draws:
+      term = draw.term
+      first, second = term.parameters
+      rows.append(
+        {
+          "field": term.field if term.column is None else f"{term.field}[:, {term.column}]",
+          "target": term.target if isinstance(term.target, str) else ", ".join(term.target),
+          "operation": term.operation,
+          "draw": f"{term.distribution}({first:g}, {second:g})",
+          "values": str(draw.count),
+        }
+      )
+    return rows
+
+
+def domain_randomizer(
+  mj_model: mujoco.MjModel, terms: Iterable[Mapping[str, Any]]
+) -> Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]:
+  """Returns Playground 0.2.0's kind of randomizer, for Brax's wrappers.
+
+  The callable maps `(mjx_model, rng[N])` to `(model, in_axes)`: the model with a leading axis N on every randomised
+  field, and the same structure with 0 at those fields and None elsewhere, for `jax.vmap`.
+  """
+  randomizer = Randomizer(mj_model, terms)
+
+  def randomize(mjx_model: mjx.Model, rng: jax.Array) -> tuple[mjx.Model, mjx.Model]:
+    in_axes: Any = jax.tree.map(lambda _: None, mjx_model)
+    fields: Any = randomizer.sample_batch(rng)
+    model: Any = mjx_model.tree_replace(fields)
+    return model, in_axes.tree_replace(dict.fromkeys(randomizer.fields, 0))
+
+  return randomize
+
+
+def _keyed(terms: Iterable[Mapping[str, Any]]) -> Iterable[tuple[str, Mapping[str, Any]]]:
+  for i, term in enumerate(terms):
+    key = f"randomization.terms[{i}]"
+    if not hasattr(term, "keys"):
+      raise ConfigError(f"{key}={term!r} is not a mapping such as {{field: body_mass, target: all, ...}}.")
+    yield key, term
+
+
+def _choose(key: str, name: Any, known: Iterable[str]) -> None:
+  known = list(known)
+  if name not in known:
+    raise UnknownNameError(f"{key} {name!r} is unknown: choose from {', '.join(known)}.{nearest(str(name), known)}")
+
+
+def _is_list_of(value: Any, kind: Any) -> bool:
+  return isinstance(value, list | tuple) and bool(value) and all(isinstance(v, kind) for v in value)
+
+
+def _bind(mj_model: mujoco.MjModel, term: Term, key: str) -> _Draw:
+  """Finds the entries of the model that a term means."""
+  fields = [*_randomizable(mj_model), *_LINKED]
+  if term.field not in fields:
+    raise UnknownNameError(
+      f"{key}.field {term.field!r} is no field of the model that can be randomised.{nearest(str(term.field), fields)}"
+    )
+  rows = _rows(mj_model, term, key)
+  if term.field in _LINKED:
+    if term.column is not None:
+      raise ConfigError(f"{key}.column={term.column!r}: field {term.field!r} has no columns, leave the key out.")
+    slots = [_Slot(field, np.ix_(rows, np.array([column])), sign) for field, column, sign in _LINKED[term.field]]
+    return _Draw(term, tuple(slots), (len(rows), 1))
+  shape = getattr(mj_model, term.field).shape
+  width = shape[1] if len(shape) == 2 else 0
+  if term.column is None:
+    columns = list(range(width))
+  else:
+    columns = [term.column] if isinstance(term.column, int) else term.column
+    if not _is_list_of(columns, int) or not all(0 <= c < width for c in columns):
+      allowed = f"columns 0 to {width - 1}" if width else "no columns, leave the key out"
+      raise ConfigError(f"{key}.column={term.column!r}: field {term.field!r} has {allowed}.")
+  index = np.ix_(rows, np.array(columns)) if width else (rows,)
+  return _Draw(term, (_Slot(term.field, index, 1.0),), (len(rows), len(columns)) if width else (len(rows),))
+
+
+def _randomizable(mj_model: mujoco.MjModel) -> list[str]:
+  """Float fields that are arrays (not constants) of an `mjx.Model`, with a row per object."""
+  fields = dataclasses.fields(mjx.Model)  # pyright: ignore[reportArgumentType]  # MJX's own dataclass decorator
+  names = [field.name for field in fields if field.type in (jax.Array, "jax.Array")]
+  arrays = {name: getattr(mj_model, name, None) for name in names if _prefix(name) in _OBJECTS}
+  return [n for n, a in arrays.items() if isinstance(a, np.ndarray) and a.dtype.kind == "f" and a.ndim in (1, 2)]
+
+
+def _prefix(field: str) -> str:
+  return field.split("_")[0].removesuffix("0")
+
+
+def _rows(mj_model: mujoco.MjModel, term: Term, key: str) -> np.ndarray:
+  """Rows of a term's field that belong to its target."""
+  prefix = _prefix(term.field)
+  kind, counter = _OBJECTS[prefix]
+  count = getattr(mj_model, counter)
+  starts = np.arange(count)
+  end = count
+  if prefix in ("dof", "qpos"):  # a joint has as many rows as it has degrees of freedom, or coordinates
+    starts = getattr(mj_model, f"jnt_{prefix}adr")
+    end = mj_model.nv if prefix == "dof" else mj_model.nq
+  spans = [range(a, b) for a, b in pairwise([*starts.tolist(), end])]
+  if term.target == "all":
+    chosen = spans
+  elif term.target == "joints":
+    if kind != mujoco.mjtObj.mjOBJ_JOINT:
+      raise ConfigError(f"{key}.target='joints' needs a field of joints (jnt_*, dof_*, qpos*), not {term.field!r}.")
+    chosen = [s for s, t in zip(spans, mj_model.jnt_type, strict=True) if t != mujoco.mjtJoint.mjJNT_FREE]
+  else:
+    ids = {mujoco.mj_id2name(mj_model, kind, i): i for i in range(count)}
+    ids.pop(None, None)
+    targets = [term.target] if isinstance(term.target, str) else list(dict.fromkeys(term.target))
+    for name in targets:
+      if name not in ids:
+        what = kind.name.removeprefix("mjOBJ_").lower()
+        raise UnknownNameError(f"{key}.target {name!r} is no {what} of the model.{nearest(str(name), ids)}")
+    chosen = [spans[ids[name]] for name in targets]
+  rows = np.array([row for span in chosen for row in span], dtype=np.int32)
+  if not rows.size:
+    raise ConfigError(f"{key}.target={term.target!r} names nothing that field {term.field!r} has.")
+  return rows

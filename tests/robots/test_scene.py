@@ -1,0 +1,90 @@
+"""Scenes: terrain, collision variants, contact sensors and their errors."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from playground.errors import UnknownNameError
+from playground.robots.scene import COLLISIONS, build_scene
+
+LEG_GEOMS = ("hip", "thigh1", "thigh2", "thigh3", "calf1", "calf2")
+
+
+def masks(model: mujoco.MjModel) -> dict[str, tuple[int, int, int]]:
+  """contype, conaffinity and condim of every geom that can collide."""
+  geoms = [model.geom(i) for i in range(model.ngeom)]
+  values = {g.name: (int(g.contype[0]), int(g.conaffinity[0]), int(g.condim[0])) for g in geoms}
+  return {name: value for name, value in values.items() if value[0] or value[1]}
+
+
+def test_floor_is_geom_zero_and_decides_friction() -> None:
+  model = build_scene("go1").compile()
+  floor = model.geom(0)
+  assert floor.name == "floor"
+  assert floor.type[0] == mujoco.mjtGeom.mjGEOM_PLANE
+  assert (floor.priority[0], floor.condim[0], floor.contype[0], floor.conaffinity[0]) == (1, 3, 1, 0)
+  np.testing.assert_allclose(floor.friction, [0.6, 0.005, 0.0001])
+
+
+def test_light_follows_the_robot() -> None:
+  model = build_scene("go1").compile()
+  assert model.light_targetbodyid[0] == model.body("trunk").id
+
+
+@pytest.mark.parametrize(("collision", "contype"), [("full_floor", 0), ("full_self", 1)])
+def test_full_collision(collision: str, contype: int) -> None:
+  """Figures: go1_standard_flat (full_floor), go1_full_flat (full_self)."""
+  model = build_scene("go1", collision=collision).compile()
+  legs = {f"{leg}_{part}" for leg in ("fr", "fl", "rr", "rl") for part in LEG_GEOMS}
+  expected = dict.fromkeys(legs | {"trunk_left", "trunk_right"}, (contype, 1, 1))
+  assert masks(model) == expected | dict.fromkeys(("FR", "FL", "RR", "RL"), (contype, 1, 3)) | {"floor": (1, 0, 3)}
+  assert bool(model.nnumeric) == (collision == "full_self")
+
+
+@pytest.mark.parametrize("collision", ["full_floor", "full_self"])
+def test_a_fallen_robot_rests_on_its_body(collision: str) -> None:
+  """Without feet near the floor, the trunk carries it; with feet alone it would sink."""
+  heights = {}
+  for variant in ("feet", collision):
+    model = build_scene("go1", collision=variant).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+    data.qpos[2], data.qpos[3:7] = 0.3, [0, 1, 0, 0]  # on its back
+    mujoco.mj_step(model, data, 500)
+    heights[variant] = data.qpos[2]
+  assert heights["feet"] < 0 < 0.03 < heights[collision] < 0.3
+
+
+def test_collision_variants_leave_the_dynamics_alone() -> None:
+  models = [build_scene("go1", collision=name).compile() for name in COLLISIONS]
+  for model in models[1:]:
+    np.testing.assert_array_equal(model.body_mass, models[0].body_mass)
+    np.testing.assert_array_equal(model.body_inertia, models[0].body_inertia)
+
+
+def test_floor_contact_sensors_come_last_in_order() -> None:
+  model = build_scene("go1", floor_contacts=["RL", "FR"]).compile()
+  assert [model.sensor(i).name for i in range(model.nsensor)][-2:] == ["RL_floor_found", "FR_floor_found"]
+  data = mujoco.MjData(model)
+  mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+  mujoco.mj_forward(model, data)
+  assert (data.sensordata[-2:] > 0).all()
+  data.qpos[2] = 1.0
+  mujoco.mj_forward(model, data)
+  assert not data.sensordata[-2:].any()
+
+
+@pytest.mark.parametrize(
+  ("robot", "options", "message"),
+  [
+    ("go2", {}, "robot='go2' is unknown: choose from "),
+    ("go1", {"terrain": "flatt"}, "Did you mean 'flat'?"),
+    ("go1", {"collision": "full_selv"}, "Did you mean 'full_self'?"),
+    ("go1", {"floor_contacts": ["FX"]}, "floor_contacts='FX' is unknown"),
+  ],
+)
+def test_unknown_names(robot: str, options: dict, message: str) -> None:
+  with pytest.raises(UnknownNameError) as error:
+    build_scene(robot, **options)
+  assert message in str(error.value)
+  assert "\n" not in str(error.value)

@@ -1,0 +1,257 @@
+"""Domain randomisation terms: what they draw, where it goes, and what they refuse."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import ml_collections
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mujoco import mjx
+
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError
+from playground.randomization import Randomizer, domain_randomizer
+from playground.robots.scene import build_scene
+
+CONFIGS = Path(__file__).parents[1] / "configs/randomization"
+GO1 = yaml.safe_load((CONFIGS / "go1.yaml").read_text())["terms"]
+SMALL = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body name="base"><freejoint/><geom name="hull" size="0.1"/>
+      <body name="arm"><joint name="shoulder" type="ball"/><geom name="upper" size="0.1" pos="0 0 1"/>
+        <body name="hand"><joint name="wrist"/><geom name="palm" size="0.1" pos="0 0 1"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <contact><pair name="touch" geom1="floor" geom2="palm"/></contact>
+  <actuator><position name="turn" joint="wrist" kp="20"/><position name="hold" joint="wrist" kp="10"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def go1() -> mujoco.MjModel:
+  return build_scene("go1").compile()
+
+
+@pytest.fixture(scope="module")
+def small() -> mujoco.MjModel:
+  return mujoco.MjModel.from_xml_string(SMALL)
+
+
+def keys(count: int, seed: int = 0) -> jax.Array:
+  return jax.random.split(jax.random.PRNGKey(seed), count)
+
+
+def test_go1_changes_only_what_it_names_within_range(go1: mujoco.MjModel) -> None:
+  randomizer = Randomizer(go1, GO1)
+  fields = {"geom_friction", "dof_frictionloss", "dof_armature", "body_ipos", "body_mass", "qpos0"}
+  batch = {k: np.array(v) for k, v in jax.jit(randomizer.sample_batch)(keys(64)).items()}
+  assert set(batch) == set(randomizer.fields) == fields
+  nominal = {k: getattr(go1, k) for k in fields}
+  assert all(batch[k].shape == (64, *nominal[k].shape) for k in fields)
+
+  friction = batch["geom_friction"]
+  assert (friction[:, 0, 0] >= 0.4).all() and (friction[:, 0, 0] <= 1).all() and np.ptp(friction[:, 0, 0]) > 0.3
+  friction[:, 0, 0] = nominal["geom_friction"][0, 0]
+  np.testing.assert_allclose(friction, np.broadcast_to(nominal["geom_friction"], friction.shape), rtol=1e-6)
+
+  for field, low, high in (("dof_frictionloss", 0.9, 1.1), ("dof_armature", 1.0, 1.05)):
+    assert not batch[field][:, :6].any()
+    ratio = batch[field][:, 6:] / nominal[field][6:]
+    assert (ratio > low - 1e-5).all() and (ratio < high + 1e-5).all()
+    assert (ratio.std(axis=0) > 0).all() and (ratio.std(axis=1) > 0).all()
+
+  shift = batch["body_ipos"] - nominal["body_ipos"]
+  np.testing.assert_allclose(np.delete(shift, 1, axis=1), 0, atol=1e-7)
+  assert (np.abs(shift[:, 1]) <= 0.05 + 1e-6).all() and (shift[:, 1].std(axis=1) > 0).all()
+
+  ratio = batch["body_mass"][:, 2:] / nominal["body_mass"][2:]
+  assert (ratio > 0.9 - 1e-5).all() and (ratio < 1.1 + 1e-5).all()
+  assert (batch["body_mass"][:, 0] == 0).all()
+  assert np.abs(batch["body_mass"][:, 1] / go1.body_mass[1] - 1).max() > 0.1  # scaled, then a payload added
+
+  offset = batch["qpos0"] - nominal["qpos0"]
+  np.testing.assert_allclose(offset[:, :7], 0, atol=1e-7)
+  assert (np.abs(offset[:, 7:]) <= 0.05 + 1e-6).all() and (offset[:, 7:].std(axis=0) > 0).all()
+
+
+def test_go1_draws_in_the_order_of_playground(go1: mujoco.MjModel) -> None:
+  """Written out from the published list: split, then one uniform draw, per term."""
+
+  def draw(low: float, high: float, shape: tuple[int, ...] = ()) -> jax.Array:
+    nonlocal rng
+    rng, key = jax.random.split(rng)
+    return jax.random.uniform(key, shape, minval=low, maxval=high)
+
+  rng = jax.random.PRNGKey(7)
+  sample = Randomizer(go1, GO1).sample(rng)
+  model = mjx.put_model(go1)
+  expected = {
+    "geom_friction": model.geom_friction.at[0, 0].set(draw(0.4, 1.0)),
+    "dof_frictionloss": model.dof_frictionloss.at[6:].set(model.dof_frictionloss[6:] * draw(0.9, 1.1, (12,))),
+    "dof_armature": model.dof_armature.at[6:].set(model.dof_armature[6:] * draw(1.0, 1.05, (12,))),
+    "body_ipos": model.body_ipos.at[1].set(model.body_ipos[1] + draw(-0.05, 0.05, (3,))),
+    "body_mass": (model.body_mass * draw(0.9, 1.1, (14,))).at[1].add(draw(-1.0, 1.0)),
+    "qpos0": model.qpos0.at[7:].set(model.qpos0[7:] + draw(-0.05, 0.05, (12,))),
+  }
+  for field, value in expected.items():
+    np.testing.assert_array_equal(sample[field], value, err_msg=field)
+
+
+def test_terms_apply_in_order(small: mujoco.MjModel) -> None:
+  fixed = {"field": "body_mass", "target": "hand"}
+  set_then_scale = [fixed | {"operation": "set", "range": [2, 2]}, fixed | {"operation": "scale", "range": [3, 3]}]
+  hand = small.body("hand").id
+  key = jax.random.PRNGKey(0)
+  assert Randomizer(small, set_then_scale).sample(key)["body_mass"][hand] == pytest.approx(6)
+  assert Randomizer(small, set_then_scale[::-1]).sample(key)["body_mass"][hand] == pytest.approx(2)
+
+
+def test_nothing_to_randomise(small: mujoco.MjModel) -> None:
+  terms = yaml.safe_load((CONFIGS / "none.yaml").read_text())["terms"]
+  randomizer = Randomizer(small, terms)
+  assert randomizer.fields == () and randomizer.sample_batch(keys(3)) == {} and randomizer.describe() == []
+
+
+def test_shared_draw_and_columns(small: mujoco.MjModel) -> None:
+  """Friction of a contact pair: both tangential directions get one value, and no other column changes."""
+  term = {"field": "pair_friction", "target": "all", "column": [0, 1], "operation": "set", "range": [0.4, 1.0]}
+  shared = np.asarray(Randomizer(small, [term | {"shared": True}]).sample_batch(keys(8))["pair_friction"])
+  assert (shared[:, 0, 0] == shared[:, 0, 1]).all() and np.ptp(shared[:, 0, 0]) > 0
+  np.testing.assert_allclose(shared[:, 0, 2:], np.tile(small.pair_friction[0, 2:], (8, 1)), rtol=1e-6)
+  separate = np.asarray(Randomizer(small, [term]).sample_batch(keys(8))["pair_friction"])
+  assert (separate[:, 0, 0] != separate[:, 0, 1]).all()
+
+
+def test_position_gain_moves_gain_and_bias(small: mujoco.MjModel) -> None:
+  for operation, bounds in (("scale", [0.9, 1.1]), ("add", [-2, 2]), ("set", [15, 25])):
+    term = {"field": "actuator_kp", "target": "all", "operation": operation, "range": bounds}
+    sample = Randomizer(small, [term]).sample(jax.random.PRNGKey(1))
+    gain, bias = sample["actuator_gainprm"], sample["actuator_biasprm"]
+    np.testing.assert_allclose(gain[:, 0], -bias[:, 1], rtol=1e-6)
+    assert (gain[:, 0] != small.actuator_gainprm[:, 0]).all()
+    np.testing.assert_allclose(bias[:, 2], small.actuator_biasprm[:, 2])
+
+
+@pytest.mark.parametrize(
+  ("field", "target", "rows"),
+  [
+    ("dof_armature", "joints", [6, 7, 8, 9]),
+    ("dof_armature", "shoulder", [6, 7, 8]),
+    ("dof_armature", ["wrist", "shoulder"], [9, 6, 7, 8]),
+    ("qpos0", "joints", [7, 8, 9, 10, 11]),
+    ("qpos0", "wrist", [11]),
+    ("jnt_stiffness", "joints", [1, 2]),
+    ("dof_armature", "all", list(range(10))),
+    ("body_mass", ["hand", "base"], [3, 1]),
+  ],
+)
+def test_targets(small: mujoco.MjModel, field: str, target: Any, rows: list[int]) -> None:
+  term = {"field": field, "target": target, "operation": "add", "range": [1, 2]}
+  change = np.asarray(Randomizer(small, [term]).sample(jax.random.PRNGKey(0))[field]) - getattr(small, field)
+  assert set(np.flatnonzero(np.abs(change) > 0.5)) == set(rows)
+
+
+def test_distributions(small: mujoco.MjModel) -> None:
+  base = {"field": "dof_damping", "target": "wrist", "operation": "set"}
+  log = Randomizer(small, [base | {"distribution": "log_uniform", "range": [0.01, 100]}]).sample_batch(keys(2000))
+  log = np.log10(np.asarray(log["dof_damping"][:, 9]))
+  assert abs(log.mean()) < 0.1 and -2.01 < log.min() < -1.9 and 1.9 < log.max() < 2.01
+  normal = Randomizer(small, [base | {"distribution": "normal", "mean": 5, "std": 2}]).sample_batch(keys(2000))
+  normal = np.asarray(normal["dof_damping"][:, 9])
+  assert abs(normal.mean() - 5) < 0.2 and abs(normal.std() - 2) < 0.15
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+  low=st.floats(-10, 10), width=st.floats(0, 5), operation=st.sampled_from(["set", "scale", "add"]),
+  target=st.sampled_from(["all", "base", "hand"]), seed=st.integers(0, 2**31 - 1),
+)  # fmt: skip
+def test_ranges_hold(low: float, width: float, operation: str, target: str, seed: int) -> None:
+  model = mujoco.MjModel.from_xml_string(SMALL)
+  term = {"field": "body_mass", "target": target, "operation": operation, "range": [low, low + width]}
+  sample = np.asarray(Randomizer(model, [term]).sample(jax.random.PRNGKey(seed))["body_mass"])
+  rows = slice(None) if target == "all" else [model.body(target).id]
+  ends = [np.full(4, low), np.full(4, low + width)]
+  if operation != "set":
+    ends = [model.body_mass * e if operation == "scale" else model.body_mass + e for e in ends]
+  ends = np.sort(ends, axis=0)[:, rows]
+  assert (sample[rows] >= ends[0] - 1e-3).all() and (sample[rows] <= ends[1] + 1e-3).all()
+  untouched = np.ones(4, bool)
+  untouched[rows] = False
+  np.testing.assert_allclose(sample[untouched], model.body_mass[untouched], rtol=1e-6)
+
+
+def test_old_randomizer_drives_a_vmapped_model(small: mujoco.MjModel) -> None:
+  """Playground 0.2.0's callable: its output is what vmap needs, and reset poses differ between environments."""
+  term = {"field": "body_mass", "target": "all", "operation": "scale", "range": [0.5, 2]}
+  model = mjx.put_model(small)
+  batched, in_axes = domain_randomizer(small, [term])(model, keys(4))
+  assert batched.body_mass.shape == (4, small.nbody)
+  assert in_axes.body_mass == 0 and in_axes.body_ipos is None
+  total = jax.vmap(lambda m: jnp.sum(m.body_mass) + jnp.sum(m.qpos0), in_axes=[in_axes])(batched)
+  assert len(np.unique(total)) == 4
+
+
+def test_terms_may_be_config_dicts(go1: mujoco.MjModel) -> None:
+  config: Any = ml_collections.ConfigDict({"terms": GO1})
+  assert Randomizer(go1, config.terms).fields == Randomizer(go1, GO1).fields
+
+
+def test_describe(go1: mujoco.MjModel) -> None:
+  rows = Randomizer(go1, GO1).describe()
+  assert [row["values"] for row in rows] == ["1", "12", "12", "3", "14", "1", "12"]
+  assert rows[0] == {
+    "field": "geom_friction[:, 0]", "target": "floor", "operation": "set", "draw": "uniform(0.4, 1)", "values": "1",
+  }  # fmt: skip
+
+
+GOOD = {"field": "body_mass", "target": "hand", "operation": "scale", "range": [0.9, 1.1]}
+
+
+@pytest.mark.parametrize(
+  ("change", "kind", "message"),
+  [
+    ({"field": "body_mas"}, UnknownNameError, "Did you mean 'body_mass'?"),
+    ({"field": "body_parentid"}, UnknownNameError, "no field of the model that can be randomised"),
+    ({"target": "hnd"}, UnknownNameError, "target 'hnd' is no body of the model. Did you mean 'hand'?"),
+    ({"target": ["hand", "arn"]}, UnknownNameError, "Did you mean 'arm'?"),
+    ({"target": "joints"}, ConfigError, "needs a field of joints"),
+    ({"target": 3}, ConfigError, "neither a name nor a list of names"),
+    ({"field": "tendon_range", "target": "all"}, ConfigError, "names nothing"),
+    ({"operation": "multiply"}, UnknownNameError, "choose from set, scale, add"),
+    ({"distribution": "unifrom"}, UnknownNameError, "Did you mean 'uniform'?"),
+    ({"distribution": "normal"}, ConfigError, "'normal' has no key 'range'"),
+    ({"distribution": "log_uniform", "range": [0, 1]}, ConfigError, "must be above 0"),
+    ({"range": None}, ConfigError, "'uniform' needs key 'range'"),
+    ({"range": [1.1, 0.9]}, ConfigError, "low end above its high end"),
+    ({"range": [0.9]}, ConfigError, "not a pair"),
+    ({"range": [0, float("nan")]}, ConfigError, "not two finite numbers"),
+    ({"column": 0}, ConfigError, "has no columns"),
+    ({"field": "body_ipos", "column": 3}, ConfigError, "has columns 0 to 2"),
+    ({"rnage": [1, 2]}, UnknownNameError, "Did you mean 'range'?"),
+  ],
+)
+def test_errors_say_what_is_wrong_in_one_sentence(
+  small: mujoco.MjModel, change: dict[str, Any], kind: type[PlaygroundError], message: str
+) -> None:
+  with pytest.raises(kind) as error:
+    Randomizer(small, [GOOD, GOOD | change])
+  assert message in str(error.value)
+  assert str(error.value).startswith("randomization.terms[1]") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("missing", ["field", "target", "operation"])
+def test_missing_keys(small: mujoco.MjModel, missing: str) -> None:
+  with pytest.raises(ConfigError, match=f"lacks the key '{missing}'"):
+    Randomizer(small, [{k: v for k, v in GOOD.items() if k != missing}])
+  with pytest.raises(ConfigError, match="is not a mapping"):
+    Randomizer(small, ["body_mass"])  # type: ignore[list-item]
