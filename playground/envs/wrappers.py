@@ -62,12 +62,13 @@ class FiniteGuard(Wrapper):
   """Ends an episode whose numbers went NaN or infinite, before they reach anything that learns.
 
   Such a step gives done = 1, reward 0, the previous observation, metrics 0 and the previous info; `info["nonfinite"]`
-  is 1 for it. The simulator's state is left as it came, for `AutoReset` to replace.
+  is 1 for it, and `info["nonfinite_state"]` holds the simulator's state as it came out of the step.
   """
 
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
     state = self.env.reset(rng, model)
-    return state.replace(info=state.info | {"nonfinite": jnp.zeros_like(state.done)})
+    info = {"nonfinite": jnp.zeros_like(state.done), "nonfinite_state": start_of(state)}
+    return state.replace(info=state.info | info)
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
     after = self.env.step(state, action, model)
@@ -87,7 +88,7 @@ class FiniteGuard(Wrapper):
       reward=reward,
       metrics=metrics,
       done=jnp.where(bad, 1.0, after.done),
-      info=info | {"nonfinite": bad.astype(after.done.dtype)},
+      info=info | {"nonfinite": bad.astype(after.done.dtype), "nonfinite_state": start_of(after)},
     )
 
 
@@ -156,7 +157,7 @@ class AutoReset(Wrapper):
     state = self.env.reset(keys[:, 0], model)
     own: dict[str, Any] = {PREFIX + "rng": keys[:, 1], PREFIX + "done_count": jnp.zeros(state.done.shape, jnp.int32)}
     if not self.full_reset:
-      own[PREFIX + "first_data"] = _start_of(state)
+      own[PREFIX + "first_data"] = start_of(state)
       own[PREFIX + "first_obs"] = state.obs
     return state.replace(info=state.info | own)
 
@@ -172,18 +173,19 @@ class AutoReset(Wrapper):
       # A reset costs a forward pass over the whole batch: skip it in the steps in which nobody is done.
       after = jax.lax.cond(after.done.any(), self._restart, lambda s, *_: s, after, keys[:, 1], model)
     else:
-      data = after.data.replace(**where_done(after.done, own[PREFIX + "first_data"], _start_of(after)))
+      data = after.data.replace(**where_done(after.done, own[PREFIX + "first_data"], start_of(after)))
       after = after.replace(data=data, obs=where_done(after.done, own[PREFIX + "first_obs"], after.obs))
     return after.replace(info=after.info | own)
 
   def _restart(self, after: State, keys: jax.Array, model: ModelFields | None) -> State:
     fresh = self.env.reset(keys, model)
-    kept = {k: after.info[k] for k in (*EPISODE_KEYS, "nonfinite", PRESERVE_INFO) if k in after.info}
+    kept = {k: after.info[k] for k in (*EPISODE_KEYS, "nonfinite", "nonfinite_state", PRESERVE_INFO) if k in after.info}
     data, obs, info = where_done(after.done, (fresh.data, fresh.obs, fresh.info), (after.data, after.obs, after.info))
     return after.replace(data=data, obs=obs, info=info | kept)
 
 
-def _start_of(state: State) -> dict[str, jax.Array]:
+def start_of(state: State) -> dict[str, jax.Array]:
+  """The fields of the simulator's state that the next step depends on, by name."""
   return {name: getattr(state.data, name) for name in STATE_FIELDS}
 
 

@@ -8,14 +8,17 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from playground.envs.base import Env
+from playground.envs.base import Env, State
 from playground.envs.wrappers import ModelFields, wrap_for_evaluation
 from playground.hardware.mesh import AXIS, jit_on_mesh
 
 Act = Callable[[Any, Any, jax.Array], jax.Array]  # (policy, obs [N, ...], key) -> actions [N, action_size]
 
 
-def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh) -> Callable[..., dict[str, jax.Array]]:
+Evaluate = Callable[..., tuple[dict[str, jax.Array], dict[str, jax.Array]]]
+
+
+def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: int = 0) -> Evaluate:
   """Builds a jitted evaluation of a policy over `num_envs` episodes, spread over the mesh.
 
   Args:
@@ -23,41 +26,51 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh) -> Callable[..
     act: the policy.
     num_envs: episodes, a multiple of the number of devices.
     mesh: devices, one axis named "data".
+    num_recorded: episodes on each device to record for a video.
 
   Returns:
-    A function (policy, key, model fields [num_envs, ...]) -> scalars: `episode_reward` and `episode_length` with their
-    deviation over episodes (`_std`), the mean of every metric summed over an episode (`episode_<metric>`), and
-    `nonfinite`, the number of episodes that ended in NaN.
+    A function (policy, key, model fields [num_envs, ...]) -> (scalars, recording). The scalars: `episode_reward` and
+    `episode_length` with their deviation over episodes (`_std`), the mean of every metric summed over an episode
+    (`episode_<metric>`), and `nonfinite`, the number of episodes that ended in NaN. The recording: `qpos`, `mocap_pos`,
+    `mocap_quat` and `active` (1 until the episode ended) before each decision, [decisions, episodes, ...].
   """
   wrapped = wrap_for_evaluation(env)
   decisions = -(-env.episode_length // env.action_repeat)
   per_device = num_envs // mesh.size
 
-  def evaluate(policy: Any, key: jax.Array, model: ModelFields) -> dict[str, jax.Array]:
+  def evaluate(policy: Any, key: jax.Array, model: ModelFields) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
     reset_key, act_key = jax.random.split(key)
     state = wrapped.reset(jax.random.split(reset_key, per_device), model)
     zeros = jnp.zeros(per_device)
     sums = {"reward": zeros, "length": zeros, "nonfinite": zeros} | {name: zeros for name in state.metrics}
 
+    def view(state: State, active: jax.Array) -> dict[str, jax.Array]:
+      seen = {name: getattr(state.data, name) for name in ("qpos", "mocap_pos", "mocap_quat")}
+      return jax.tree.map(lambda x: x[:num_recorded], seen | {"active": active})
+
+    active = jnp.ones(per_device)
+    recording = jax.tree.map(lambda x: jnp.zeros((decisions, *x.shape), x.dtype), view(state, active))
+
     def running(carry: tuple[Any, ...]) -> jax.Array:
-      step, _, active, _ = carry
+      step, _, active, _, _ = carry
       # Devices must leave the loop together: a policy may communicate between them.
       return (step < decisions) & (jax.lax.pmax(active.max(), AXIS) > 0)
 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-      step, state, active, sums = carry
+      step, state, active, sums, recording = carry
+      recording = jax.tree.map(lambda tape, x: tape.at[step].set(x), recording, view(state, active))
       state = wrapped.step(state, act(policy, state.obs, jax.random.fold_in(act_key, step)), model)
       values = {"reward": state.reward, "length": jnp.full_like(zeros, env.action_repeat)}
       values |= {"nonfinite": state.info["nonfinite"]} | state.metrics
       sums = {k: sums[k] + jnp.where(active > 0, values[k], 0.0) for k in sums}
-      return step + 1, state, active * (1 - state.done), sums
+      return step + 1, state, active * (1 - state.done), sums, recording
 
-    sums = jax.lax.while_loop(running, step, (0, state, jnp.ones(per_device), sums))[3]
+    sums, recording = jax.lax.while_loop(running, step, (0, state, active, sums, recording))[3:]
     everywhere = {k: jax.lax.all_gather(v, AXIS, tiled=True) for k, v in sums.items()}
     report = {f"episode_{k}": v.mean() for k, v in everywhere.items() if k != "nonfinite"}
     for name in ("reward", "length"):
       report[f"episode_{name}_std"] = everywhere[name].std()
-    return report | {"nonfinite": everywhere["nonfinite"].sum()}
+    return report | {"nonfinite": everywhere["nonfinite"].sum()}, recording
 
-  return jit_on_mesh(evaluate, mesh, (P(), P(), P(AXIS)), P())
+  return jit_on_mesh(evaluate, mesh, (P(), P(), P(AXIS)), (P(), P(None, AXIS)))

@@ -61,12 +61,31 @@ class Learner(Protocol):
     """The part of the state that acting needs."""
     ...
 
+  def split(self, state: Any) -> tuple[Any, Any]:
+    """Divides a state into what acting needs and the rest."""
+    ...
+
+  def join(self, policy: Any, rest: Any) -> Any:
+    """Undoes `split`."""
+    ...
+
+  def place(self, state: Any) -> Any:
+    """Puts a state of host arrays on the devices."""
+    ...
+
+  def with_policy(self, state: Any, policy: Any) -> Any:
+    """A state that acts with `policy` (host arrays), all else unchanged."""
+    ...
+
 
 class Hooks(Protocol):
   """What a run does with what happens; called on the host while the device works on."""
 
-  def on_metrics(self, step: int, metrics: Metrics, state: Any) -> None:
-    """A row of the log. `state` is the newest state there is: it may be ahead of the row."""
+  def on_metrics(self, step: int, metrics: Metrics, state: Any, recording: Any) -> None:
+    """A row of the log. `state` is the newest state there is: it may be ahead of the row.
+
+    `recording` (on the device) is what the row's evaluation recorded, None for a row without one.
+    """
     ...
 
   def on_save(self, update: int, step: int, state: Any) -> None:
@@ -203,7 +222,7 @@ class Loop:
       queued.evaluated = self._program.evaluate(policy, self._key(self._eval_key, mark), self._eval_model)
     if mark.reset:
       state = self._program.reset(state, self._key(self._reset_key, mark), self._model)
-    due = mark.evaluate or time.perf_counter() - self._last_save > self._save_every_s
+    due = mark.evaluate or mark is self._marks[-1] or time.perf_counter() - self._last_save > self._save_every_s
     if due and mark.update:
       # A copy, because the next training call takes the state's buffers over while this one is written to disk.
       queued.snapshot = self._program.copy(state)
@@ -222,10 +241,12 @@ class Loop:
       self.train_s += seconds
       self.trained_steps += steps
       self.first_update_s = self.first_update_s or seconds / done.num_updates
+    recording = None
     if done.evaluated is not None:
-      row |= {f"eval/{k}": float(v) for k, v in jax.device_get(done.evaluated).items()}
+      scores, recording = done.evaluated
+      row |= {f"eval/{k}": float(v) for k, v in jax.device_get(scores).items()}
       row["time/eval_s"] = self._lap()
-    self._hooks.on_metrics(step, row, newest)
+    self._hooks.on_metrics(step, row, newest, recording)
     if done.snapshot is not None:
       self._hooks.on_save(done.mark.update, step, done.snapshot)
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 from brax.training.acme import running_statistics
 from flax import struct
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from playground.envs.base import Env, Observation, State
@@ -145,6 +145,22 @@ class PPO:
   def policy(self, state: TrainState) -> Policy:
     """Normaliser and networks: what acting needs, and what a new run can start from."""
     return Policy(state.params, state.normalizer)
+
+  def split(self, state: TrainState) -> tuple[Policy, TrainState]:
+    """Divides a state into what acting needs and the rest; `join` puts it together again."""
+    return self.policy(state), state.replace(params=None, normalizer=None)
+
+  def join(self, policy: Policy, rest: TrainState) -> TrainState:
+    return rest.replace(params=policy.params, normalizer=policy.normalizer)
+
+  def place(self, state: TrainState) -> TrainState:
+    """Puts a state's host arrays on the devices, each its share."""
+    shardings = jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), TRAIN_STATE_SPEC)
+    return jax.device_put(state, shardings, may_alias=False)
+
+  def with_policy(self, state: TrainState, policy: Policy) -> TrainState:
+    """A state that acts with `policy` (host arrays), all else unchanged."""
+    return self.join(jax.device_put(policy, NamedSharding(self.mesh, P()), may_alias=False), state)
 
   def act(self, policy: Policy, obs: Observation, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
     """Actions in [-1, 1], [..., action_size]; deterministic as `deterministic_eval` says if not given."""

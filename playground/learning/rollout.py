@@ -31,20 +31,24 @@ class NonfiniteCapture(struct.PyTreeNode):
     state: the last good state of that environment, every leaf [1, ...].
     action: the action that broke it, [1, action_size].
     model: its randomised model fields, each [1, ...].
+    after: the simulator's state after that step, by field.
   """
 
   found: jax.Array
   state: State
   action: jax.Array
   model: dict[str, jax.Array]
+  after: dict[str, jax.Array]
 
   @classmethod
   def empty(cls, state: State, action_size: int, model: ModelFields) -> "NonfiniteCapture":
     first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
-    return cls(jnp.zeros(1, bool), first(state), jnp.zeros((1, action_size)), first(dict(model)))
+    after = first(state.info["nonfinite_state"])
+    return cls(jnp.zeros(1, bool), first(state), jnp.zeros((1, action_size)), first(dict(model)), after)
 
-  def look(self, before: State, action: jax.Array, model: ModelFields, bad: jax.Array) -> "NonfiniteCapture":
-    """Keeps the step of the first bad environment (`bad` [N], 0/1), if none was kept before."""
+  def look(self, before: State, action: jax.Array, model: ModelFields, after: State) -> "NonfiniteCapture":
+    """Keeps the step from `before` to `after` of the first environment that it broke, if none was kept before."""
+    bad = after.info["nonfinite"]
     which = jnp.argmax(bad)
     take = (bad[which] > 0) & ~self.found[0]
     pick = lambda new, old: jnp.where(take, jax.lax.dynamic_slice_in_dim(new, which, 1), old)
@@ -53,6 +57,7 @@ class NonfiniteCapture(struct.PyTreeNode):
       state=jax.tree.map(pick, before, self.state),
       action=pick(action, self.action),
       model=jax.tree.map(pick, dict(model), self.model),
+      after=jax.tree.map(pick, after.info["nonfinite_state"], self.after),
     )
 
 
@@ -99,7 +104,7 @@ def unroll(
       termination=after.done * (1 - truncation),
       truncation=truncation,
     )
-    capture = capture.look(state, action, model, after.info["nonfinite"])
+    capture = capture.look(state, action, model, after)
     return (after, capture), (transitions, episode_sums(after))
 
   (state, capture), (transitions, sums) = jax.lax.scan(step, (state, capture), jax.random.split(key, length))

@@ -1,0 +1,89 @@
+"""From the `hardware` config to devices: platform, precision, memory and compilation caches."""
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+from playground.errors import ConfigError, HardwareError
+from playground.hardware.mesh import make_mesh
+
+PRECISIONS = ("highest", "float32", "tensorfloat32", "high", "bfloat16", "default")
+CACHE = Path("~/.cache/playground")
+
+
+@dataclasses.dataclass(frozen=True)
+class Hardware:
+  """What a run trains on."""
+
+  mesh: Mesh
+  network_precision: str | None
+  facts: dict[str, Any]  # for the manifest
+
+
+def setup(config: Any) -> Hardware:
+  """Applies the `hardware` config to this process and returns its devices.
+
+  Call it before JAX touches a device: platform, memory and flags cannot change afterwards.
+
+  Raises:
+    ConfigError: an unknown platform or precision.
+    HardwareError: devices this machine does not have.
+  """
+  for key in ("matmul_precision", "network_precision"):
+    if config[key] not in PRECISIONS:
+      raise ConfigError(f"hardware.{key}={config[key]!r} must be one of {', '.join(PRECISIONS)}.")
+  if config.platform not in ("auto", "cpu", "gpu"):
+    raise ConfigError(f"hardware.platform={config.platform!r} must be one of auto, cpu, gpu.")
+  _environment(config)
+  if config.platform == "cpu":
+    jax.config.update("jax_platforms", "cpu")
+  jax.config.update("jax_default_matmul_precision", config.matmul_precision)
+  cache = _caches(config)
+  devices = jax.devices()
+  if config.platform == "gpu" and devices[0].platform != "gpu":
+    raise HardwareError(
+      "hardware.platform=gpu, but JAX sees no GPU: `playground doctor` says what is missing, hardware=cpu runs without."
+    )
+  count = len(devices) if config.devices is None else config.devices
+  if not 1 <= count <= len(devices):
+    raise HardwareError(f"hardware.devices={count}, but this machine has {len(devices)} ({devices[0].device_kind}).")
+  facts = {
+    "platform": devices[0].platform,
+    "device": devices[0].device_kind,
+    "num_devices": count,
+    "matmul_precision": config.matmul_precision,
+    "network_precision": config.network_precision,
+    "compilation_cache": cache,
+  }
+  return Hardware(make_mesh(count), config.network_precision, facts)
+
+
+def cache_dir(config: Any) -> Path:
+  """Where compiled programs are kept between runs."""
+  return Path(config.cache_dir or CACHE).expanduser()
+
+
+def _environment(config: Any) -> None:
+  """Variables that the GPU runtime reads when it starts; what the user exported wins."""
+  os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", str(bool(config.preallocate)).lower())
+  if config.memory_fraction is not None:
+    os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", str(config.memory_fraction))
+  if config.xla_flags:
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {config.xla_flags}".strip()
+
+
+def _caches(config: Any) -> str | None:
+  """Turns on JAX's and Warp's persistent caches; a cache the user set up already is left as it is."""
+  if not config.compilation_cache:
+    return None
+  folder = cache_dir(config)
+  os.environ.setdefault("WARP_CACHE_PATH", str(folder / "warp"))
+  if not jax.config.jax_compilation_cache_dir:
+    jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
+  jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+  jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+  return jax.config.jax_compilation_cache_dir

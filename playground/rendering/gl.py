@@ -1,0 +1,52 @@
+"""Finds a way to draw without a screen. Never imports mujoco here: a broken GL library kills the process that tries."""
+
+import functools
+import os
+import subprocess
+import sys
+
+NO_GL_REMEDY = (
+  "No working OpenGL was found: install one (on Debian or Ubuntu `apt install libegl1` for EGL or "
+  "`apt install libosmesa6` for software rendering), or name one that works in MUJOCO_GL."
+)
+
+_PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 16, 16) as renderer:
+  renderer.update_scene(data)
+  assert renderer.render().any()
+"""
+_OFF = ("disable", "disabled", "off", "false", "0")  # what MuJoCo itself takes for "no GL"
+
+
+@functools.cache
+def find_gl() -> str | None:
+  """Returns a value of MUJOCO_GL with which MuJoCo draws here, or None; probed once per process, in subprocesses.
+
+  The user's own MUJOCO_GL comes first (and `MUJOCO_GL=disable` means none), then EGL, OSMesa and, if there is a
+  display, GLFW.
+  """
+  asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+  if asked in _OFF:
+    return None
+  candidates = [asked, "egl", "osmesa", "glfw" if os.environ.get("DISPLAY") else ""]
+  return next((backend for backend in dict.fromkeys(candidates) if backend and works(backend)), None)
+
+
+def works(backend: str, timeout_s: float = 60.0) -> bool:
+  """Returns whether MuJoCo can draw a picture with this backend, found out in a subprocess."""
+  command = [sys.executable, "-c", _PROBE]
+  try:
+    done = subprocess.run(command, env=gl_environment(backend), capture_output=True, timeout=timeout_s)
+  except subprocess.TimeoutExpired:
+    return False
+  return done.returncode == 0
+
+
+def gl_environment(backend: str) -> dict[str, str]:
+  """Returns this process's environment for a child that draws with `backend`."""
+  # MuJoCo sets PYOPENGL_PLATFORM itself and refuses one that contradicts MUJOCO_GL.
+  return {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}

@@ -1,0 +1,202 @@
+"""Renders a recorded trajectory to MP4 in a child process, so that no GL crash or hang reaches the run.
+
+`python -m playground.rendering.video <trajectory.npz> <out.mp4>` is the child; $MUJOCO_GL chooses how it draws.
+"""
+
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from playground.errors import PlaygroundError, nearest
+from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
+
+MAX_FPS = 50.0
+_CAMERAS = ("track", "tracking", "fixed", "side", "front", "back", "cam0")
+
+
+def save_trajectory(
+  path: str | Path,
+  mj_model: Any,
+  qpos: np.ndarray,
+  mocap_pos: np.ndarray | None = None,
+  mocap_quat: np.ndarray | None = None,
+  dt: float = 0.02,
+  **view: Any,
+) -> Path:
+  """Writes a trajectory to `path` (.npz) and its model next to it (.mjb).
+
+  Args:
+    path: ends in .npz.
+    mj_model: the MjModel that `qpos` belongs to.
+    qpos: [T, nq].
+    mocap_pos: [T, nmocap, 3], if bodies are moved by mocap.
+    mocap_quat: [T, nmocap, 4].
+    dt: seconds between two rows of `qpos`.
+    **view: camera, width, height of the video (`render_video`).
+  """
+  import mujoco
+
+  path, qpos = Path(path), np.asarray(qpos)
+  if qpos.ndim != 2 or qpos.shape[1] != mj_model.nq:
+    raise ValueError(f"qpos must have shape [T, {mj_model.nq}], not {list(qpos.shape)}")
+  arrays: dict[str, Any] = {"qpos": qpos, "dt": dt, "mocap_pos": mocap_pos, "mocap_quat": mocap_quat, **view}
+  np.savez_compressed(path, **{k: v for k, v in arrays.items() if v is not None})
+  mujoco.mj_saveModel(mj_model, str(path.with_suffix(".mjb")))
+  return path
+
+
+def render_video(
+  mj_model: Any,
+  qpos: np.ndarray,
+  out_path: str | Path,
+  *,
+  dt: float,
+  camera: str | None = None,
+  width: int = 640,
+  height: int = 480,
+  mocap_pos: np.ndarray | None = None,
+  mocap_quat: np.ndarray | None = None,
+  timeout_s: float | None = None,
+  notify: Callable[[str], None] = print,
+) -> Path | None:
+  """Renders `qpos` [T, nq] in real time to `out_path`.
+
+  Args:
+    mj_model: the MjModel that `qpos` belongs to.
+    qpos: [T, nq]; rows from the first NaN on are left out.
+    out_path: the .mp4 to write; complete or absent, whatever happens.
+    dt: seconds between two rows of `qpos`.
+    camera: a camera of the model; by default one meant for looking on, else one that follows a floating base.
+    width: pixels, even.
+    height: pixels, even.
+    mocap_pos: [T, nmocap, 3].
+    mocap_quat: [T, nmocap, 4].
+    timeout_s: when to give up; by default a minute and a half second a frame.
+    notify: takes one sentence if there is no video.
+
+  Returns:
+    `out_path`, or None if it could not be rendered.
+  """
+  out_path = Path(out_path).absolute()
+  backend = find_gl()
+  if backend is None:
+    notify(f"No video at {out_path.name}. {NO_GL_REMEDY}")
+    return None
+  partial = _partial(out_path)
+  timeout_s = timeout_s or 60.0 + 0.5 * len(qpos)
+  with tempfile.TemporaryDirectory(prefix="playground_video_") as folder, open(f"{folder}/stderr", "w+") as stderr:
+    view = {"camera": camera, "width": width, "height": height}
+    trajectory = save_trajectory(Path(folder) / "trajectory.npz", mj_model, qpos, mocap_pos, mocap_quat, dt, **view)
+    out_path.parent.mkdir(parents=True, exist_ok=True)
+    environment = gl_environment(backend) | {
+      # The child runs this very package, whatever its folder.
+      "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
+      "JAX_PLATFORMS": "cpu",  # and must never reach for the GPU memory that training holds
+    }
+    command = [sys.executable, "-m", "playground.rendering.video", str(trajectory), str(out_path)]
+    child = subprocess.Popen(command, cwd=folder, env=environment, stderr=stderr, start_new_session=True)
+    try:
+      code = child.wait(timeout_s)
+      stderr.seek(0)
+      lines = stderr.read().strip().splitlines()
+      reason = lines[-1].rstrip(".") if lines else f"the renderer ended with code {code}"
+    except subprocess.TimeoutExpired:
+      code, reason = 1, f"rendering with MUJOCO_GL={backend} took longer than {timeout_s:g} s"
+    finally:
+      with contextlib.suppress(OSError):
+        os.killpg(child.pid, signal.SIGKILL)  # the whole group: the encoder would live on and write its file
+      child.wait()
+      partial.unlink(missing_ok=True)
+  if code == 0 and out_path.is_file():
+    return out_path
+  notify(f"No video at {out_path.name}: {reason}; `playground doctor` shows what rendering needs.")
+  return None
+
+
+def frame_stride(dt: float) -> int:
+  """Returns every how many rows a frame is taken, so that playback is real time at no more than `MAX_FPS`."""
+  return max(1, math.ceil(1 / (MAX_FPS * dt) - 1e-6))
+
+
+def _partial(out_path: Path) -> Path:
+  return out_path.with_name(f".{out_path.name}.partial")
+
+
+def _render(trajectory: Path, out_path: Path) -> None:
+  """The child's work: draws and encodes under a temporary name, then gives the file its own."""
+  import imageio_ffmpeg
+  import mujoco
+
+  saved = np.load(trajectory)
+  model = mujoco.MjModel.from_binary_path(str(trajectory.with_suffix(".mjb")))
+  data = mujoco.MjData(model)
+  width, height, dt = int(saved["width"]), int(saved["height"]), float(saved["dt"])
+  camera = _camera(model, str(saved["camera"]) if "camera" in saved else None)
+  finite = np.isfinite(saved["qpos"]).all(axis=1)
+  length = len(finite) if finite.all() else int(finite.argmin())
+  if length == 0:
+    raise PlaygroundError("the trajectory has no finite state to draw.")
+  model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
+  model.vis.global_.offheight = max(height, model.vis.global_.offheight)
+  # Measured without a GPU, 640x480: 18 ms a frame instead of 30 at MuJoCo's 4096, and no difference to the eye.
+  model.vis.quality.shadowsize = min(2048, model.vis.quality.shadowsize)
+  stride = frame_stride(dt)
+  fps: Any = 1 / (dt * stride)  # declared int by imageio_ffmpeg, which prints it with two decimals
+  partial = _partial(out_path)
+  writer = imageio_ffmpeg.write_frames(
+    str(partial),
+    (width, height),
+    fps=fps,
+    codec="libx264",
+    quality=7,
+    macro_block_size=2,
+    output_params=["-f", "mp4", "-movflags", "+faststart"],  # the temporary name does not tell the format
+  )
+  writer.send(None)
+  with mujoco.Renderer(model, height, width) as renderer:
+    for t in range(0, length, stride):
+      data.qpos[:] = saved["qpos"][t]
+      for name in ("mocap_pos", "mocap_quat"):
+        if name in saved:
+          getattr(data, name)[:] = saved[name][t]
+      mujoco.mj_forward(model, data)
+      renderer.update_scene(data, camera)
+      writer.send(renderer.render())
+  writer.close()
+  partial.replace(out_path)
+
+
+def _camera(model: Any, name: str | None) -> Any:
+  """Returns the named camera, or the best one the model offers for looking at it from outside."""
+  import mujoco
+
+  names = [model.camera(i).name for i in range(model.ncam)]
+  if name is not None and name not in names:
+    raise PlaygroundError(f"the model has no camera {name!r}, only {', '.join(names) or 'none'}.{nearest(name, names)}")
+  chosen = name or next((known for known in _CAMERAS if known in names), None)
+  if chosen:
+    return chosen
+  view = mujoco.MjvCamera()
+  mujoco.mjv_defaultFreeCamera(model, view)
+  roots = [model.body_rootid[b] for b in model.jnt_bodyid]
+  if roots and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and roots.count(roots[0]) > 1:
+    # A robot that walks out of the picture is no use; a free object on a table should not be followed.
+    view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, model.jnt_bodyid[0]
+    view.distance = min(view.distance, 3.0)  # terrain makes the model's extent, and so the default, huge
+  return view
+
+
+if __name__ == "__main__":
+  try:
+    _render(Path(sys.argv[1]), Path(sys.argv[2]))
+  except Exception as error:  # the parent shows the last line
+    sys.exit(str(error).splitlines()[0] if str(error) else type(error).__name__)

@@ -1,0 +1,41 @@
+"""SIGINT and SIGTERM: finish the work in flight, save, leave."""
+
+import signal
+from types import FrameType
+from typing import Self
+
+
+class Interrupted(BaseException):
+  """The process was told to go while there was nothing to save yet (or was told twice)."""
+
+  def __init__(self, signum: int):
+    super().__init__(signal.Signals(signum).name)
+    self.signum = signum
+
+
+class Interrupts:
+  """Context that turns the first signal into a flag while `saving` is on, and into `Interrupted` otherwise."""
+
+  def __init__(self) -> None:
+    self.signum: int | None = None
+    self.saving = False
+    self._before: dict[int, object] = {}
+
+  def __enter__(self) -> Self:
+    for signum in (signal.SIGINT, signal.SIGTERM):
+      self._before[signum] = signal.signal(signum, self._handle)
+    return self
+
+  def __exit__(self, *exc: object) -> None:
+    for signum, handler in self._before.items():
+      signal.signal(signum, handler)  # pyright: ignore[reportArgumentType]
+
+  def _handle(self, signum: int, frame: FrameType | None) -> None:
+    if not self.saving or self.signum is not None:
+      raise Interrupted(signum)
+    self.signum = signum
+
+
+def exit_code(signum: int) -> int:
+  """What a shell reports for a process that this signal ended: 130 for SIGINT, 143 for SIGTERM."""
+  return 128 + signum

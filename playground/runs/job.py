@@ -1,0 +1,186 @@
+"""What a run does with what its loop reports: logs, pictures, checkpoints, and the result at the end."""
+
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from playground.envs.base import Env
+from playground.errors import PlaygroundError
+from playground.learning.checkpoints import CheckpointStore, checksum
+from playground.learning.loop import Learner, Loop, Metrics
+from playground.rendering.video import render_video
+from playground.runs.interrupts import Interrupts
+from playground.runs.nonfinite import write_dump
+from playground.runs.plots import plot_learning_curve
+from playground.runs.progress import Progress
+from playground.runs.run_dir import RunDirectory
+from playground.runs.start import Start
+from playground.runs.trackers import make_trackers
+
+if TYPE_CHECKING:
+  from playground.config import RunConfig
+
+
+class NonfiniteError(PlaygroundError):
+  """Too many environment steps went NaN or infinite for the run to go on."""
+
+
+class Job:
+  """The loop's hooks for one run directory (`learning.loop.Hooks`)."""
+
+  def __init__(
+    self,
+    config: "RunConfig",
+    run_dir: RunDirectory,
+    env: Env,
+    learner: Learner,
+    progress: Progress,
+    interrupts: Interrupts,
+    start: Start,
+  ):
+    self._config = config
+    self._run_dir = run_dir
+    self._env = env
+    self._learner = learner
+    self._progress = progress
+    self._interrupts = interrupts
+    self._trackers = make_trackers(config.resolved, run_dir, start.step, progress.print)
+    self._store = CheckpointStore(run_dir.checkpoints, config.checkpoint.keep)
+    self._videos = ThreadPoolExecutor(1, thread_name_prefix="video")
+    self._video: Future[Path | None] | None = None
+    self._earlier_s = start.wall_clock_s
+    self._began = time.perf_counter()
+    self._evaluations = 0
+    self._last: dict[str, Any] = {"step": start.step or 0, "episode_reward": None, "recording": None}
+    self._counted_step = start.step or 0
+    self._dumped = False
+    self._tracing: int | None = None
+
+  @property
+  def wall_clock_s(self) -> float:
+    """Time the run has taken, over all its starts, without compiling."""
+    return self._earlier_s + time.perf_counter() - self._began
+
+  def on_metrics(self, step: int, metrics: Metrics, state: Any, recording: Any) -> None:
+    score = metrics.get("eval/episode_reward")
+    self._trackers.log(step, metrics | {"time/wall_clock_s": self.wall_clock_s})
+    self._progress.update(step, metrics.get("time/steps_per_second"), score)
+    self._last |= {"step": step, "recording": recording}
+    if score is not None:
+      self._last["episode_reward"] = score
+      self._evaluations += 1
+      every = self._config.video.every_evals
+      if every and self._evaluations % every == 0:
+        self._start_video(step, recording)
+    self._trace(metrics)
+    self._check_numbers(step, metrics, state)
+
+  def on_save(self, update: int, step: int, state: Any) -> None:
+    policy, rest = self._learner.split(state)
+    meta = {
+      "update": update,
+      "env": self._config.choices["env"],
+      "wall_clock_s": self.wall_clock_s,
+      "config": self._config.resolved,
+    }
+    self._store.save(step, policy, rest, meta)
+
+  def should_stop(self) -> bool:
+    return self._interrupts.signum is not None
+
+  def finish(self, loop: Loop, state: Any, completed: bool) -> None:
+    """Waits for what is being written, and writes the run's result."""
+    self._progress.phase("saving")
+    self._store.close()
+    if self._config.video.enable and self._config.video.at_end and self._last["recording"] is not None:
+      self._progress.phase("rendering the video")
+      self._start_video(self._last["step"], self._last["recording"])
+    policy, _ = self._learner.split(state)
+    steps_per_second = loop.trained_steps / loop.train_s if loop.train_s else None
+    wall_clock_s = self.wall_clock_s
+    if self._video:
+      self._video.result()
+    self.close("finished" if completed else "preempted")
+    plot_learning_curve(self._run_dir.metrics_csv, self._run_dir.plots)
+    self._run_dir.update_manifest(timings={"first_update_s": loop.first_update_s, "train_s": loop.train_s})
+    self._run_dir.write_summary(
+      {
+        "status": "finished" if completed else "preempted",
+        "env": self._config.choices["env"],
+        "final_return": self._last["episode_reward"],
+        "best_return": self._best_return(),
+        "steps": self._last["step"],
+        "steps_per_second": steps_per_second,
+        "wall_clock_s": wall_clock_s,
+        "params_sha256": checksum([np.asarray(x) for x in jax.device_get(jax.tree.leaves(policy))]),
+      }
+    )
+
+  def close(self, status: str) -> None:
+    """Ends the trackers and the video thread; safe to call after an error."""
+    self._videos.shutdown(cancel_futures=True)
+    self._trackers.close(status)
+
+  def _best_return(self) -> float | None:
+    import pandas as pd
+
+    table = pd.read_csv(self._run_dir.metrics_csv)
+    scores = table["eval/episode_reward"].dropna() if "eval/episode_reward" in table else table.iloc[:0, 0]
+    return float(scores.max()) if len(scores) else None
+
+  def _start_video(self, step: int, recording: Any) -> None:
+    """Renders the first recorded episodes in a child process while training goes on."""
+    tape = {name: np.asarray(value) for name, value in jax.device_get(recording).items()}
+    episodes = min(self._config.video.episodes, tape["active"].shape[1])
+    rows = np.concatenate([np.flatnonzero(tape["active"][:, i]) for i in range(episodes)])
+    columns = np.repeat(np.arange(episodes), [int((tape["active"][:, i] > 0).sum()) for i in range(episodes)])
+    view = self._config.video
+    mocap = {k: tape[k][rows, columns] for k in ("mocap_pos", "mocap_quat") if tape[k].size}
+    self._video = self._videos.submit(
+      render_video,
+      self._env.mj_model,
+      tape["qpos"][rows, columns],
+      self._run_dir.videos / f"step_{step:012d}.mp4",
+      dt=self._env.dt * self._env.action_repeat,
+      camera=view.camera,
+      width=view.width,
+      height=view.height,
+      notify=self._progress.print,
+      **mocap,
+    )
+
+  def _trace(self, metrics: Metrics) -> None:
+    """With `profile.enable`, traces the stretch between the first two rows that trained."""
+    if not self._config.profile.enable or "training/total_loss" not in metrics:
+      return
+    if self._tracing is None:
+      folder = self._run_dir.path / "profile"
+      jax.profiler.start_trace(str(folder))
+      self._tracing = 0
+      self._progress.print(f"tracing into {folder}")
+    elif self._tracing == 0:
+      jax.profiler.stop_trace()
+      self._tracing = 1
+
+  def _check_numbers(self, step: int, metrics: Metrics, state: Any) -> None:
+    """Dumps the first non-finite step, and stops the run when there are too many of them."""
+    bad = metrics.get("training/nonfinite", 0.0)
+    taken, self._counted_step = step - self._counted_step, step
+    if not bad:
+      return
+    where = ""
+    if not self._dumped:
+      self._dumped = True
+      dump = write_dump(self._run_dir.nan_dump, step, state.capture, self._config.resolved)
+      where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
+      self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN or infinite.{where}")
+    fraction = bad * self._env.action_repeat / max(taken, 1)
+    if fraction > self._config.on_nonfinite.max_fraction:
+      raise NonfiniteError(
+        f"{fraction:.1%} of the environment steps before step {step:,} went NaN or infinite, more than "
+        f"on_nonfinite.max_fraction={self._config.on_nonfinite.max_fraction:g}.{where}"
+      )

@@ -1,0 +1,85 @@
+"""The record of the first step that went NaN or infinite, and its replay."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from playground.envs.base import Env, State
+from playground.errors import CheckpointError
+from playground.learning.rollout import NonfiniteCapture
+from playground.runs.files import replacing
+
+
+def write_dump(folder: Path, step: int, capture: NonfiniteCapture, config: dict[str, Any]) -> Path | None:
+  """Writes the captured step as `step_<step>.npz`, with the run's config inside so that it can travel alone.
+
+  Args:
+    folder: where to; made if needed.
+    step: control steps after which it was noticed.
+    capture: one entry a device; the first found is written.
+    config: the run's resolved config.
+
+  Returns:
+    The file, or None if nothing was captured.
+  """
+  capture = jax.device_get(capture)
+  found = np.flatnonzero(capture.found)
+  if not len(found):
+    return None
+  one = jax.tree.map(lambda x: x[found[0]], capture)
+  arrays = {f"state{name}": leaf for name, leaf in _named(one.state)}
+  arrays |= {f"model/{name}": value for name, value in one.model.items()}
+  arrays |= {f"after/{name}": value for name, value in one.after.items()}
+  folder.mkdir(parents=True, exist_ok=True)
+  path = folder / f"step_{step:012d}.npz"
+  with replacing(path) as temporary, open(temporary, "wb") as file:
+    np.savez_compressed(file, action=one.action, config=json.dumps(config), **arrays)
+  return path
+
+
+class Dump:
+  """A dumped step: the last good state, the action, the randomised model and what came out."""
+
+  def __init__(self, path: str | Path):
+    """Reads it; raises CheckpointError if it is missing or no dump."""
+    try:
+      with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+      self.config: dict[str, Any] = json.loads(str(arrays.pop("config")))
+      self.action = arrays.pop("action")
+    except (OSError, ValueError, KeyError) as error:
+      raise CheckpointError(f"{path} is not a dump of a non-finite step (nan_dump/step_*.npz of a run).") from error
+    part = lambda prefix: {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+    self._state, self.model, self.after = part("state"), part("model/"), part("after/")
+
+  def state(self, env: Env) -> State:
+    """The last good state, for the task it came from."""
+    template = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    names = [name for name, _ in _named(template)]
+    missing = [name for name in names if name not in self._state]
+    if missing:
+      raise CheckpointError(f"The dump does not fit this task: it has no {missing[0]}.")
+    return jax.tree.unflatten(jax.tree.structure(template), [self._state[name] for name in names])
+
+  def replay(self, env: Env) -> State:
+    """Takes the step again, on this machine's backend."""
+    model = env.mjx_model.tree_replace(dict(self.model)) if self.model else None
+    return jax.jit(lambda state, action: env.step(state, action, model))(self.state(env), self.action)
+
+
+def nonfinite_fields(tree: Any) -> list[str]:
+  """Names of the leaves that hold a NaN or infinity, with how many."""
+  lines = []
+  for name, leaf in _named(tree):
+    values = np.asarray(leaf)
+    if np.issubdtype(values.dtype, np.floating) and not np.isfinite(values).all():
+      lines.append(f"{name}: {int((~np.isfinite(values)).sum())} of {values.size}")
+  return lines
+
+
+def _named(tree: Any) -> list[tuple[str, Any]]:
+  flat, _ = jax.tree_util.tree_flatten_with_path(tree)
+  return [(jax.tree_util.keystr(path), leaf) for path, leaf in flat]

@@ -1,0 +1,68 @@
+"""Learning curves of one run, drawn from its metrics.csv."""
+
+from pathlib import Path
+from typing import Any
+
+from playground.runs.files import replacing
+
+_AXES = {  # file name -> (column, its label)
+  "return_over_steps.png": ("step", "environment steps"),
+  "return_over_wall_clock.png": ("time/wall_clock_s", "wall-clock time"),
+}
+
+
+def plot_learning_curve(metrics_csv: str | Path, out_dir: str | Path) -> list[Path]:
+  """Draws the evaluation return (mean ± standard deviation over episodes) over steps and over wall-clock time.
+
+  Args:
+    metrics_csv: needs columns `step` and `eval/episode_reward`; `eval/episode_reward_std` adds the band and
+      `time/wall_clock_s` (seconds) the second picture.
+    out_dir: made if needed.
+
+  Returns:
+    The files written; none if there has been no evaluation yet.
+  """
+  import pandas as pd
+
+  metrics_csv, out_dir = Path(metrics_csv), Path(out_dir)
+  if not metrics_csv.is_file() or metrics_csv.stat().st_size == 0:
+    return []
+  table = pd.read_csv(metrics_csv, on_bad_lines="skip")
+  if "eval/episode_reward" not in table:
+    return []
+  table = table.dropna(subset=["eval/episode_reward"]).sort_values("step")
+  out_dir.mkdir(parents=True, exist_ok=True)
+  written = []
+  for name, (column, label) in _AXES.items():
+    rows = table.dropna(subset=[column]) if column in table else table.iloc[:0]
+    if len(rows):
+      with replacing(out_dir / name) as temporary:
+        _draw(rows, column, label, temporary)
+      written.append(out_dir / name)
+  return written
+
+
+def _draw(rows: Any, column: str, label: str, path: Path) -> None:
+  from matplotlib.figure import Figure  # not pyplot: no global state, no display, safe in any thread
+  from matplotlib.ticker import EngFormatter
+
+  x, mean = rows[column].to_numpy(float), rows["eval/episode_reward"].to_numpy(float)
+  if column == "time/wall_clock_s":
+    unit, seconds = next((u, s) for u, s in (("h", 3600), ("min", 60), ("s", 1)) if x.max() >= 3 * s or s == 1)
+    x, label = x / seconds, f"{label} ({unit})"
+  figure = Figure(figsize=(7, 4.2), layout="constrained")
+  axes = figure.subplots()
+  if "eval/episode_reward_std" in rows:
+    std = rows["eval/episode_reward_std"].fillna(0).to_numpy(float)
+    axes.fill_between(x, mean - std, mean + std, color="tab:blue", alpha=0.18, linewidth=0, label="± std")
+  axes.plot(x, mean, color="tab:blue", linewidth=1.8, marker="o", markersize=3.5, label="mean")
+  axes.set_xlabel(label)
+  axes.set_ylabel("evaluation return")
+  axes.set_title(f"last {mean[-1]:.1f}   best {mean.max():.1f}", loc="right", fontsize=9, color="0.35")
+  if column == "step":
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+  axes.grid(color="0.9")
+  axes.set_axisbelow(True)
+  axes.spines[["top", "right"]].set_visible(False)
+  axes.legend(frameon=False, loc="lower right")
+  figure.savefig(path, dpi=150)

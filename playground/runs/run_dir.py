@@ -1,0 +1,159 @@
+"""The folder of one run: what was asked, on what it ran, how it ended. Layout in design §4."""
+
+import datetime
+import os
+import socket
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import yaml
+from ml_collections import ConfigDict
+
+from playground.errors import CheckpointError, nearest
+from playground.runs.files import plain, read_json, write_json, write_text
+from playground.runs.provenance import git_state, package_versions
+
+RunStatus = Literal["running", "finished", "failed", "preempted"]
+
+
+class RunDirectory:
+  """Paths and records of one run. Get one from `create` (new run) or `open` (resume, eval)."""
+
+  def __init__(self, path: str | Path):
+    self.path = Path(path).expanduser()
+
+  @classmethod
+  def create(
+    cls, path: str | Path, config: Mapping[str, Any] | ConfigDict, overrides: Sequence[str] = ()
+  ) -> "RunDirectory":
+    """Makes the folder and writes the resolved `config` and the command line's `overrides`.
+
+    Raises:
+      CheckpointError: the folder already holds a run, or cannot be made.
+    """
+    run = cls(path)
+    run.must_be_new()
+    try:
+      run.path.mkdir(parents=True, exist_ok=True)
+      write_text(run.overrides_path, yaml.safe_dump(list(overrides), sort_keys=False))
+      # Last, because this file is what makes the folder a run: a creation cut short can simply be repeated.
+      write_text(run.config_path, yaml.safe_dump(plain(config), sort_keys=False))
+    except OSError as error:
+      raise CheckpointError(f"run_dir={run.path} cannot be written: {error.strerror}.") from error
+    return run
+
+  @classmethod
+  def open(cls, path: str | Path) -> "RunDirectory":
+    """Returns the run that lies at `path`.
+
+    Raises:
+      CheckpointError: there is no such folder, or it is not a readable run.
+    """
+    run = cls(path)
+    if not run.path.is_dir():
+      hint = nearest(run.path.name, (p.name for p in run.path.parent.glob("*/")))
+      raise CheckpointError(f"No run directory at {run.path}: there is no such folder.{hint}")
+    if not run.config_path.is_file():
+      raise CheckpointError(f"{run.path} is not a run directory: it has no config.yaml.")
+    try:
+      valid = isinstance(run.config, dict)
+    except (yaml.YAMLError, UnicodeDecodeError):
+      valid = False
+    if not valid:
+      raise CheckpointError(f"{run.path} is not a readable run directory: its config.yaml is damaged.")
+    return run
+
+  def must_be_new(self) -> None:
+    """Raises CheckpointError if the folder holds a run already."""
+    if self.config_path.exists() or self.checkpoints.exists():
+      raise CheckpointError(
+        f"run_dir={self.path} already holds a run: give resume={self.path} to continue it, or another run_dir= "
+        f"(with init_from={self.path} to start anew from its weights)."
+      )
+
+  @property
+  def config_path(self) -> Path:
+    return self.path / "config.yaml"
+
+  @property
+  def overrides_path(self) -> Path:
+    return self.path / "overrides.yaml"
+
+  @property
+  def metrics_csv(self) -> Path:
+    return self.path / "metrics.csv"
+
+  @property
+  def checkpoints(self) -> Path:
+    return self.path / "checkpoints"
+
+  @property
+  def videos(self) -> Path:
+    return self.path / "videos"
+
+  @property
+  def plots(self) -> Path:
+    return self.path / "plots"
+
+  @property
+  def nan_dump(self) -> Path:
+    return self.path / "nan_dump"
+
+  @property
+  def config(self) -> dict[str, Any]:
+    """The resolved config that the run was started with."""
+    return yaml.safe_load(self.config_path.read_text(encoding="utf-8"))
+
+  @property
+  def overrides(self) -> list[str]:
+    """The command line's overrides that the run was started with."""
+    return yaml.safe_load(self.overrides_path.read_text(encoding="utf-8")) if self.overrides_path.is_file() else []
+
+  @property
+  def manifest(self) -> dict[str, Any]:
+    return read_json(self.path / "manifest.json")
+
+  @property
+  def status(self) -> dict[str, Any]:
+    return read_json(self.path / "status.json")
+
+  @property
+  def summary(self) -> dict[str, Any]:
+    return read_json(self.path / "summary.json")
+
+  def write_manifest(self, **fields: Any) -> None:
+    """Records this process: git state, package versions, host, and `fields` (device, precision, seed, timings, …).
+
+    A resumed run may sit on another machine or commit, so the manifests of earlier starts are kept, oldest first,
+    under `earlier_starts`.
+    """
+    earlier = self.manifest
+    starts = [*earlier.pop("earlier_starts", []), *([earlier] if earlier else [])]
+    facts = {"created": _now(), "host": socket.gethostname(), "git": git_state(), "versions": package_versions()}
+    write_json(self.path / "manifest.json", _merged(facts, fields) | {"earlier_starts": starts})
+
+  def update_manifest(self, **fields: Any) -> None:
+    """Merges `fields` into the manifest; nested mappings (`timings={"compile_s": 9.1}`) are merged key by key."""
+    write_json(self.path / "manifest.json", _merged(self.manifest, fields))
+
+  def set_status(self, status: RunStatus, reason: str = "") -> None:
+    """Records how the run stands, when it first started, and which process says so."""
+    if status not in get_args(RunStatus):
+      raise ValueError(f"status must be one of {get_args(RunStatus)}, not {status!r}")
+    started = self.status.get("started", _now())
+    content = {"status": status, "reason": reason, "pid": os.getpid(), "started": started, "updated": _now()}
+    write_json(self.path / "status.json", content)
+
+  def write_summary(self, summary: Mapping[str, Any]) -> None:
+    """Writes the run's result, which sweeps and tables read."""
+    write_json(self.path / "summary.json", summary)
+
+
+def _now() -> str:
+  return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+
+
+def _merged(base: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+  shared = [k for k in new if isinstance(new[k], Mapping) and isinstance(base.get(k), Mapping)]
+  return {**base, **new, **{k: _merged(base[k], new[k]) for k in shared}}

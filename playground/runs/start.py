@@ -1,0 +1,95 @@
+"""Where a run begins: anew, at the last good checkpoint of its own, or from another run's weights."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import jax
+
+from playground.errors import CheckpointError
+from playground.learning.checkpoints import Checkpoint, find_checkpoints
+from playground.learning.loop import Learner
+from playground.runs.run_dir import RunDirectory
+
+if TYPE_CHECKING:
+  from playground.config import RunConfig
+
+
+@dataclasses.dataclass
+class Start:
+  """What was found on disk before anything expensive began, and then what was restored from it.
+
+  Attributes:
+    run_dir: the resumed run's, None for a new run.
+    checkpoints: the resumed run's, newest first.
+    weights: the checkpoint that a new run takes its weights from.
+    notices: sentences for the user, on what was restored and what was skipped.
+    state: the restored training state, on the devices.
+    update: training steps done in it.
+    wall_clock_s: time the run had taken by then.
+    policy: restored weights (host arrays) for a new run.
+  """
+
+  run_dir: RunDirectory | None = None
+  checkpoints: list[Path] = dataclasses.field(default_factory=list)
+  weights: Checkpoint | None = None
+  notices: list[str] = dataclasses.field(default_factory=list)
+  state: Any = None
+  update: int | None = None
+  step: int | None = None
+  wall_clock_s: float = 0.0
+  policy: Any = None
+
+  @classmethod
+  def find(cls, config: "RunConfig") -> Self:
+    """Looks up what `resume`, `init_from` and `run_dir` name.
+
+    Raises:
+      CheckpointError: nothing usable there, or `run_dir` holds a run already.
+    """
+    if config.resume is not None:
+      start = cls(run_dir=RunDirectory.open(config.resume))
+      try:
+        start.checkpoints = find_checkpoints(config.resume)
+      except CheckpointError:
+        start.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
+      return start
+    RunDirectory(config.run_dir).must_be_new()
+    if config.init_from is not None:
+      return cls(weights=Checkpoint(find_checkpoints(config.init_from)[0]))
+    return cls()
+
+  @property
+  def finished(self) -> bool:
+    """Whether the resumed run has nothing left to do."""
+    return self.run_dir is not None and self.run_dir.status.get("status") == "finished"
+
+  def restore(self, learner: Learner, model: Any) -> None:
+    """Reads what there is to restore, checked against the learner's shapes, before anything is compiled.
+
+    Raises:
+      CheckpointError: no checkpoint is whole and fits.
+    """
+    if not self.checkpoints and self.weights is None:
+      return
+    template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), model)
+    policy, rest = learner.split(template)
+    if self.weights is not None:
+      self.policy = self.weights.restore("policy", policy)
+      source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
+      self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is fresh.")
+      return
+    for path in self.checkpoints:
+      try:
+        checkpoint = Checkpoint(path)
+        state = learner.join(checkpoint.restore("policy", policy), checkpoint.restore("state", rest))
+      except CheckpointError as error:
+        if path == self.checkpoints[-1]:
+          raise
+        self.notices.append(f"{error} Falling back to the checkpoint before it.")
+        continue
+      self.state = learner.place(state)
+      self.update, self.step = checkpoint.meta["update"], checkpoint.step
+      self.wall_clock_s = checkpoint.meta["wall_clock_s"]
+      self.notices.append(f"Resuming the whole training state of {path} ({self.step:,} steps).")
+      return

@@ -1,0 +1,130 @@
+"""One training run, from a resolved config to a finished run directory."""
+
+import contextlib
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import jax
+
+from playground import registry
+from playground.envs.base import Env
+from playground.errors import PlaygroundError
+from playground.hardware.setup import setup
+from playground.learning.evaluation import make_evaluator
+from playground.learning.loop import Loop, compile_program, schedule
+from playground.learning.ppo import PPO, PPOConfig
+from playground.randomization import Randomizer
+from playground.runs.interrupts import Interrupted, Interrupts, exit_code
+from playground.runs.job import Job
+from playground.runs.progress import Progress
+from playground.runs.provenance import process_age_s
+from playground.runs.run_dir import RunDirectory
+from playground.runs.start import Start
+
+if TYPE_CHECKING:
+  from playground.config import RunConfig
+
+ROWS = 100  # rows of metrics.csv that a run aims at: a call to the device is about a hundredth of it
+
+
+def train(config: "RunConfig") -> int:
+  """Runs the training that `config` describes.
+
+  Returns:
+    The exit code: 0 when finished, 130 or 143 when interrupted (and saved).
+
+  Raises:
+    PlaygroundError: what the user can act on; a run directory that exists by then says failed and why.
+  """
+  with Interrupts() as interrupts:
+    try:
+      return _train(config, interrupts)
+    except Interrupted as interrupt:
+      print(f"Interrupted by {interrupt}.")
+      return exit_code(interrupt.signum)
+
+
+def _train(config: "RunConfig", interrupts: Interrupts) -> int:
+  start = Start.find(config)
+  if start.finished:
+    print(f"{config.resume} is finished: nothing to resume (init_from={config.resume} trains on from its weights).")
+    return 0
+  hardware = setup(config.hardware)
+  agent = PPOConfig.from_config(config.agent)
+  agent.check(hardware.mesh.size)
+  env = registry.load(config.choices["env"], config=config.env)
+  model, eval_model = randomized_models(env, config, agent)
+  learner = PPO(env, agent, hardware.mesh, model, hardware.network_precision)
+  start.restore(learner, model)
+
+  num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
+  marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
+  run_dir = start.run_dir or RunDirectory.create(config.run_dir, config.resolved, config.overrides)
+  with recorded(run_dir, interrupts), Progress(num_updates * learner.steps_per_update) as progress:
+    notes = [] if not env.parity else ["env.parity=true: playground 0.2.0 bug for bug"]
+    run_dir.write_manifest(
+      seed=config.seed, task=config.choices["env"], impl=env.impl, task_notes=notes, **hardware.facts
+    )
+    for notice in start.notices:
+      progress.print(notice)
+    progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
+    num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
+    evaluate = make_evaluator(env, learner.act, agent.num_eval_envs, hardware.mesh, num_recorded)
+    program = compile_program(learner, evaluate, model, eval_model)
+    timings = {"start_to_compiled_s": process_age_s(), "trace_s": program.trace_s, "compile_s": program.compile_s}
+    run_dir.update_manifest(timings=timings)
+
+    job = Job(config, run_dir, env, learner, progress, interrupts, start)
+    with contextlib.closing(job):
+      loop = Loop(learner, program, marks, config.seed, job, model, eval_model)
+      interrupts.saving = True
+      state = loop.init() if start.state is None else start.state
+      if start.policy is not None:
+        state = learner.with_policy(state, start.policy)
+      state, completed = loop.run(state, start.update)
+      job.finish(loop, state, completed)
+  _say_where(run_dir)
+  return 0 if interrupts.signum is None else exit_code(interrupts.signum)
+
+
+def randomized_models(env: Env, config: "RunConfig", agent: PPOConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+  """Model fields of the training and the evaluation environments, drawn from the run's seed; empty without terms."""
+  randomizer = Randomizer(env.mj_model, config.randomization.terms)
+  if not randomizer.fields:
+    return {}, {}
+  train_key, eval_key = jax.random.split(jax.random.fold_in(jax.random.PRNGKey(config.seed), 1))
+  draw = jax.jit(randomizer.sample_batch)
+  return draw(jax.random.split(train_key, agent.num_envs)), draw(jax.random.split(eval_key, agent.num_eval_envs))
+
+
+@contextlib.contextmanager
+def recorded(run_dir: RunDirectory, interrupts: Interrupts) -> Iterator[None]:
+  """Keeps `status.json` true, whatever ends the block."""
+  run_dir.set_status("running")
+  try:
+    yield
+  except Interrupted as interrupt:
+    run_dir.set_status("preempted", f"{interrupt}, before anything was trained")
+    raise
+  except PlaygroundError as error:
+    run_dir.set_status("failed", str(error))
+    raise
+  except BaseException as error:
+    run_dir.set_status("failed", f"{type(error).__name__}: {error}")
+    raise
+  if interrupts.signum is None:
+    run_dir.set_status("finished")
+  else:
+    run_dir.set_status("preempted", f"signal {interrupts.signum}; resume={run_dir.path} continues")
+
+
+def _say_where(run_dir: RunDirectory) -> None:
+  """The last lines of a run: what lies where."""
+  summary = run_dir.summary
+  print(f"{summary['status']}: return {summary['final_return']}, {summary['steps']:,} steps")
+  places = {"metrics": run_dir.metrics_csv, "plots": run_dir.plots, "checkpoints": run_dir.checkpoints}
+  for name, path in places.items():
+    print(f"  {name:12}{path}")
+  videos = sorted(run_dir.videos.glob("*.mp4"))
+  print(f"  {'video':12}{videos[-1] if videos else 'none'}")

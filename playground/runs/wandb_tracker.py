@@ -1,0 +1,105 @@
+"""Weights & Biases: online if the user is logged in, offline otherwise, and never a reason for a run to stop."""
+
+import contextlib
+import netrc
+import os
+import secrets
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from playground.runs.files import write_text
+
+# wandb 0.31 renamed its public server, and still takes a netrc entry under the old name.
+_PUBLIC_HOSTS = {"api.wandb.ai", "api.forge.coreweave.com"}
+
+
+def logged_in() -> bool:
+  """Returns whether W&B would find credentials (environment or netrc) without asking for them."""
+  if os.environ.get("WANDB_API_KEY") or os.environ.get("WANDB_IDENTITY_TOKEN_FILE"):
+    return True
+  import wandb
+
+  hosts = {urlsplit(os.environ.get("WANDB_BASE_URL") or wandb.Settings().base_url).netloc}
+  if hosts & _PUBLIC_HOSTS:
+    hosts.add("api.wandb.ai")
+  for path in (os.environ.get("NETRC") or "~/.netrc", "~/_netrc"):
+    with contextlib.suppress(OSError, netrc.NetrcParseError):
+      entries = netrc.netrc(os.path.expanduser(path))
+      if any(entries.authenticators(host) for host in hosts):
+        return True
+  return False
+
+
+def resolve_mode(mode: str) -> str:
+  """Returns the mode W&B is started in: `auto` follows $WANDB_MODE, then the login; online needs a login."""
+  if mode == "auto":
+    mode = os.environ.get("WANDB_MODE") or "online"
+  # Online without a key would stop and ask for one.
+  return "offline" if mode == "online" and not logged_in() else mode
+
+
+class WandbTracker:
+  """One W&B run for one run directory, the same one after every resume (its id is kept in `wandb_run_id`).
+
+  Steps logged again after a resume are the same numbers, and W&B ignores those it already has.
+
+  Args:
+    options: `tracking.wandb` (project, entity, group, name, tags, mode).
+    folder: the run directory.
+    config: the whole resolved config.
+    notify: takes one sentence when W&B fails; the run then goes on without it.
+  """
+
+  def __init__(
+    self, options: Mapping[str, Any], folder: Path, config: Mapping[str, Any], notify: Callable[[str], None] = print
+  ):
+    self._notify = notify
+    self._run: Any = None
+    self._guard(lambda: self._start(options, folder, config))
+
+  def log(self, step: int, metrics: dict[str, float]) -> None:
+    if self._run is not None:
+      self._guard(lambda: self._run.log(metrics, step=step))
+
+  def close(self, status: str) -> None:
+    if self._run is not None:
+      self._guard(lambda: self._run.finish(exit_code=0 if status == "finished" else 1))
+      self._run = None
+
+  def _start(self, options: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
+    import wandb
+
+    id_file = folder / "wandb_run_id"
+    if not id_file.is_file():
+      write_text(id_file, secrets.token_hex(4))
+    start = {key: options[key] for key in ("project", "entity", "group", "tags")} | {
+      "name": options["name"] or folder.resolve().name,
+      "id": id_file.read_text().strip(),
+      "config": dict(config),
+      "dir": str(folder),
+      # The progress bar is ours; W&B neither prints nor wraps the terminal.
+      "settings": wandb.Settings(silent=True, console="off", init_timeout=30),
+    }
+    mode: Any = resolve_mode(options["mode"])
+    try:
+      # Offline, the id alone decides, and `resume` would only warn.
+      self._run = wandb.init(**start, mode=mode, resume="allow" if mode == "online" else None)
+    except Exception as error:
+      if mode != "online":
+        raise
+      self._notify(f"W&B cannot be reached ({_reason(error)}): this run is recorded offline, for `wandb sync`.")
+      wandb.teardown()  # its service still holds the id
+      self._run = wandb.init(**start, mode="offline")
+
+  def _guard(self, call: Callable[[], Any]) -> None:
+    try:
+      call()
+    except Exception as error:  # whatever a third-party service throws, training is worth more
+      self._run = None
+      self._notify(f"W&B tracking is off for the rest of this run ({_reason(error)}); metrics.csv goes on.")
+
+
+def _reason(error: Exception) -> str:
+  return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")

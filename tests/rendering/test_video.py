@@ -1,0 +1,141 @@
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import mujoco
+import numpy as np
+import pytest
+
+from playground.rendering import gl, video
+from playground.rendering.gl import NO_GL_REMEDY, find_gl
+from playground.rendering.video import frame_stride, render_video
+
+XML = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <camera name="fixed" pos="0 -3 1" xyaxes="1 0 0 0 .3 1"/>
+    <geom type="plane" size="5 5 .1"/>
+    <body name="ball" pos="0 0 .5"><freejoint/><geom size=".1"/></body>
+    <body name="goal" mocap="true"><geom size=".05" contype="0" conaffinity="0"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.fixture(autouse=True)
+def fresh_probe():
+  find_gl.cache_clear()
+  yield
+  find_gl.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def model() -> Any:
+  return mujoco.MjModel.from_xml_string(XML)
+
+
+@pytest.fixture
+def needs_gl() -> str:
+  backend = find_gl()
+  if backend is None:
+    pytest.skip(NO_GL_REMEDY)
+  return backend
+
+
+def path_of_ball(model: Any, rows: int) -> np.ndarray:
+  qpos = np.tile(model.qpos0, (rows, 1))
+  qpos[:, 0] = np.linspace(0, 1, rows)
+  return qpos
+
+
+def test_a_bogus_backend_is_passed_over(monkeypatch: pytest.MonkeyPatch):
+  monkeypatch.delenv("DISPLAY", raising=False)
+  assert not gl.works("bogus")
+  monkeypatch.setenv("MUJOCO_GL", "bogus")
+  assert find_gl() in ("egl", "osmesa", None)
+
+
+def test_a_stale_platform_variable_does_not_break_the_probe(monkeypatch: pytest.MonkeyPatch, needs_gl: str):
+  monkeypatch.setenv("PYOPENGL_PLATFORM", "glx")
+  assert gl.works(needs_gl)
+
+
+def test_probes_go_in_order_and_happen_once(monkeypatch: pytest.MonkeyPatch):
+  tried: list[str] = []
+  monkeypatch.setattr(gl, "works", lambda backend: bool(tried.append(backend)))
+  monkeypatch.setenv("MUJOCO_GL", "osmesa")
+  monkeypatch.setenv("DISPLAY", ":0")
+  assert find_gl() is None and find_gl() is None
+  assert tried == ["osmesa", "egl", "glfw"]
+
+
+def test_without_gl_there_is_one_sentence_and_no_video(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: Any):
+  monkeypatch.setenv("MUJOCO_GL", "disable")
+  said: list[str] = []
+  assert render_video(model, path_of_ball(model, 3), tmp_path / "a.mp4", dt=0.02, notify=said.append) is None
+  assert said == [f"No video at a.mp4. {NO_GL_REMEDY}"]
+  assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+  ("dt", "stride"), [(0.02, 1), (0.01, 2), (0.004, 5), (0.0025, 8), (0.05, 1), (0.03, 1), (0.015, 2)]
+)
+def test_frame_stride_keeps_real_time_at_50_fps_or_less(dt: float, stride: int):
+  assert frame_stride(dt) == stride
+
+
+def test_video_is_real_time_and_shows_motion(tmp_path: Path, model: Any, needs_gl: str):
+  mocap_pos, mocap_quat = np.zeros((60, 1, 3)), np.tile([1.0, 0, 0, 0], (60, 1, 1))
+  out = render_video(
+    model,
+    path_of_ball(model, 60),
+    tmp_path / "videos" / "a.mp4",
+    dt=0.01,
+    width=160,
+    height=120,
+    mocap_pos=mocap_pos,
+    mocap_quat=mocap_quat,
+    notify=pytest.fail,
+  )
+  assert out == tmp_path / "videos" / "a.mp4" and list((tmp_path / "videos").iterdir()) == [out]
+  reader = imageio_ffmpeg.read_frames(str(out))
+  meta: Any = next(reader)
+  frames = [np.frombuffer(frame, np.uint8) for frame in reader if isinstance(frame, bytes)]
+  assert meta["fps"] == 50 and meta["size"] == (160, 120) and len(frames) == 30
+  assert np.abs(frames[0].astype(int) - frames[-1].astype(int)).max() > 30
+
+
+def test_rows_after_a_nan_are_left_out(tmp_path: Path, model: Any, needs_gl: str):
+  qpos = path_of_ball(model, 20)
+  qpos[10:] = np.nan
+  out = render_video(model, qpos, tmp_path / "a.mp4", dt=0.02, width=64, height=64, notify=pytest.fail)
+  assert out and imageio_ffmpeg.count_frames_and_secs(str(out))[0] == 10
+
+
+@pytest.mark.parametrize(
+  ("options", "sentence"),
+  [
+    ({"camera": "fixd"}, "the model has no camera 'fixd', only fixed. Did you mean 'fixed'?"),
+    ({"timeout_s": 0.3}, "took longer than 0.3 s"),
+  ],
+)
+def test_failure_is_one_sentence_and_leaves_nothing(
+  tmp_path: Path, model: Any, needs_gl: str, options: dict[str, Any], sentence: str
+):
+  said: list[str] = []
+  qpos = path_of_ball(model, 500)
+  assert render_video(model, qpos, tmp_path / "a.mp4", dt=0.02, notify=said.append, **options) is None
+  assert len(said) == 1 and sentence in said[0] and "\n" not in said[0]
+  assert list(tmp_path.iterdir()) == []
+
+
+def test_a_crash_of_the_renderer_does_not_reach_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: Any):
+  monkeypatch.setattr(video, "find_gl", lambda: "bogus")  # the child dies importing mujoco
+  said: list[str] = []
+  assert render_video(model, path_of_ball(model, 3), tmp_path / "a.mp4", dt=0.02, notify=said.append) is None
+  assert len(said) == 1 and "bogus" in said[0]
+
+
+def test_qpos_of_another_model_is_refused(tmp_path: Path, model: Any):
+  with pytest.raises(ValueError, match=r"\[T, 7\]"):
+    video.save_trajectory(tmp_path / "t.npz", model, np.zeros((5, 3)))

@@ -1,0 +1,114 @@
+import json
+import math
+import os
+import subprocess
+from pathlib import Path
+
+import ml_collections
+import numpy as np
+import pytest
+
+from playground.errors import CheckpointError
+from playground.runs.files import replacing
+from playground.runs.provenance import git_state
+from playground.runs.run_dir import RunDirectory
+
+CONFIG = {"seed": 1, "agent": {"learning_rate": 1e-5, "layers": (32, 32), "decay": None}}
+
+
+def test_config_and_overrides_survive_the_round_trip(tmp_path: Path):
+  RunDirectory.create(tmp_path / "a" / "run", ml_collections.ConfigDict(CONFIG), ["seed=1", "env=X"])
+  run = RunDirectory.open(tmp_path / "a" / "run")
+  assert run.config == {"seed": 1, "agent": {"learning_rate": 1e-5, "layers": [32, 32], "decay": None}}
+  assert isinstance(run.config["agent"]["learning_rate"], float)
+  assert run.overrides == ["seed=1", "env=X"]
+
+
+@pytest.mark.parametrize("trace", ["config.yaml", "checkpoints"])
+def test_create_refuses_an_existing_run_and_names_both_verbs(tmp_path: Path, trace: str):
+  (tmp_path / trace).mkdir() if trace == "checkpoints" else (tmp_path / trace).write_text("seed: 1\n")
+  with pytest.raises(CheckpointError) as error:
+    RunDirectory.create(tmp_path, CONFIG)
+  message = str(error.value)
+  assert f"resume={tmp_path}" in message and f"init_from={tmp_path}" in message and "run_dir=" in message
+  assert "\n" not in message
+
+
+def test_create_takes_an_empty_or_unrelated_folder(tmp_path: Path):
+  (tmp_path / "notes.txt").write_text("mine")
+  assert RunDirectory.create(tmp_path, CONFIG).config["seed"] == 1
+
+
+def test_create_where_a_file_lies_is_one_sentence(tmp_path: Path):
+  (tmp_path / "file").write_text("")
+  with pytest.raises(CheckpointError, match="cannot be written"):
+    RunDirectory.create(tmp_path / "file" / "run", CONFIG)
+
+
+def test_open_names_what_is_missing(tmp_path: Path):
+  RunDirectory.create(tmp_path / "cartpole", CONFIG)
+  (tmp_path / "empty").mkdir()
+  with pytest.raises(CheckpointError, match=r"no such folder\. Did you mean 'cartpole'"):
+    RunDirectory.open(tmp_path / "cartpoel")
+  with pytest.raises(CheckpointError, match=r"no config\.yaml"):
+    RunDirectory.open(tmp_path / "empty")
+  (tmp_path / "empty" / "config.yaml").write_text("seed: [1")
+  with pytest.raises(CheckpointError, match="damaged"):
+    RunDirectory.open(tmp_path / "empty")
+
+
+def test_manifest_has_versions_merges_timings_and_keeps_earlier_starts(tmp_path: Path):
+  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run.write_manifest(seed=1, device={"kind": "cpu", "count": 1}, timings={"trace_s": 0.5})
+  run.update_manifest(timings={"compile_s": np.float32(2.0)})
+  manifest = run.manifest
+  assert manifest["timings"] == {"trace_s": 0.5, "compile_s": 2.0}
+  assert manifest["versions"]["jax"] and manifest["versions"]["python"]
+  assert manifest["earlier_starts"] == []
+  for seed in (2, 3):
+    run.write_manifest(seed=seed)
+  assert [start["seed"] for start in run.manifest["earlier_starts"]] == [1, 2]
+
+
+def test_status_keeps_the_first_start_and_refuses_other_words(tmp_path: Path):
+  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run.set_status("running")
+  started = run.status["started"]
+  run.set_status("preempted", reason="SIGTERM")
+  assert run.status["status"] == "preempted" and run.status["reason"] == "SIGTERM"
+  assert run.status["started"] == started and run.status["pid"] == os.getpid()
+  with pytest.raises(ValueError, match="status must be"):
+    run.set_status("done")  # pyright: ignore[reportArgumentType]
+
+
+def test_summary_is_strict_json(tmp_path: Path):
+  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run.write_summary({"final_return": math.nan, "steps": np.int64(7), "curve": np.ones(2)})
+  text = (run.path / "summary.json").read_text()
+  assert json.loads(text, parse_constant=pytest.fail) == {"final_return": None, "steps": 7, "curve": [1.0, 1.0]}
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path):
+  path = tmp_path / "a.json"
+  path.write_text("old")
+  with pytest.raises(RuntimeError), replacing(path) as temporary:
+    temporary.write_text("half")
+    raise RuntimeError
+  assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_git_state_is_of_this_checkout_only(tmp_path: Path):
+  def git(*args: str) -> None:
+    identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
+    subprocess.run(["git", "-C", str(tmp_path), *identity, *args], check=True, capture_output=True)
+
+  assert git_state(tmp_path) is None
+  git("init")
+  git("commit", "--allow-empty", "-m", "first")
+  state = git_state(tmp_path)
+  assert state and len(state["commit"]) == 40 and state["dirty"] is False
+  (tmp_path / "site-packages").mkdir()
+  assert git_state(tmp_path / "site-packages") is None  # somebody else's repository
+  (tmp_path / "new.txt").write_text("x")
+  state = git_state(tmp_path)
+  assert state and state["dirty"] is True
