@@ -234,7 +234,10 @@ class Loop:
     row: Metrics = {}
     step = done.mark.update * self._learner.steps_per_update
     if done.trained is not None:
-      row |= {f"training/{k}": float(v) for k, v in jax.device_get(done.trained).items()}
+      report = {k: float(v) for k, v in jax.device_get(done.trained).items()}
+      # No episode ended in this stretch: then there is no mean over episodes to log.
+      means = () if report["episodes"] else [k for k in report if k.startswith("episode_")]
+      row |= {f"training/{k}": v for k, v in report.items() if k not in means}
       seconds = self._lap()
       steps = done.num_updates * self._learner.steps_per_update
       row["time/steps_per_second"] = steps / seconds

@@ -160,7 +160,11 @@ class PPO:
 
   def with_policy(self, state: TrainState, policy: Policy) -> TrainState:
     """A state that acts with `policy` (host arrays), all else unchanged."""
-    return self.join(jax.device_put(policy, NamedSharding(self.mesh, P()), may_alias=False), state)
+    return self.join(self.place_policy(policy), state)
+
+  def place_policy(self, policy: Policy) -> Policy:
+    """Puts a policy's host arrays on every device."""
+    return jax.device_put(policy, NamedSharding(self.mesh, P()), may_alias=False)
 
   def act(self, policy: Policy, obs: Observation, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
     """Actions in [-1, 1], [..., action_size]; deterministic as `deterministic_eval` says if not given."""
@@ -291,7 +295,7 @@ class PPO:
     for name, value in total.items():
       if name.startswith("episode_"):
         short = {"episode_sum_reward": "episode_reward"}.get(name, name)
-        report[short] = jnp.where(total["episodes"] > 0, value / episodes, jnp.nan)
+        report[short] = value / episodes
       elif name in ("episodes", "nonfinite"):
         report[name] = value
       elif name == "nonfinite_updates":

@@ -134,23 +134,17 @@ class Job:
 
   def _start_video(self, step: int, recording: Any) -> None:
     """Renders the first recorded episodes in a child process while training goes on."""
-    tape = {name: np.asarray(value) for name, value in jax.device_get(recording).items()}
-    episodes = min(self._config.video.episodes, tape["active"].shape[1])
-    rows = np.concatenate([np.flatnonzero(tape["active"][:, i]) for i in range(episodes)])
-    columns = np.repeat(np.arange(episodes), [int((tape["active"][:, i] > 0).sum()) for i in range(episodes)])
     view = self._config.video
-    mocap = {k: tape[k][rows, columns] for k in ("mocap_pos", "mocap_quat") if tape[k].size}
     self._video = self._videos.submit(
       render_video,
       self._env.mj_model,
-      tape["qpos"][rows, columns],
-      self._run_dir.videos / f"step_{step:012d}.mp4",
+      out_path=self._run_dir.videos / f"step_{step:012d}.mp4",
       dt=self._env.dt * self._env.action_repeat,
       camera=view.camera,
       width=view.width,
       height=view.height,
       notify=self._progress.print,
-      **mocap,
+      **episodes_of(recording, view.episodes),
     )
 
   def _trace(self, metrics: Metrics) -> None:
@@ -184,3 +178,11 @@ class Job:
         f"{fraction:.1%} of the environment steps before step {step:,} went NaN or infinite, more than "
         f"on_nonfinite.max_fraction={self._config.on_nonfinite.max_fraction:g}.{where}"
       )
+
+
+def episodes_of(recording: Any, count: int) -> dict[str, Any]:
+  """The first `count` episodes of an evaluation's recording, one after the other: `qpos` [T, nq] and mocap poses."""
+  tape = {name: np.asarray(value) for name, value in jax.device_get(recording).items()}
+  active = tape.pop("active")[:, :count] > 0
+  columns, rows = np.nonzero(active.T)
+  return {name: value[rows, columns] for name, value in tape.items() if value.size}

@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 
@@ -54,7 +54,7 @@ def _train(config: "RunConfig", interrupts: Interrupts) -> int:
   agent = PPOConfig.from_config(config.agent)
   agent.check(hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
-  model, eval_model = randomized_models(env, config, agent)
+  model, eval_model = randomized_models(env, config, agent.num_envs, agent.num_eval_envs)
   learner = PPO(env, agent, hardware.mesh, model, hardware.network_precision)
   start.restore(learner, model)
 
@@ -88,14 +88,16 @@ def _train(config: "RunConfig", interrupts: Interrupts) -> int:
   return 0 if interrupts.signum is None else exit_code(interrupts.signum)
 
 
-def randomized_models(env: Env, config: "RunConfig", agent: PPOConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+def randomized_models(
+  env: Env, config: "RunConfig", num_envs: int, num_eval_envs: int
+) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
   """Model fields of the training and the evaluation environments, drawn from the run's seed; empty without terms."""
   randomizer = Randomizer(env.mj_model, config.randomization.terms)
   if not randomizer.fields:
     return {}, {}
   train_key, eval_key = jax.random.split(jax.random.fold_in(jax.random.PRNGKey(config.seed), 1))
   draw = jax.jit(randomizer.sample_batch)
-  return draw(jax.random.split(train_key, agent.num_envs)), draw(jax.random.split(eval_key, agent.num_eval_envs))
+  return draw(jax.random.split(train_key, num_envs)), draw(jax.random.split(eval_key, num_eval_envs))
 
 
 @contextlib.contextmanager

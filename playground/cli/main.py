@@ -1,0 +1,155 @@
+"""`playground`: the commands beside training. They parse, call and print."""
+
+import argparse
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from playground import registry
+from playground.config import RunConfig, compose, format_value
+from playground.errors import PlaygroundError, UnknownNameError, nearest
+
+if TYPE_CHECKING:
+  from rich.console import RenderableType
+
+  from playground.envs.base import Env
+
+
+def main() -> None:
+  """Runs a command and exits with its code; 2 for what the user can act on."""
+  args = _parser().parse_args()
+  try:
+    code = args.command(args)
+  except PlaygroundError as error:
+    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    code = 2
+  except BrokenPipeError:  # `playground list | head`
+    sys.stderr.close()
+    code = 0
+  sys.exit(code)
+
+
+def _parser() -> argparse.ArgumentParser:
+  parser = argparse.ArgumentParser(prog="playground", description="Robot learning tasks; train with playground-run.")
+  commands = parser.add_subparsers(required=True, metavar="command")
+
+  def add(name: str, command: Any, what: str) -> argparse.ArgumentParser:
+    sub = commands.add_parser(name, help=what, description=what)
+    sub.set_defaults(command=command)
+    return sub
+
+  add("list", _list, "List tasks.").add_argument("word", nargs="?", help="only tasks whose name contains it")
+  show = add("show", _show, "Show what a task observes, does, is paid for and is trained with.")
+  show.add_argument("task")
+  show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
+  add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
+  evaluate = add("eval", _eval, "Evaluate a run's last checkpoint.")
+  evaluate.add_argument("run", type=Path, help="run directory")
+  evaluate.add_argument("--episodes", type=int, default=128)
+  evaluate.add_argument("--seed", type=int, default=0)
+  add("replay", _replay, "Replay a dump of a state that went NaN.").add_argument("dump", type=Path)
+  return parser
+
+
+def _list(args: argparse.Namespace) -> int:
+  found = registry.names(args.word)
+  if not found:
+    near = nearest(args.word, registry.names())
+    raise UnknownNameError(f"No task's name contains {args.word!r}: `playground list` shows all.{near}")
+  print("\n".join(found))
+  return 0
+
+
+def _doctor(args: argparse.Namespace) -> int:
+  from playground.cli.doctor import doctor
+
+  return doctor()
+
+
+def _eval(args: argparse.Namespace) -> int:
+  from playground.cli.eval import evaluate_run
+
+  return int(evaluate_run(args.run, episodes=args.episodes, seed=args.seed) or 0)
+
+
+def _replay(args: argparse.Namespace) -> int:
+  from playground.cli.replay import replay
+
+  return int(replay(args.dump) or 0)
+
+
+def _show(args: argparse.Namespace) -> int:
+  config = compose([f"env={args.task}", *args.overrides])
+  from rich.console import Console
+
+  env = registry.build(config.env)
+  console = Console()
+  for part in describe(config, env):
+    console.print(part)
+  return 0
+
+
+def describe(config: RunConfig, env: "Env") -> "Iterable[RenderableType]":
+  """Tables about a task: facts, observation, reward terms, randomisation, hyperparameters."""
+  import jax
+
+  from playground.randomization import Randomizer
+
+  section, choices = config.resolved["env"], config.choices
+  state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+  ctrl = [f"[{low:g}, {high:g}]" for low, high in dict.fromkeys(map(tuple, env.mj_model.actuator_ctrlrange))]
+  auto = f"auto: jax on CPU, {section['cuda_impl']} on an NVIDIA GPU"
+  facts = {
+    "class": section["task"],
+    "robot": choices.get("robot") or "its own",
+    "action": f"{env.action_size} in [-1, 1]",
+    "actuators": f"{env.mj_model.nu}, ctrl in {', '.join(ctrl)}",
+    "control": f"{1 / env.dt:g} Hz ({env.dt:g} s), each action applied {env.action_repeat} x",
+    "physics": f"{1 / env.sim_dt:g} Hz ({env.sim_dt:g} s), {env.n_substeps} per control step",
+    "episode": f"{env.episode_length} control steps ({env.episode_length * env.dt:g} s)",
+    "backend": auto if section["impl"] == "auto" else section["impl"],
+  }
+  yield _table(f"{choices['env']}", facts.items())
+  yield _table("observation", _observation(env, state.obs, section))
+  scales = section.get("reward", {}).get("scales", {})
+  terms = [name.removeprefix("reward/") for name in state.metrics if name.startswith("reward/")]
+  yield _table("reward terms and weights", ((t, scales.get(t, "")) for t in dict.fromkeys([*scales, *terms])))
+  rows = Randomizer(env.mj_model, config.resolved["randomization"]["terms"]).describe()
+  drawn = [(row["field"], f"{row['target']}: {row['operation']} {row['draw']}") for row in rows]
+  yield _table(f"randomization: {choices['randomization']}", drawn)
+  origin = f"tuned/{choices['tuned']}.yaml" if choices.get("tuned") else "defaults, not tuned for this task"
+  yield _table(f"{config.agent.name} ({origin})", _flat(config.resolved["agent"]))
+
+
+def _observation(env: "Env", obs: Any, section: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
+  """Rows of the observation: each entry's size, below it its parts, with sizes where the task tells them."""
+  parts: Mapping[str, Any] = getattr(env, "observation_parts", None) or section.get("obs", {})
+  entries = obs if isinstance(obs, Mapping) else {"state": obs}
+  for group in [g for g in parts if g in entries] + [g for g in entries if g not in parts]:
+    yield group, " x ".join(map(str, entries[group].shape))
+    named = parts.get(group, ())
+    yield from ((f"  {part}", named[part] if isinstance(named, Mapping) else "") for part in named)
+
+
+def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+  for key, value in node.items():
+    if isinstance(value, Mapping):
+      yield from _flat(value, f"{prefix}{key}.")
+    else:
+      yield f"{prefix}{key}", value
+
+
+def _table(title: str, rows: Iterable[tuple[str, Any]]) -> "RenderableType":
+  from rich.console import Group
+  from rich.table import Table
+  from rich.text import Text
+
+  table = Table(show_header=False, box=None, padding=(0, 2))
+  for key, value in list(rows) or [("none", "")]:
+    table.add_row(Text(key, style="cyan"), Text(format_value(value)))
+  return Group(Text(title, style="bold"), table)
+
+
+if __name__ == "__main__":
+  main()

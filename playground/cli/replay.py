@@ -1,0 +1,37 @@
+"""`playground replay <dump>`: takes the step again that went NaN or infinite, and says where."""
+
+import jax
+from rich.console import Console
+
+from playground import config as configs
+from playground import registry
+from playground.hardware.setup import setup
+from playground.runs.nonfinite import Dump, nonfinite_fields
+
+
+def replay(path: str, console: Console | None = None) -> int:
+  """Prints what was not finite in the dumped step and in its replay on this machine.
+
+  Args:
+    path: a run's `nan_dump/step_*.npz`.
+    console: for the output.
+
+  Returns:
+    0 if the replay is not finite either, 1 if this machine cannot reproduce it.
+  """
+  console = console or Console()
+  dump = Dump(path)
+  run = configs.from_dict(dump.config)
+  hardware = setup(run.hardware)
+  env = registry.load(run.choices["env"], config=run.env)
+  before = dump.state(env)
+  console.print(f"{run.choices['env']} at physics time {float(before.data.time):.3f} s, action {dump.action.tolist()}")
+  console.print(f"recorded: {_listed(nonfinite_fields(dump.after))}")
+  again = jax.device_get(dump.replay(env))
+  bad = nonfinite_fields({"data": again.data, "obs": again.obs, "reward": again.reward})
+  console.print(f"replayed on {hardware.facts['device']} with impl={env.impl}: {_listed(bad)}")
+  return 0 if bad else 1
+
+
+def _listed(fields: list[str]) -> str:
+  return "not finite in " + "; ".join(fields) if fields else "all finite"

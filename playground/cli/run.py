@@ -1,0 +1,82 @@
+"""`playground-run`: composes a run's configuration, checks it, trains.
+
+Our check comes first, so that a mistake is one sentence; the rest is a Hydra app, with its flags (`--cfg job`,
+`--help`, `--info`, `-m`).
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+
+import hydra
+from hydra._internal.utils import get_args_parser  # Hydra has no public name for its own flags
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+
+from playground.config import (
+  RunConfig,
+  compose,
+  config_roots,
+  search_path_override,
+  to_yaml,
+  tree,
+  with_default_experiment,
+)
+from playground.errors import PlaygroundError
+
+
+def main() -> None:
+  """Runs the command and exits: 0 done, 2 for what the user can act on, 130 or 143 when interrupted."""
+  os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is not a PlaygroundError is a bug: show all of it
+  try:
+    code = _main(sys.argv[1:])
+  except (PlaygroundError, HydraException) as error:
+    code = _report(error)
+  except BrokenPipeError:  # `playground-run --help | head`
+    sys.stderr.close()
+    code = 0
+  sys.exit(code)
+
+
+def _main(argv: Sequence[str]) -> int:
+  args, others = get_args_parser().parse_known_args(argv)
+  overrides = [*args.overrides, *(other for other in others if not other.startswith("-"))]
+  flags = [arg for arg in argv if arg not in overrides]
+  config = None
+  if args.multirun or args.help:  # the jobs of a sweep are checked one by one
+    overrides = with_default_experiment(overrides)
+  elif not (args.hydra_help or args.info or args.shell_completion):
+    config = compose(overrides)
+    overrides = [*config.overrides, *(o for o in overrides if o.lstrip("+~").startswith(("hydra.", "hydra/")))]
+    if args.cfg == "job" and config.resume:  # the run's own, which Hydra cannot compose
+      print(to_yaml(config))
+      return 0
+
+  codes = []
+
+  def job(_: object) -> None:
+    codes.append(_train(config, list(HydraConfig.get().overrides.task)))
+
+  roots = config_roots()
+  sys.argv[1:] = [*flags, *overrides, *search_path_override(roots)]
+  hydra.main(config_path=str(roots[0]), config_name="config", version_base="1.3")(job)()
+  return next((code for code in codes if code), 0)
+
+
+def _train(config: RunConfig | None, overrides: Sequence[str]) -> int:
+  try:
+    config = config or compose(overrides)
+    from rich.console import Console
+
+    Console().print(tree(config))
+    from playground.runs.train import train  # imports JAX
+
+    return train(config)
+  except PlaygroundError as error:
+    return _report(error)
+
+
+def _report(error: Exception) -> int:
+  sys.stdout.flush()
+  print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+  return 2

@@ -1,0 +1,96 @@
+"""Parts that observations are concatenated from. A new one is a function here and its name in `env.obs`.
+
+Sensors, site poses and actuator forces are one physics step older than `qpos` and `qvel`, as MuJoCo leaves them.
+Noise (`env.noise.scales`) is drawn in the order of `OBSERVATIONS`.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from playground.mdp.legged import Context
+
+
+def gyro(c: Context) -> jax.Array:
+  """Angular velocity of the base in its own frame, rad/s [3]."""
+  return c.sensor("gyro")
+
+
+def gravity(c: Context) -> jax.Array:
+  """Direction of gravity in the base frame [3]."""
+  return c.gravity
+
+
+def joint_pos(c: Context) -> jax.Array:
+  """Joint positions relative to the default pose, rad [nu]."""
+  return c.joint_pos - c.robot.default_pose
+
+
+def joint_vel(c: Context) -> jax.Array:
+  """Joint velocities, rad/s [nu]."""
+  return c.joint_vel
+
+
+def linvel(c: Context) -> jax.Array:
+  """Linear velocity of the base in its own frame, m/s [3]."""
+  return c.sensor("linvel")
+
+
+def last_act(c: Context) -> jax.Array:
+  """The action before the one just applied [nu]."""
+  return c.info["last_act"]
+
+
+def command(c: Context) -> jax.Array:
+  """Velocity asked for: forward m/s, left m/s, turn rad/s [3]."""
+  return c.command
+
+
+def accelerometer(c: Context) -> jax.Array:
+  """Proper acceleration of the base in its own frame, m/s² [3]."""
+  return c.sensor("accelerometer")
+
+
+def global_angvel(c: Context) -> jax.Array:
+  """Angular velocity of the base in the world frame, rad/s [3]."""
+  return c.sensor("global_angvel")
+
+
+def actuator_force(c: Context) -> jax.Array:
+  """Joint torques, N m [nu]."""
+  return c.data.actuator_force
+
+
+def last_contact(c: Context) -> jax.Array:
+  """Which feet touched the floor in the step before, 0 or 1 [feet]."""
+  return c.info["last_contact"].astype(jnp.float32)
+
+
+def feet_velocity(c: Context) -> jax.Array:
+  """World velocities of the feet, m/s [3 * feet]."""
+  return c.feet_velocity.ravel()
+
+
+def feet_air_time(c: Context) -> jax.Array:
+  """How long each foot has been in the air, s [feet]."""
+  return c.info["feet_air_time"]
+
+
+def push_force(c: Context) -> jax.Array:
+  """Force of a push on the root body, world frame, N [3]."""
+  return c.data.xfrc_applied[c.robot.root, :3]
+
+
+def pushed(c: Context) -> jax.Array:
+  """Whether a push is under way, 0 or 1 [1]."""
+  return (c.info["steps_since_last_pert"] >= c.info["steps_until_next_pert"]).astype(jnp.float32)[None]
+
+
+OBSERVATIONS: dict[str, Callable[[Context], jax.Array]] = {
+  f.__name__: f
+  for f in (
+    gyro, gravity, joint_pos, joint_vel, linvel, last_act, command, accelerometer, global_angvel, actuator_force,
+    last_contact, feet_velocity, feet_air_time, push_force, pushed,
+  )
+}  # fmt: skip

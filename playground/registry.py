@@ -1,0 +1,123 @@
+"""Task name to task: a file `configs/env/<TaskName>.yaml` is the registration, `task: module:Class` in it the code.
+
+Outside packages add tasks through an entry point of the group `playground.tasks`:
+
+```toml
+[project.entry-points."playground.tasks"]
+my_pkg = "my_pkg:CONFIGS"     # CONFIGS = Path(__file__).parent / "configs", or a function that returns it
+```
+
+The folder is laid out like our `configs/`: `env/MyTask.yaml`, and whatever else belongs to it (`tuned/ppo/MyTask.yaml`,
+`robot/my_robot.yaml`, `experiment/...`). Its files may use our groups and options in their defaults lists.
+"""
+
+import functools
+import importlib
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from ml_collections import ConfigDict
+
+from playground.config import compose, override_section, task_names
+from playground.errors import ConfigError, UnknownNameError, nearest
+
+if TYPE_CHECKING:
+  from playground.envs.base import Env
+
+ALL_ENVS: tuple[str, ...]  # every task's name, read when asked for
+
+
+def __getattr__(name: str) -> Any:
+  if name == "ALL_ENVS":
+    return tuple(names())
+  raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def names(word: str | None = None) -> list[str]:
+  """Names of all tasks, sorted; with a word, of those that contain it (in any case)."""
+  return [name for name in task_names() if word is None or word.lower() in name.lower()]
+
+
+def config(name: str) -> ConfigDict:
+  """A task's configuration as its file has it, the robot under `robot`: a fresh copy, yours to change.
+
+  Raises:
+    UnknownNameError: no such task.
+  """
+  return _composed(name).env.copy_and_resolve_references()
+
+
+get_default_config = config
+
+
+def load(
+  name: str,
+  config: Mapping[str, Any] | None = None,
+  overrides: Mapping[str, Any] | None = None,
+  config_overrides: Mapping[str, Any] | None = None,
+) -> "Env":
+  """Builds a task.
+
+  Args:
+    name: one of `names()`.
+    config: a whole configuration to use in place of the task's own; it is not changed.
+    overrides: values by dotted key, `{"reward.scales.energy": -0.002}`.
+    config_overrides: the same, under the name that Playground 0.2.0 had for it.
+
+  Raises:
+    UnknownNameError: no such task or key.
+    ConfigError: a value that cannot be.
+  """
+  default = _composed(name).env if config is None else config
+  section = override_section("env", default, {**(overrides or {}), **(config_overrides or {})})
+  return build(ConfigDict(section))
+
+
+def build(env_config: ConfigDict) -> "Env":
+  """Builds the task that a composed env section describes."""
+  return task_class(str(env_config.task))(env_config)
+
+
+def task_class(task: str) -> Callable[[ConfigDict], "Env"]:
+  """Imports the class that `module:Class` names; raises ConfigError if there is none."""
+  module_name, _, class_name = task.partition(":")
+  try:
+    module = importlib.import_module(module_name)
+  except ModuleNotFoundError as error:
+    if not f"{module_name}.".startswith(f"{error.name}."):  # the module is there, something that it needs is not
+      raise
+    raise ConfigError(f"env.task={task}: there is no module {error.name}; write module:Class.") from None
+  except ValueError:  # an empty name
+    raise ConfigError(f"env.task={task} is not of the form module:Class.") from None
+  if not isinstance(getattr(module, class_name, None), type):
+    classes = [n for n, value in vars(module).items() if isinstance(value, type) and value.__module__ == module_name]
+    near = nearest(class_name, classes)
+    raise ConfigError(f"env.task={task}: {module_name} has no class {class_name or '(write module:Class)'}.{near}")
+  return getattr(module, class_name)
+
+
+def get_domain_randomizer(name: str) -> Callable[..., Any] | None:
+  """The task's randomisation as Playground 0.2.0 gave it, or None if it has none.
+
+  Returns:
+    A function `(mjx_model, rng [N]) -> (model, in_axes)`: the model with a leading axis N on every randomised field,
+    and the same structure with 0 at those fields and None elsewhere.
+  """
+  terms = _composed(name).randomization.terms
+  if not terms:
+    return None
+
+  @functools.cache
+  def randomizer() -> Callable[..., Any]:
+    from playground.randomization import domain_randomizer
+
+    return domain_randomizer(load(name).mj_model, terms)
+
+  return lambda mjx_model, rng: randomizer()(mjx_model, rng)
+
+
+def _composed(name: str) -> Any:
+  """The composition of a task alone: no tuned set, whose env values belong to an algorithm."""
+  if name not in task_names():
+    raise UnknownNameError(f"Task {name!r} does not exist; `playground list` shows all.{nearest(name, task_names())}")
+  return compose([f"env={name}", "tuned=null"])

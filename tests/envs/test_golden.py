@@ -1,0 +1,52 @@
+"""Every task with a recording reproduces Playground 0.2.0: its functions exactly, one step of physics to rounding."""
+
+import jax
+import numpy as np
+import pytest
+
+from playground.envs.base import State
+from tests.envs.golden import TASKS, Golden, golden, pairs
+
+# Ten times what a change of qpos, qvel and qacc_warmstart by one rounding moves one step, relative to max(1, largest
+# entry). Obs, metrics and info mix these; the sensors' bound holds for them.
+STEP_BOUNDS = {"data/qpos": 2e-5, "data/qvel": 1e-3, "data/qacc": 1e-2, "data/qacc_warmstart": 1e-2}
+OTHER_BOUND = 2e-3
+
+
+@pytest.fixture(params=TASKS, scope="module")
+def recording(request: pytest.FixtureRequest) -> Golden:
+  return golden(request.param)
+
+
+def before(recording: Golden) -> State:
+  return jax.tree.map(lambda x: x[:-1], recording.states)
+
+
+def after(recording: Golden) -> State:
+  return jax.tree.map(lambda x: x[1:], recording.states)
+
+
+def test_nothing_recorded_is_left_out(recording: Golden) -> None:
+  assert recording.missing() == []
+
+
+def test_reset(recording: Golden) -> None:
+  start = jax.tree.map(lambda x: x[0], recording.states)
+  for name, actual, expected in pairs(recording.first, start):
+    np.testing.assert_allclose(actual, expected, atol=1e-6, rtol=1e-5, err_msg=name)
+
+
+def test_functions(recording: Golden) -> None:
+  expected = after(recording)
+  evaluate = jax.jit(jax.vmap(recording.env.evaluate))
+  state = evaluate(expected.data, before(recording).info, recording.actions)
+  for name, ours, theirs in pairs(state, expected):
+    np.testing.assert_allclose(ours, theirs, atol=1e-5, rtol=1e-4, err_msg=name)
+
+
+def test_one_step_of_physics(recording: Golden) -> None:
+  step = jax.jit(jax.vmap(recording.env.step))
+  state = step(before(recording), recording.actions)
+  for name, ours, theirs in pairs(state, after(recording)):
+    bound = STEP_BOUNDS.get(name, OTHER_BOUND) * max(1.0, np.abs(theirs).max(initial=0.0))
+    np.testing.assert_allclose(ours, theirs, atol=bound, rtol=0, err_msg=name)

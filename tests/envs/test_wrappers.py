@@ -1,0 +1,112 @@
+"""Batching, episode limits, resets and the guard against non-finite numbers, on a task without physics."""
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from playground.envs import wrappers
+from playground.envs.base import State
+from tests.dummy import PointTask
+
+N, LENGTH = 3, 4
+
+
+class Counting(PointTask):
+  """Counts its steps in info, in a preserved part too, and terminates at `die_at` steps."""
+
+  def __init__(self, die_at: int | None = None, **kwargs: Any):
+    super().__init__(**kwargs)
+    self.die_at = die_at
+
+  def reset(self, rng: jax.Array, model: Any = None) -> State:
+    state = super().reset(rng)
+    return state.replace(info=state.info | {wrappers.PRESERVE_INFO: {"total": jnp.zeros(())}})
+
+  def evaluate(self, data: Any, info: Any, action: jax.Array) -> State:
+    state = super().evaluate(data, info, action)
+    total = info[wrappers.PRESERVE_INFO]["total"] + 1
+    done = state.done if self.die_at is None else jnp.where(state.info["age"] == self.die_at, 1.0, state.done)
+    return state.replace(done=done, info=state.info | {wrappers.PRESERVE_INFO: {"total": total}})
+
+
+@cache
+def stack(full_reset: bool = False, repeat: int = 1, die_at: int | None = None, nan_at: int | None = None) -> Any:
+  env = Counting(die_at=die_at, episode_length=LENGTH, action_repeat=repeat, nan_at=nan_at)
+  wrapped = wrappers.wrap_for_training(env, full_reset=full_reset)
+  return jax.jit(wrapped.reset), jax.jit(wrapped.step)
+
+
+def roll(steps: int, **kwargs: Any) -> list[State]:
+  reset, step = stack(**kwargs)
+  states = [reset(jax.random.split(jax.random.PRNGKey(0), N))]
+  for _ in range(steps):
+    states.append(step(states[-1], jnp.full((N, 2), 0.1)))
+  return states
+
+
+@pytest.mark.parametrize("full_reset", [False, True])
+def test_time_outs_are_truncations_and_not_terminations(full_reset: bool) -> None:
+  states = roll(2 * LENGTH, full_reset=full_reset)
+  done = np.array([s.done for s in states])
+  truncation = np.array([s.info["truncation"] for s in states])
+  expected = np.zeros((2 * LENGTH + 1, N))
+  expected[[LENGTH, 2 * LENGTH]] = 1
+  np.testing.assert_array_equal(done, expected)
+  np.testing.assert_array_equal(truncation, expected)
+  assert [int(s.info["steps"][0]) for s in states] == [0, 1, 2, 3, 4, 1, 2, 3, 4]
+  np.testing.assert_array_equal(states[-1].info["AutoResetWrapper_done_count"], [2] * N)
+
+
+@pytest.mark.parametrize("full_reset", [False, True])
+def test_a_task_that_ends_itself_is_not_truncated(full_reset: bool) -> None:
+  states = roll(2, full_reset=full_reset, die_at=2)
+  np.testing.assert_array_equal(states[2].done, 1)
+  np.testing.assert_array_equal(states[2].info["truncation"], 0)
+
+
+def test_cached_reset_returns_to_the_first_state_and_keeps_info() -> None:
+  states = roll(LENGTH + 1)
+  np.testing.assert_array_equal(states[LENGTH].data.qpos, states[0].data.qpos)
+  np.testing.assert_array_equal(states[LENGTH].obs["state"], states[0].obs["state"])
+  np.testing.assert_array_equal(states[LENGTH].info["age"], LENGTH)
+  assert (states[LENGTH].reward != 0).all(), "the last step's reward is kept"
+
+
+def test_full_reset_draws_anew_and_keeps_what_is_preserved() -> None:
+  states = roll(2 * LENGTH, full_reset=True)
+  first, second, third = (states[i].data.qpos for i in (0, LENGTH, 2 * LENGTH))
+  assert not np.allclose(first, second) and not np.allclose(second, third)
+  np.testing.assert_array_equal(states[LENGTH].info["age"], 0)
+  np.testing.assert_array_equal(states[LENGTH].info[wrappers.PRESERVE_INFO]["total"], LENGTH)
+  np.testing.assert_array_equal(states[LENGTH].info["episode_metrics"]["length"], LENGTH)
+
+
+def test_episode_metrics_sum_one_episode() -> None:
+  states = roll(LENGTH + 1)
+  rewards = np.array([s.reward for s in states[1:]])
+  np.testing.assert_allclose(states[LENGTH].info["episode_metrics"]["sum_reward"], rewards[:LENGTH].sum(0), rtol=1e-6)
+  np.testing.assert_allclose(states[LENGTH + 1].info["episode_metrics"]["sum_reward"], rewards[LENGTH], rtol=1e-6)
+
+
+def test_action_repeat_sums_rewards_and_stops_at_a_termination() -> None:
+  single = np.array([s.reward for s in roll(2, repeat=1)])
+  np.testing.assert_allclose(roll(1, repeat=2)[1].reward, single[1] + single[2], rtol=1e-5)
+  ended = roll(1, repeat=2, die_at=1)[1]
+  np.testing.assert_array_equal(ended.done, 1)
+  np.testing.assert_allclose(ended.reward, single[1], rtol=1e-5)
+
+
+@pytest.mark.parametrize("full_reset", [False, True])
+def test_a_nan_ends_the_episode_and_goes_no_further(full_reset: bool) -> None:
+  states = roll(4, full_reset=full_reset, nan_at=2)
+  assert [int(s.info["nonfinite"].sum()) for s in states] == [0, 0, N, *([N, N] if not full_reset else [0, N])][:5]
+  bad = states[2]
+  np.testing.assert_array_equal(bad.done, 1)
+  np.testing.assert_array_equal(bad.reward, 0)
+  assert np.isnan(bad.info["nonfinite_state"]["qpos"]).any()
+  for leaf in jax.tree.leaves((bad.obs, bad.reward, bad.metrics, bad.data.qpos, bad.info["episode_metrics"])):
+    assert np.isfinite(leaf).all()

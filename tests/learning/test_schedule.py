@@ -1,0 +1,45 @@
+"""Where evaluations, resets and calls to the device lie."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from playground.learning.loop import Mark, schedule
+
+
+def test_a_short_run_written_out() -> None:
+  assert schedule(6, num_evals=3, num_resets_per_eval=3, max_updates=10) == [
+    Mark(0, evaluate=True),
+    Mark(1, reset=True),
+    Mark(2, reset=True),
+    Mark(3, evaluate=True, reset=True),
+    Mark(4, reset=True),
+    Mark(5, reset=True),
+    Mark(6, evaluate=True),
+  ]
+
+
+def test_one_evaluation_is_at_the_end_and_none_is_none() -> None:
+  assert [m.update for m in schedule(5, 1, 0, 10) if m.evaluate] == [5]
+  assert not any(m.evaluate for m in schedule(5, 0, 0, 10))
+
+
+def test_long_stretches_are_cut() -> None:
+  assert [m.update for m in schedule(10, 1, 0, 4)] == [4, 8, 10]
+
+
+@given(st.integers(1, 3000), st.integers(0, 30), st.integers(0, 12), st.integers(1, 50))
+def test_any_schedule_covers_the_budget_in_order(updates: int, evals: int, resets: int, longest: int) -> None:
+  marks = schedule(updates, evals, resets, longest)
+  points = [mark.update for mark in marks]
+  assert points == sorted(set(points))
+  assert points[-1] == updates
+  assert all(b - a <= longest for a, b in zip([0, *points], points, strict=False))
+  assert sum(mark.evaluate for mark in marks) == min(evals, updates + 1)
+  assert not marks[-1].reset
+
+
+@pytest.mark.parametrize("resets", [1, 4])
+def test_resets_fall_between_evaluations(resets: int) -> None:
+  marks = schedule(100, 5, resets, 100)
+  assert sum(mark.reset for mark in marks) == 4 * resets - 1

@@ -1,0 +1,336 @@
+"""Composition: which file's value wins, what is refused and in which words."""
+
+import dataclasses
+import math
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from playground import config
+from playground.config import compose
+from playground.errors import ConfigError, UnknownNameError
+
+TUNED = ["experiment=cartpole_balance"]
+
+
+@pytest.fixture
+def configs(tmp_path: Path) -> Path:
+  """A copy of our configs/, to add files to."""
+  return Path(shutil.copytree(config.config_roots()[0], tmp_path / "configs"))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+  """A run directory with a saved configuration."""
+  path = tmp_path / "run"
+  path.mkdir()
+  (path / "config.yaml").write_text(config.to_yaml(compose(["env=CartpoleBalance", "agent.num_envs=64", "seed=7"])))
+  return path
+
+
+# Which value wins
+
+
+def test_default_run():
+  run = compose()
+  assert run.name == "quickstart"
+  assert run.overrides == ("experiment=quickstart",)
+  assert compose(["agent.num_envs=64"]).name == "quickstart"
+  assert compose(["debug=fast"]).choices["experiment"] == "quickstart"
+
+
+@pytest.mark.parametrize("choice", ["env=CartpoleBalance", "agent=ppo", "curriculum=none", "experiment=null"])
+def test_quickstart_never_leaks_onto_a_chosen_run(choice: str):
+  run = compose([choice])
+  assert run.choices["experiment"] is None
+  assert run.name == "CartpoleBalance"
+  assert run.agent.num_timesteps == 60_000_000
+
+
+def test_env_and_agent_alone_pick_the_tuned_set():
+  cartpole, go1 = compose(["env=CartpoleSwingup"]), compose(["agent=ppo", "env=Go1JoystickFlatTerrain"])
+  assert (cartpole.choices["tuned"], go1.choices["tuned"]) == ("ppo/CartpoleSwingup", "ppo/Go1JoystickFlatTerrain")
+  assert (cartpole.agent.discounting, go1.agent.discounting) == (0.995, 0.97)
+  assert go1.agent.network.value_obs_key == "privileged_state"
+  assert compose(["env=CartpoleSwingup", "tuned=null"]).agent.discounting == 0.99
+
+
+def test_a_task_without_a_tuned_set_has_the_agents_defaults(configs: Path):
+  shutil.copy(configs / "env/CartpoleBalance.yaml", configs / "env/Untuned.yaml")
+  run = compose(["env=Untuned"], configs)
+  assert run.choices["tuned"] is None
+  assert run.agent.num_timesteps == 50_000_000
+
+
+def test_later_layers_win(configs: Path):
+  (configs / "experiment/mine.yaml").write_text(
+    "# @package _global_\ndefaults:\n  - override /env: CartpoleBalance\nagent: {num_envs: 512, learning_rate: 1}\n"
+  )
+  agent = compose(["experiment=mine"], configs).agent
+  assert (agent.num_envs, agent.learning_rate, agent.num_minibatches) == (512, 1.0, 32)  # experiment over tuned
+  assert isinstance(agent.learning_rate, float)
+  assert compose(["experiment=mine", "agent.num_envs=256"], configs).agent.num_envs == 256
+  assert compose(["agent.num_envs=4", "debug=fast", "experiment=mine"], configs).agent.num_envs == 4
+  assert compose(["experiment=mine", "env=CartpoleSwingup"], configs).choices["tuned"] == "ppo/CartpoleSwingup"
+
+
+def test_a_task_chooses_robot_and_randomization_which_the_command_line_overrides():
+  run = compose(["experiment=go1_joystick"])
+  assert (run.choices["robot"], run.choices["randomization"]) == ("go1", "go1")
+  assert run.env.robot.name == "go1"
+  assert run.randomization.terms
+  assert compose(["experiment=go1_joystick", "randomization=none"]).randomization.terms == []
+
+
+def test_a_generic_task_takes_any_robot():
+  run = compose(["env=joystick", "robot=go1"])
+  assert run.name == "joystick"
+  assert run.env.robot.name == "go1"
+
+
+@pytest.mark.parametrize("env", [*config.task_names(), "joystick robot=go1"])
+def test_debug_fast_is_small_for_every_task(env: str):
+  run = compose([*f"env={env}".split(), "debug=fast"])
+  agent = run.agent
+  assert run.env.episode_length == 20
+  assert agent.num_timesteps / (agent.batch_size * agent.num_minibatches * agent.unroll_length) == 4
+
+
+@pytest.mark.parametrize("group", ["experiment", "hardware", "tracking", "tuned", "debug"])
+def test_every_option_we_ship_composes(group: str):
+  for option in config.options(group):
+    env = [f"env={option.split('/')[1]}"] if group == "tuned" else []
+    assert compose([f"{group}={option}", *env]).choices[group] == option
+
+
+def test_several_debug_presets():
+  run = compose(["debug=[fast,profile]"])
+  assert run.profile.enable
+  assert run.agent.num_envs == 8
+
+
+# What a RunConfig is
+
+
+def test_agent_is_what_ppo_reads():
+  from playground.learning.ppo import PPOConfig
+
+  agent = compose().agent
+  names = {field.name for field in dataclasses.fields(PPOConfig)}
+  assert set(agent) - {"name"} == names
+  assert PPOConfig.from_config(agent).num_envs == 256
+
+
+def test_paper_values_of_go1():
+  agent = compose(["experiment=go1_joystick"]).agent
+  assert (agent.num_timesteps, agent.num_evals, agent.num_resets_per_eval) == (200_000_000, 10, 1)
+  assert (agent.num_envs, agent.batch_size, agent.unroll_length, agent.max_grad_norm) == (8192, 256, 20, 1.0)
+  assert tuple(agent.network.policy_hidden_layer_sizes) == (512, 256, 128)
+
+
+@pytest.mark.parametrize(
+  ("text", "value"),
+  [
+    ("agent.num_timesteps=1e6", 1_000_000),
+    ("agent.learning_rate=1", 1.0),
+    ("agent.max_grad_norm=1", 1),
+    ("agent.max_grad_norm=null", None),
+    ("agent.network.policy_hidden_layer_sizes=[8,16.0]", [8, 16]),
+    ("agent.batch_size=${agent.num_envs}", 2048),
+    ("+agent.num_envs=64", 64),
+    ("agent.network={activation: relu}", "relu"),
+  ],
+)
+def test_values_take_the_type_of_their_default(text: str, value: Any):
+  run = compose([*TUNED, text])
+  key = text.lstrip("+").split("=")[0] + (".activation" if value == "relu" else "")
+  found = OmegaConf.select(OmegaConf.create(run.resolved), key)
+  assert found == value
+  assert type(value) in (list, type(found))
+
+
+def test_overrides_are_what_hydra_takes():
+  run = compose(["agent.num_timesteps=1e6", "tuned=null", "+seed=2", "run_dir='a b'", "hydra.verbose=true"])
+  assert run.overrides == (
+    *("experiment=quickstart", "agent.num_timesteps=1000000", "~tuned", "seed=2", "run_dir='a b'"),
+  )
+  assert compose(run.overrides).resolved == run.resolved
+
+
+def test_saved_configuration_reads_back(tmp_path: Path):
+  run = compose(["experiment=go1_joystick"])
+  (tmp_path / "config.yaml").write_text(config.to_yaml(run))
+  again = config.load(tmp_path / "config.yaml")
+  assert again.resolved == run.resolved
+  assert again.env.to_dict() == run.env.to_dict()
+  assert list(run.resolved)[:2] == ["name", "choices"]
+
+
+def test_foreign_configuration_is_refused(tmp_path: Path):
+  for text in ("a: 1", "[1]", "a: [", "${"):
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(ConfigError):
+      config.load(tmp_path / "config.yaml")
+  with pytest.raises(ConfigError, match="missing"):
+    config.load(tmp_path / "missing")
+
+
+def test_null_keys_can_be_assigned():
+  run = compose()
+  run.agent.max_grad_norm = 1.0
+  run.video.camera = "side"
+  assert (run.agent.max_grad_norm, run.video.camera) == (1.0, "side")
+
+
+def test_directory(run: Path):
+  assert compose().directory().parent == Path("results/quickstart")
+  assert compose(["run_dir=/tmp/here"]).directory() == Path("/tmp/here")
+  assert compose([f"resume={run}"]).directory() == run
+
+
+def test_tree_shows_every_value():
+  from rich.console import Console
+
+  console = Console(width=200, record=True, quiet=True)
+  console.print(config.tree(compose()))
+  shown = console.export_text()
+  for text in ("quickstart", "agent", "num_envs: 256", "policy_hidden_layer_sizes: [32, 32, 32, 32]", "run_dir: null"):
+    assert text in shown
+
+
+def test_composing_needs_no_jax():
+  code = (
+    "import sys, playground, playground.registry as r; r.config('CartpoleBalance'); assert 'jax' not in sys.modules"
+  )
+  subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# What is refused
+
+ERRORS = {
+  "env=Go1Joystic": ["env=Go1Joystic does not exist", "CartpoleBalance, ", "Did you mean 'Go1JoystickFlatTerrain'?"],
+  "experiment=quickstar": ["experiment=quickstar", "go1_joystick, quickstart", "Did you mean 'quickstart'?"],
+  "hardware=tpu": ["hardware=tpu does not exist: choose from auto, cpu, gpu."],
+  "env=_cartpole": ["env=_cartpole does not exist", "Did you mean 'Cartpole"],
+  "env=null": ["env=null does not exist: choose from Cartpole"],
+  "experimen=foo": ["experimen does not exist", "Did you mean 'experiment'?"],
+  "sead=1": ["sead does not exist", "Did you mean 'seed'?"],
+  "learning_rate=1": ["learning_rate does not exist", "Did you mean 'agent.learning_rate'?"],
+  "agent.learning_rat=1": ["agent.learning_rat does not exist: agent has", "Did you mean 'agent.learning_rate'?"],
+  "agent.network.activatio=relu": ["agent.network has policy_hidden_layer_sizes, ", "'agent.network.activation'?"],
+  "agent.network={activatio: relu}": ["agent.network.activatio", "does not exist.", "'agent.network.activation'?"],
+  "env=Go1JoystickFlatTerrain env.reward.scales.enrgy=1": ["env.reward.scales.enrgy", "'env.reward.scales.energy'?"],
+  "agent.name.x=1": ["agent.name.x does not exist: agent.name is a single value."],
+  "randomization.terms.0.field=x": ["randomization.terms is a list of 0."],
+  "env@foo=CartpoleBalance": ["env@foo does not exist", "Did you mean 'env'?"],
+  "+agent.foo=1": ["agent.foo does not exist: agent has name, num_timesteps, "],
+  "++env.foo=1": ["env.foo does not exist: env has task, "],
+  "+foo.bar=1": ["foo.bar does not exist: the configuration has "],
+  "~agent.num_envs": ["~agent.num_envs: a key cannot be removed"],
+  "agent.learning_rate=fast": ["agent.learning_rate=fast", "must be a number, as its default 0.0003 is."],
+  "agent.learning_rate=nan": ["agent.learning_rate=nan", "must be a number"],
+  "agent.num_envs=1.5": ["agent.num_envs=1.5", "must be a whole number, as its default 2048 is."],
+  "agent.num_envs=inf": ["agent.num_envs=inf", "must be a whole number"],
+  "agent.num_envs=true": ["agent.num_envs=true", "must be a whole number"],
+  "agent.num_envs=null": ["agent.num_envs=null", "must be a whole number"],
+  "agent.num_envs=[1]": ["agent.num_envs=[1]", "must be a whole number"],
+  "agent.num_envs=???": ["agent.num_envs has no value: set agent.num_envs=<value>."],
+  "agent.normalize_advantage=1": ["agent.normalize_advantage=1", "must be true or false, as its default true is."],
+  "agent.name=3": ["agent.name=3", "must be text, as its default ppo is."],
+  "agent.network=3": ["agent.network=3", "must be a mapping with the keys policy_hidden_layer_sizes, "],
+  "agent.network.policy_hidden_layer_sizes=8": ["=8 ", "must be a list, as its default [32, 32, 32, 32] is."],
+  "agent.network.policy_hidden_layer_sizes=[8,a]": ["policy_hidden_layer_sizes[1]=a ", "must be a whole number"],
+  "agent.max_grad_norm={a: 1}": ["agent.max_grad_norm={a: 1}", "must be a single value, a list or null."],
+  "agent.batch_size=${agent.nothing}": ["agent.nothing"],
+  "run_dir=3": ["run_dir=3", "must be text (put quotes around a number)."],
+  "agent=[1": ["'agent=[1' is not an override: write key=value, such as env=CartpoleBalance"],
+  "agent.num_envs": ["'agent.num_envs' is not an override"],
+  "agent.num_envs=1,2": ["agent.num_envs=1,2 names several values, which is a sweep: add -m"],
+  "agent.num_timesteps=-5": ["agent.num_timesteps=-5 must be a number above 0."],
+  "agent.num_envs=0": ["agent.num_envs=0 must be a number above 0."],
+  "agent.max_grad_norm=big": ["agent.max_grad_norm=big must be a number above 0."],
+  "hardware.devices=0": ["hardware.devices=0 must be a number above 0."],
+  "agent.discounting=2": ["agent.discounting=2.0 must be a number between 0 and 1."],
+  "seed=-1": ["seed=-1 must be a number 0 or more."],
+  "env.impl=wrap": ["env.impl=wrap is unknown: choose from auto, jax, warp. Did you mean 'warp'?"],
+  "hardware.matmul_precision=higest": ["choose from default, high, highest, ", "Did you mean 'highest'?"],
+  "agent.num_envs=100": ["agent.num_envs=100 does not divide", "64 * 8 = 512"],
+  "env=joystick": ["env=joystick needs a robot: add robot=<name>, one of go1"],
+  "env=CartpoleBalance robot=go1": ["robot=go1: env=CartpoleBalance takes no robot"],
+  "init_from=/nowhere/run": ["init_from=/nowhere/run is no run directory or checkpoint", "does not exist."],
+  "resume=/nowhere/run": ["resume=/nowhere/run is no run directory: /nowhere/run/config.yaml does not exist."],
+}
+
+
+@pytest.mark.parametrize("line", ERRORS)
+def test_errors_are_one_sentence(line: str):
+  overrides = [line] if "{" in line or "[" in line else line.split()
+  with pytest.raises(ConfigError) as caught:
+    compose(overrides)
+  message = str(caught.value)
+  for part in ERRORS[line]:
+    assert part in message
+  assert "\n" not in message
+  assert message[-1] in ".?"
+  assert isinstance(caught.value, UnknownNameError) == ("does not exist" in message and "=/nowhere" not in line)
+
+
+def test_a_key_that_only_a_file_sets_is_refused(configs: Path):
+  (configs / "experiment/typo.yaml").write_text("# @package _global_\nagent: {lerning_rate: 1}\n")
+  with pytest.raises(UnknownNameError, match=r"agent\.lerning_rate, set by a chosen file.*'learning_rate'"):
+    compose(["experiment=typo"], configs)
+
+
+def test_files_that_do_not_compose(configs: Path):
+  (configs / "experiment/broken.yaml").write_text("# @package _global_\ndefaults:\n  - override /env: Gone\n")
+  with pytest.raises(ConfigError, match="experiment=broken do not compose.*env/Gone"):
+    compose(["experiment=broken"], configs)
+
+
+# resume and init_from
+
+
+def test_resume_takes_the_runs_own_configuration(run: Path):
+  resumed = compose([f"resume={run}", "hardware=cpu", "video.enable=false", "tracking.wandb.enable=true"])
+  assert (resumed.name, resumed.seed, resumed.agent.num_envs) == ("CartpoleBalance", 7, 64)
+  assert (resumed.hardware.platform, resumed.choices["hardware"]) == ("cpu", "cpu")
+  assert (resumed.video.enable, resumed.tracking.wandb.enable) == (False, True)
+  assert resumed.resume == resumed.run_dir == str(run)
+
+
+@pytest.mark.parametrize(
+  ("override", "parts"),
+  {
+    "agent.num_timesteps=9": ["agent.num_timesteps=9 cannot be given with resume", "init_from={run} starts a new run"],
+    "env=CartpoleBalance": ["env=CartpoleBalance cannot be given with resume", "hardware, tracking, video;"],
+    "seed=2": ["seed=2 cannot be given with resume"],
+    "run_dir=x": ["run_dir=x cannot be given with resume"],
+    "init_from={run}": ["resume={run} exclude each other"],
+    "hardware.devces=1": ["hardware.devces does not exist", "'hardware.devices'"],
+    "video.width=0": ["video.width=0 must be a number above 0."],
+  }.items(),
+)
+def test_what_resume_refuses(run: Path, override: str, parts: list[str]):
+  with pytest.raises(ConfigError) as caught:
+    compose([f"resume={run}", override.format(run=run)])
+  for part in parts:
+    assert part.format(run=run) in str(caught.value)
+
+
+def test_a_mistyped_run_names_its_neighbour(run: Path):
+  with pytest.raises(ConfigError, match="Did you mean 'run'"):
+    compose([f"resume={run.parent / 'rum'}"])
+  assert compose([f"init_from={run}"]).init_from == str(run)
+
+
+def test_override_section():
+  env = compose(["env=Go1JoystickFlatTerrain"]).env
+  changed = config.override_section("env", env, {"reward.scales.energy": -1, "command.max": (1.0, 0.5, 0.5)})
+  assert changed["reward"]["scales"]["energy"] == -1.0
+  assert changed["command"]["max"] == [1.0, 0.5, 0.5]
+  assert not math.isclose(env.reward.scales.energy, -1)
