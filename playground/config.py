@@ -18,11 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from ml_collections import ConfigDict
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 
@@ -68,6 +70,9 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
 )
 
 
+Section = Any  # a ConfigDict; pyright cannot know its attributes
+
+
 @dataclasses.dataclass(frozen=True)
 class RunConfig:
   """A run's whole configuration, checked. The sections are those of `configs/`, every value resolved.
@@ -80,21 +85,21 @@ class RunConfig:
   """
 
   name: str
-  env: ConfigDict
-  agent: ConfigDict
-  randomization: ConfigDict
-  curriculum: ConfigDict
-  hardware: ConfigDict
-  tracking: ConfigDict
-  video: ConfigDict
-  checkpoint: ConfigDict
-  on_nonfinite: ConfigDict
-  profile: ConfigDict
+  env: Section
+  agent: Section
+  randomization: Section
+  curriculum: Section
+  hardware: Section
+  tracking: Section
+  video: Section
+  checkpoint: Section
+  on_nonfinite: Section
+  profile: Section
   seed: int
   run_dir: str | None
   resume: str | None
   init_from: str | None
-  choices: dict[str, str | None]
+  choices: dict[str, Any]
   overrides: tuple[str, ...]
   resolved: dict[str, Any]
 
@@ -168,7 +173,7 @@ def load(path: Path) -> RunConfig:
   """Reads a saved config.yaml; raises ConfigError if it is not one."""
   try:
     resolved = OmegaConf.to_container(OmegaConf.load(path))
-  except (OSError, ValueError, OmegaConfBaseException) as error:
+  except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
     raise ConfigError(f"{path} cannot be read: {_first_line(error)}.") from None
   if not isinstance(resolved, dict):
     raise ConfigError(f"{path} is not the configuration of a run.")
@@ -196,7 +201,7 @@ def tree(config: RunConfig) -> "Tree":
   return grow(Tree(Text(config.name, style="bold")), {k: v for k, v in config.resolved.items() if k != "name"})
 
 
-def override_section(section: str, default: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+def override_section(section: str, default: Section, overrides: Mapping[str, Any]) -> dict[str, Any]:
   """Returns a section, e.g. env, with dotted keys such as `reward.scales.energy` replaced, checked as in `compose`."""
   schema = {section: _plain(default)}
   parsed = [_Override(f"{section}.{key}", value, False, "") for key, value in overrides.items()]
@@ -325,14 +330,18 @@ def _canonical(parsed: Iterable[_Override], resolved: Mapping[str, Any]) -> list
 
 def _hydra(overrides: Sequence[str], roots: Sequence[Path]) -> tuple[DictConfig, dict[str, str | None]]:
   """Hydra's composition, and what it chose for each group."""
+  outer = GlobalHydra.instance().hydra  # the app's, when this is a job of a sweep: Hydra allows one at a time
+  GlobalHydra.instance().clear()
   try:
     with hydra.initialize_config_dir(str(roots[0]), version_base="1.3"):
       lines = [*overrides, *search_path_override(roots)]
       config = hydra.compose("config", overrides=lines, return_hydra_config=True)
       chosen = dict(config.hydra.runtime.choices)
-  except (HydraException, OmegaConfBaseException) as error:
+  except (HydraException, YAMLError, OmegaConfBaseException) as error:
     files = " ".join(o for o in overrides if not o.startswith("~"))
     raise ConfigError(f"The files of {files or 'config.yaml'} do not compose: {_first_line(error)}.") from None
+  finally:
+    GlobalHydra.instance().hydra = outer
   OmegaConf.set_struct(config, False)
   del config["hydra"]
   choices = {group: chosen.get(group) for group in _groups(roots)}
@@ -346,7 +355,7 @@ def _apply(config: DictConfig, overrides: Iterable[_Override], schema: Mapping[s
   try:
     for override in overrides:
       _check_key(override.key, schema)
-      OmegaConf.update(config, override.key, override.value, merge=True)
+      OmegaConf.update(config, override.key, override.value, merge=isinstance(override.value, Mapping))
     if missing := OmegaConf.missing_keys(config):
       raise ConfigError(f"{min(missing)} has no value: set {min(missing)}=<value>.")
     return _fit(OmegaConf.to_container(config, resolve=True), schema, "")
@@ -424,8 +433,9 @@ def _unknown_key(key: str, parent: str, part: str, node: Any, schema: Mapping[st
     what = f"a list of {len(node)}" if isinstance(node, list) else "a single value"
     return UnknownNameError(f"{key} does not exist: {parent} is {what}.")
   known = [str(k) for k in node] if parent else [*schema, "robot", *_DELTAS]
-  near = nearest(part, known).replace("'", f"'{parent}.", 1) if parent else nearest(part, known)
-  near = near or ("" if parent else nearest(part, _keys(schema)))  # perhaps only the section is missing
+  near = _nearest_in(parent, part, known)
+  if not near and not parent:  # perhaps only the section is missing
+    near = nearest(part, _keys(schema))
   has = f"has {', '.join(known)}" if len(known) <= 12 or not near else f"has {len(known)} keys (--cfg job shows them)"
   return UnknownNameError(f"{key} does not exist: {parent or 'the configuration'} {has}.{near}")
 
@@ -446,7 +456,7 @@ def _fit(value: Any, default: Any, key: str) -> Any:
     for name in value:
       if name not in default:
         dotted = f"{key}.{name}".lstrip(".")
-        near = nearest(str(name), default)
+        near = _nearest_in(key, str(name), default)
         raise UnknownNameError(f"{dotted}, set by a chosen file or mapping, does not exist.{near}")
     return {name: _fit(value[name], default[name], f"{key}.{name}".lstrip(".")) for name in value}
   if default is None:
@@ -504,6 +514,11 @@ def _check_values(resolved: Mapping[str, Any]) -> None:
 
 
 # Small helpers
+
+
+def _nearest_in(parent: str, name: str, known: Iterable[Any]) -> str:
+  """As `nearest`, with the whole dotted key."""
+  return nearest(name, map(str, known)).replace("'", f"'{parent}." if parent else "'", 1)
 
 
 def _plain(config: Any) -> Any:

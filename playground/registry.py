@@ -52,7 +52,7 @@ get_default_config = config
 
 def load(
   name: str,
-  config: Mapping[str, Any] | None = None,
+  config: ConfigDict | Mapping[str, Any] | None = None,
   overrides: Mapping[str, Any] | None = None,
   config_overrides: Mapping[str, Any] | None = None,
 ) -> "Env":

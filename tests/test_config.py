@@ -1,6 +1,7 @@
 """Composition: which file's value wins, what is refused and in which words."""
 
 import dataclasses
+import io
 import math
 import shutil
 import subprocess
@@ -196,9 +197,9 @@ def test_directory(run: Path):
 def test_tree_shows_every_value():
   from rich.console import Console
 
-  console = Console(width=200, record=True, quiet=True)
-  console.print(config.tree(compose()))
-  shown = console.export_text()
+  out = io.StringIO()
+  Console(file=out, width=200).print(config.tree(compose()))
+  shown = out.getvalue()
   for text in ("quickstart", "agent", "num_envs: 256", "policy_hidden_layer_sizes: [32, 32, 32, 32]", "run_dir: null"):
     assert text in shown
 
@@ -288,7 +289,7 @@ def test_a_key_that_only_a_file_sets_is_refused(configs: Path):
 
 def test_files_that_do_not_compose(configs: Path):
   (configs / "experiment/broken.yaml").write_text("# @package _global_\ndefaults:\n  - override /env: Gone\n")
-  with pytest.raises(ConfigError, match="experiment=broken do not compose.*env/Gone"):
+  with pytest.raises(ConfigError, match=r"experiment=broken do not compose.*env/Gone"):
     compose(["experiment=broken"], configs)
 
 

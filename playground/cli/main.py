@@ -3,7 +3,6 @@
 import argparse
 import sys
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from playground import registry
@@ -44,11 +43,14 @@ def _parser() -> argparse.ArgumentParser:
   show.add_argument("task")
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
   add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
-  evaluate = add("eval", _eval, "Evaluate a run's last checkpoint.")
-  evaluate.add_argument("run", type=Path, help="run directory")
-  evaluate.add_argument("--episodes", type=int, default=128)
+  evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
+  evaluate.add_argument("run", help="run directory or checkpoint")
+  evaluate.add_argument("--episodes", type=int, help="by default the run's num_eval_envs")
   evaluate.add_argument("--seed", type=int, default=0)
-  add("replay", _replay, "Replay a dump of a state that went NaN.").add_argument("dump", type=Path)
+  evaluate.add_argument("--deterministic", action="store_true", help="act on the distribution's mode")
+  evaluate.add_argument("--video", metavar="FILE", help="also render an episode")
+  replay = add("replay", _replay, "Replay the step that was not finite.")
+  replay.add_argument("dump", help="a run's nan_dump/step_*.npz")
   return parser
 
 
@@ -70,13 +72,15 @@ def _doctor(args: argparse.Namespace) -> int:
 def _eval(args: argparse.Namespace) -> int:
   from playground.cli.eval import evaluate_run
 
-  return int(evaluate_run(args.run, episodes=args.episodes, seed=args.seed) or 0)
+  return evaluate_run(
+    args.run, episodes=args.episodes, seed=args.seed, deterministic=args.deterministic, video=args.video
+  )
 
 
 def _replay(args: argparse.Namespace) -> int:
   from playground.cli.replay import replay
 
-  return int(replay(args.dump) or 0)
+  return replay(args.dump)
 
 
 def _show(args: argparse.Namespace) -> int:

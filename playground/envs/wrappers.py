@@ -4,6 +4,7 @@ Each wrapper takes and returns batches of `State` (leading axis N). A randomised
 from field name ("geom_friction", dotted for nested ones) to values with leading axis N, or None for the task's own.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -47,15 +48,24 @@ class Wrapper:
 class Vectorize(Wrapper):
   """Runs N copies of a task: `reset(keys [N])`, `step(state, actions [N, action_size])`, each on its own model."""
 
+  def __init__(self, env: Env):
+    super().__init__(env)
+    # Jitted inside the vmap: the task's Python is traced once, whatever batch sizes it is then used with.
+    self._reset_one, self._step_one = _jitted(env)
+
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
-    return jax.vmap(lambda key, fields: self.env.reset(key, self._model(fields)))(rng, dict(model or {}))
+    return jax.vmap(self._reset_one)(rng, dict(model or {}))
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    step = lambda s, a, fields: self.env.step(s, a, self._model(fields))
-    return jax.vmap(step)(state, action, dict(model or {}))
+    return jax.vmap(self._step_one)(state, action, dict(model or {}))
 
-  def _model(self, fields: dict[str, jax.Array]) -> mjx.Model | None:
-    return self.env.mjx_model.tree_replace(fields) if fields else None
+
+@functools.lru_cache(maxsize=8)  # one trace serves training, evaluation and resets of the same task
+def _jitted(env: Env) -> tuple[Callable[..., State], Callable[..., State]]:
+  randomised = lambda fields: env.mjx_model.tree_replace(fields) if fields else None
+  reset = jax.jit(lambda key, fields: env.reset(key, randomised(fields)))
+  step = jax.jit(lambda state, action, fields: env.step(state, action, randomised(fields)))
+  return reset, step
 
 
 class FiniteGuard(Wrapper):

@@ -18,6 +18,7 @@ import orbax.checkpoint as ocp
 from playground.errors import CheckpointError
 
 FORMAT = "playground-run/1"
+logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax warns of its own defaults at every save and read
 Arrays = list[np.ndarray]
 
 
@@ -26,7 +27,6 @@ class CheckpointStore:
 
   def __init__(self, folder: str | Path, keep: int = 3):
     """Opens (and makes) the folder; the newest `keep` checkpoints are kept."""
-    logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every save at warning level
     options = ocp.CheckpointManagerOptions(
       max_to_keep=keep, step_format_fixed_length=12, enable_async_checkpointing=False, cleanup_tmp_directories=True
     )
@@ -101,7 +101,8 @@ class Checkpoint:
       raise CheckpointError(f"{self.path} does not fit this run: {_first_difference(expected, found)}.")
     try:
       numbered = self._read(item, ocp.args.StandardRestore())  # pyright: ignore[reportCallIssue]
-      leaves = [np.asarray(numbered[name]) for name in sorted(numbered)]
+      shapes = [(tuple(shape), dtype) for _, shape, dtype in found]
+      leaves = [np.asarray(numbered.get(_number(i), np.zeros(*spec))) for i, spec in enumerate(shapes)]
       whole = checksum(leaves) == self.meta["sha256"][item]
     except Exception as error:
       raise CheckpointError(f"{self.path} is damaged: its {item!r} cannot be read.") from error
@@ -151,7 +152,12 @@ def checksum(leaves: Arrays) -> str:
 
 
 def _numbered(leaves: Arrays) -> dict[str, np.ndarray]:
-  return {f"{i:05d}": leaf for i, leaf in enumerate(leaves)}
+  """Arrays by their place in the tree; Orbax refuses those without entries, which need no saving."""
+  return {_number(i): leaf for i, leaf in enumerate(leaves) if leaf.size}
+
+
+def _number(i: int) -> str:
+  return f"{i:05d}"
 
 
 def _first_difference(expected: list[list[Any]], found: list[list[Any]]) -> str:

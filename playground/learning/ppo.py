@@ -196,12 +196,14 @@ class PPO:
   def _train(self, state: TrainState, model: ModelFields, num_updates: jax.Array) -> tuple[TrainState, Metrics]:
     """`num_updates` training steps; the number is an argument, so any number of them is one compiled program."""
 
+    training_step = jax.jit(self._training_step)  # so that asking for its shapes and calling it is one trace
+
     def body(_: int, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
       state, total = carry
-      state, metrics = self._training_step(state, model)
+      state, metrics = training_step(state, model)
       return state, jax.tree.map(jnp.add, total, metrics)
 
-    shapes = jax.eval_shape(self._training_step, state, model)[1]
+    shapes = jax.eval_shape(training_step, state, model)[1]
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     state, total = jax.lax.fori_loop(0, num_updates, body, (state, zeros))
     return state, self._report(total, num_updates)

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from playground.envs.physics import PhysicsData, mjx
-from playground.errors import UnknownNameError, nearest
+from playground.errors import ConfigError, UnknownNameError, nearest
 
 
 class LeggedRobot:
@@ -36,7 +36,11 @@ class LeggedRobot:
 
     Raises:
       UnknownNameError: the model has no object of that name.
+      ConfigError: the model's joints come in another order.
     """
+    joints = [mujoco.mj_id2name(mj_model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(1, mj_model.njnt)]
+    if joints != list(config.joints):
+      raise ConfigError(f"env.robot.joints must name the model's joints in their order: {', '.join(joints)}.")
     self.init_qpos = jnp.array(mj_model.key_qpos[_find(mj_model, "key", config.keyframe)])
     self.default_pose = self.init_qpos[7:]
     self.joint_range = jnp.array(mj_model.jnt_range[1:].T)

@@ -73,7 +73,7 @@ def tolerance(
     raise ValueError(f"tolerance: margin={margin} is negative.")
   inside = (lower <= x) & (x <= upper)
   if margin == 0:
-    return jnp.where(inside, 1.0, 0.0)
+    return jnp.where(inside, 1.0, jnp.zeros_like(x))
   fall = lookup(SIGMOIDS, sigmoid, "tolerance: sigmoid")
   lowest_allowed = value_at_margin >= 0 if sigmoid in _MAY_REACH_ZERO else value_at_margin > 0
   if not (lowest_allowed and value_at_margin < 1):

@@ -58,6 +58,7 @@ class Job:
     self._last: dict[str, Any] = {"step": start.step or 0, "episode_reward": None, "recording": None}
     self._counted_step = start.step or 0
     self._dumped = False
+    self._closed = False
     self._tracing: int | None = None
 
   @property
@@ -120,10 +121,12 @@ class Job:
       }
     )
 
-  def close(self, status: str) -> None:
-    """Ends the trackers and the video thread; safe to call after an error."""
-    self._videos.shutdown(cancel_futures=True)
-    self._trackers.close(status)
+  def close(self, status: str = "failed") -> None:
+    """Ends the trackers and the video thread, once; without a status the run did not get to its end."""
+    if not self._closed:
+      self._closed = True
+      self._videos.shutdown(cancel_futures=True)
+      self._trackers.close(status)
 
   def _best_return(self) -> float | None:
     import pandas as pd

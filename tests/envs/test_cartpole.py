@@ -71,8 +71,17 @@ def test_batched_step(balance: Cartpole) -> None:
   assert balance.observation_size == 5 and balance.action_size == 1
   assert after.obs.shape == (4, 5)  # pyright: ignore[reportAttributeAccessIssue]
   assert jax.tree.structure(after) == jax.tree.structure(state)
+  assert jax.tree.map(jax.typeof, after) == jax.tree.map(jax.typeof, state)  # weak types included
   assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
   assert set(after.metrics) == {f"reward/{n}" for n in ("upright", "centered", "small_control", "small_velocity")}
+
+
+def test_sparse_metrics_and_types() -> None:
+  env = load_task("CartpoleSwingupSparse")
+  state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+  after = jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((1,), jnp.float32))
+  assert set(state.metrics) == {"reward/cart_in_bounds", "reward/angle_in_bounds"}
+  assert jax.tree.leaves(after) == jax.tree.leaves(state)
 
 
 def test_numbers_that_are_not_finite_end_the_episode(balance: Cartpole) -> None:

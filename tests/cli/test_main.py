@@ -1,0 +1,114 @@
+"""`playground`: list, show, and what the other commands hand over."""
+
+import sys
+import time
+import types
+from collections.abc import Callable
+from subprocess import run
+from typing import Any
+
+import pytest
+
+from playground.cli.main import main
+from playground.errors import CheckpointError
+
+Command = Callable[..., int]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Command:
+  def call(*args: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["playground", *args])
+    with pytest.raises(SystemExit) as exit_:
+      main()
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+  return call
+
+
+def _stub(monkeypatch: pytest.MonkeyPatch, module: str, name: str, result: Any) -> list[Any]:
+  calls: list[Any] = []
+
+  def function(*args: Any, **kwargs: Any) -> Any:
+    calls.append((args, kwargs))
+    if isinstance(result, Exception):
+      raise result
+    return result
+
+  stub = types.ModuleType(module)
+  setattr(stub, name, function)
+  monkeypatch.setitem(sys.modules, module, stub)
+  return calls
+
+
+def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
+  assert command("list") == 0
+  names = capsys.readouterr().out.split()
+  assert {"CartpoleBalance", "Go1JoystickFlatTerrain"} <= set(names)
+  assert command("list", "go1") == 0
+  assert capsys.readouterr().out.split() == [name for name in names if "Go1" in name]
+  assert command("list", "cartpool") == 2
+  assert "error: No task's name contains 'cartpool'" in capsys.readouterr().err
+
+
+def test_list_is_fast_and_needs_no_jax():
+  code = (
+    "import sys; sys.argv = ['playground', 'list']; from playground.cli.main import main\n"
+    "try: main()\nfinally: assert 'jax' not in sys.modules"
+  )
+  start = time.perf_counter()
+  run([sys.executable, "-c", code], check=True, capture_output=True)
+  assert time.perf_counter() - start < 3  # a third of a second, unless the machine is busy
+
+
+@pytest.mark.parametrize(
+  ("args", "shown"),
+  [
+    (
+      ["Go1JoystickFlatTerrain"],
+      [
+        *(
+          "robot go1",
+          "action 12 in [-1, 1]",
+          "control 50 Hz (0.02 s)",
+          "physics 250 Hz (0.004 s), 5 per control step",
+        ),
+        *("episode 1000 control steps (20 s)", "backend auto: jax on CPU", "state 48", "privileged_state 123", "gyro"),
+        *("tracking_lin_vel 1.0", "torques -0.0002", "randomization: go1", "trunk: add uniform(-1, 1)"),
+        *("ppo (tuned/ppo/Go1JoystickFlatTerrain.yaml)", "network.policy_hidden_layer_sizes [512, 256, 128]"),
+      ],
+    ),
+    (["CartpoleBalance", "env.impl=jax"], ["state 5", "upright", "backend jax", "randomization: none none"]),
+    (["joystick", "robot=go1"], ["joystick", "robot go1", "ppo (defaults, not tuned for this task)"]),
+  ],
+)
+def test_show(command: Command, capsys: pytest.CaptureFixture[str], args: list[str], shown: list[str]):
+  assert command("show", *args) == 0
+  out = " ".join(capsys.readouterr().out.split())
+  for text in shown:
+    assert text in out
+
+
+def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
+  assert command("show", "CartpoleBalanc") == 2
+  assert "Did you mean 'CartpoleBalance'?" in capsys.readouterr().err
+
+
+def test_doctor(command: Command, monkeypatch: pytest.MonkeyPatch):
+  assert _stub(monkeypatch, "playground.cli.doctor", "doctor", 1) == []
+  assert command("doctor") == 1
+
+
+def test_eval_and_replay(command: Command, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+  calls = _stub(monkeypatch, "playground.cli.eval", "evaluate_run", 0)
+  assert command("eval", "results/a", "--episodes", "4") == 0
+  assert calls == [(("results/a",), {"episodes": 4, "seed": 0, "deterministic": False, "video": None})]
+  _stub(monkeypatch, "playground.cli.replay", "replay", CheckpointError("No dump\nthere."))
+  assert command("replay", "dump.npz") == 2
+  assert capsys.readouterr().err == "error: No dump there.\n"
+
+
+@pytest.mark.parametrize("args", [[], ["lst"], ["eval"]])
+def test_usage(command: Command, args: list[str]):
+  assert command(*args) == 2

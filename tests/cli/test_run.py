@@ -1,0 +1,140 @@
+"""`playground-run`: what it hands to training, what it only shows, and what it says when it cannot."""
+
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from playground.cli.run import main
+from playground.config import RunConfig, compose, to_yaml
+from playground.errors import HardwareError
+
+Command = Callable[..., int]
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[RunConfig]:
+  """What training is called with; nothing is trained. Runs in an empty folder."""
+  configs: list[RunConfig] = []
+
+  def train(config: RunConfig) -> int:
+    configs.append(config)
+    if config.seed == 99:
+      raise HardwareError("hardware.devices=9: this machine has\n1.")
+    if config.seed == 98:
+      raise RuntimeError("a bug")
+    return 143 if config.seed == 97 else 0
+
+  module = types.ModuleType("playground.runs.train")
+  module.train = train  # pyright: ignore[reportAttributeAccessIssue]
+  monkeypatch.setitem(sys.modules, "playground.runs.train", module)
+  monkeypatch.chdir(tmp_path)
+  return configs
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Command:
+  def run(*args: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["playground-run", *args])
+    with pytest.raises(SystemExit) as exit_:
+      main()
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+  return run
+
+
+def test_trains_the_default_run_and_prints_it(
+  command: Command, trained: list[RunConfig], capsys: pytest.CaptureFixture[str]
+):
+  assert command() == 0
+  (config,) = trained
+  assert config == compose()
+  assert "num_timesteps: 1000000" in capsys.readouterr().out
+
+
+def test_leaves_nothing_of_hydras_behind(command: Command, trained: list[RunConfig], tmp_path: Path):
+  assert command("env=CartpoleSwingup", "agent.num_timesteps=1e6", "tuned=null") == 0
+  assert trained[0].agent.num_timesteps == 1_000_000
+  assert trained[0].choices["tuned"] is None
+  assert list(tmp_path.iterdir()) == []
+
+
+def test_resumes(command: Command, trained: list[RunConfig], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+  run = tmp_path / "a run, 1"
+  run.mkdir()
+  (run / "config.yaml").write_text(to_yaml(compose(["env=CartpoleSwingup", "seed=5"])))
+  assert command(f"resume='{run}'", "hardware=cpu") == 0
+  assert (trained[0].seed, trained[0].resume, trained[0].hardware.platform) == (5, str(run), "cpu")
+  capsys.readouterr()
+  assert command(f"resume='{run}'", "--cfg", "job") == 0
+  assert "seed: 5\n" in capsys.readouterr().out
+  assert len(trained) == 1
+
+
+@pytest.mark.parametrize(
+  ("args", "shown"),
+  [
+    (["--cfg", "job"], ["num_envs: 256\n", "num_timesteps: 1000000\n"]),
+    (["agent.num_timesteps=2e6", "--cfg", "job", "agent.num_envs=64"], ["num_envs: 64\n", "num_timesteps: 2000000\n"]),
+    (["env=CartpoleBalance", "--cfg", "job", "--package", "agent"], ["num_envs: 2048\n"]),
+    (["--help"], ["hardware: auto, cpu, gpu", "num_envs: 256\n"]),
+    (["--info", "searchpath"], ["configs"]),
+  ],
+)
+def test_shows_and_does_not_train(
+  command: Command, trained: list[RunConfig], capsys: pytest.CaptureFixture[str], args: list[str], shown: list[str]
+):
+  assert command(*args) == 0
+  out = capsys.readouterr().out
+  for text in shown:
+    assert text in out
+  assert trained == []
+
+
+@pytest.mark.parametrize(
+  ("args", "message"),
+  [
+    (["experiment=quickstar"], "error: experiment=quickstar does not exist: choose from"),
+    (["agent.learning_rate=fast", "--cfg", "job"], "error: agent.learning_rate=fast has the wrong type"),
+    (["agent.num_envs=1,2"], "add -m"),
+    (["seed=99"], "error: hardware.devices=9: this machine has 1."),
+    (["-m", "seed=1", "env=Gone"], "error: "),
+    (["-m", "agent.num_envs=0"], "error: agent.num_envs=0 must be a number above 0."),
+  ],
+)
+def test_errors_are_one_sentence_and_exit_2(
+  command: Command, trained: list[RunConfig], capsys: pytest.CaptureFixture[str], args: list[str], message: str
+):
+  assert command(*args) == 2
+  sentences = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+  assert len(sentences) == 1
+  assert message in sentences[0]
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, trained: list[RunConfig]):
+  monkeypatch.setattr(sys, "argv", ["playground-run", "seed=98"])
+  with pytest.raises(RuntimeError, match="a bug"):
+    main()
+
+
+def test_exit_code_is_trainings(command: Command, trained: list[RunConfig]):
+  assert command("seed=97") == 143
+
+
+def test_multirun(command: Command, trained: list[RunConfig], capsys: pytest.CaptureFixture[str]):
+  assert command("-m", "seed=1,99,3", "agent.num_timesteps=1e6") == 2
+  assert [config.seed for config in trained] == [1, 99, 3]
+  assert {config.name for config in trained} == {"quickstart"}
+  assert "error: hardware.devices=9" in capsys.readouterr().err
+
+
+def test_a_mistake_is_reported_before_jax_is_imported():
+  code = "import sys; from playground.cli.run import main\ntry: main()\nfinally: assert 'jax' not in sys.modules"
+  done = subprocess.run([sys.executable, "-c", code, "env=Gone"], capture_output=True, text=True)
+  assert done.returncode == 2
+  assert done.stderr.startswith("error: env=Gone does not exist")
+  assert done.stderr.count("\n") == 1

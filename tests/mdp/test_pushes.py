@@ -1,0 +1,63 @@
+"""Kicks: when they come, how long they last and what they add up to."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ml_collections import ConfigDict
+
+from playground.mdp.pushes import advance_kick, kick_force, sample_kicks
+
+MASS = jnp.array(12.0)
+CONFIG = ConfigDict({"velocity": [1.0, 3.0], "duration": [0.05, 0.2], "interval": [0.5, 0.9]})
+
+
+def roll(dt: float, steps: int) -> tuple[dict[str, Any], np.ndarray]:
+  """The first `info` and the forces of all steps, shape [steps, 3]."""
+  keys = jax.random.split(jax.random.PRNGKey(3), 4)
+  info = {"rng": keys[3], **sample_kicks(keys[:3], CONFIG, dt)}
+
+  def step(info: dict[str, Any], _: None) -> tuple[dict[str, Any], jax.Array]:
+    force, changed = advance_kick(info, MASS, dt)
+    return info | changed, force
+
+  return info, np.asarray(jax.jit(lambda i: jax.lax.scan(step, i, None, steps))(info)[1])
+
+
+def test_draws_lie_in_their_ranges() -> None:
+  keys = jax.random.split(jax.random.PRNGKey(0), (1000, 3))
+  info = jax.vmap(lambda k: sample_kicks(k, CONFIG, 0.02))(keys)
+  assert info["steps_until_next_pert"].min() >= 25 and info["steps_until_next_pert"].max() <= 45
+  assert info["pert_duration_seconds"].min() >= 0.05 and info["pert_duration_seconds"].max() <= 0.2
+  np.testing.assert_allclose(info["pert_mag"].mean(), 2.0, atol=0.1)
+  np.testing.assert_allclose(info["pert_duration"] * 0.02, info["pert_duration_seconds"], atol=0.0101)
+
+
+def test_force_integrates_to_mass_times_velocity_over_pi() -> None:
+  time = jnp.linspace(0, 0.15, 1001)
+  impulse = kick_force(time, MASS, jnp.array(2.0), jnp.array(0.15)).mean() * 0.15
+  np.testing.assert_allclose(impulse, 12.0 * 2.0 / np.pi, rtol=1e-2)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.02])
+def test_kicks_in_time(dt: float) -> None:
+  info, forces = roll(dt, round(1.5 / dt))
+  wait, duration = int(info["steps_until_next_pert"]), int(info["pert_duration"])
+  assert not forces[: wait + 1].any()  # a kick starts from a force of 0
+  kick = forces[wait : wait + duration + 1]
+  assert not forces[wait + duration + 1 : 2 * wait + duration + 1].any()  # then the interval runs again
+  assert not forces[:, 2].any()
+  expected = kick_force(jnp.arange(duration + 1) * dt, MASS, info["pert_mag"], info["pert_duration_seconds"])
+  np.testing.assert_allclose(np.linalg.norm(kick, axis=1), np.abs(expected), rtol=1e-3, atol=1e-3)
+  if dt < 0.01:  # a coarse step samples a short half sine coarsely
+    impulse = np.linalg.norm(kick.sum(0)) * dt
+    np.testing.assert_allclose(impulse, 12.0 * float(info["pert_mag"]) / np.pi, rtol=0.01)
+
+
+def test_each_kick_has_its_own_direction() -> None:
+  _, forces = roll(0.02, 400)
+  strong = forces[np.linalg.norm(forces, axis=1) > 1]
+  directions = np.unique(np.round(np.arctan2(strong[:, 1], strong[:, 0]) % np.pi, 3))
+  assert len(directions) > 5
