@@ -79,6 +79,8 @@ class RunConfig:
 
   Attributes:
     name: the experiment, or the task if there is none.
+    run_dir: where the run lives; without `run_dir` or `resume` a new name from the time of composing, which `resolved`
+      leaves null.
     choices: the option of each group, None where none is chosen.
     overrides: the command line in Hydra's form, numbers in their final type, the default experiment spelt out.
     resolved: all of it as plain dicts, lists and scalars; what `config.yaml` in the run directory holds.
@@ -102,12 +104,6 @@ class RunConfig:
   choices: dict[str, Any]
   overrides: tuple[str, ...]
   resolved: dict[str, Any]
-
-  def directory(self) -> Path:
-    """Where the run lives; without `run_dir` or `resume` a new name from the time of the call."""
-    if chosen := self.resume or self.run_dir:
-      return Path(chosen)
-    return Path("results", self.name, f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
 
 
 class _Override(NamedTuple):
@@ -145,9 +141,12 @@ def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> Ru
   _check_robot(config, choices, roots)
   resolved = _apply(config, [o for o in parsed if not o.is_group], _plain(schema))
   _check_values(resolved)
-  head = {"name": choices.get("experiment") or choices["env"], "choices": choices}
+  name = choices.get("experiment") or choices["env"]
+  head = {"name": name, "choices": choices}
   ordered = {key: resolved[key] for key in (*_SCALARS, *_SECTIONS) if key in resolved}
-  return from_dict({**head, **ordered, **resolved}, _canonical(parsed, resolved))
+  run_config = from_dict({**head, **ordered, **resolved}, _canonical(parsed, resolved))
+  run_dir = run_config.run_dir or f"results/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
+  return dataclasses.replace(run_config, run_dir=run_dir)
 
 
 def from_dict(resolved: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunConfig:

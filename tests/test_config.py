@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -188,10 +189,12 @@ def test_null_keys_can_be_assigned():
   assert (run.agent.max_grad_norm, run.video.camera) == (1.0, "side")
 
 
-def test_directory(run: Path):
-  assert compose().directory().parent == Path("results/quickstart")
-  assert compose(["run_dir=/tmp/here"]).directory() == Path("/tmp/here")
-  assert compose([f"resume={run}"]).directory() == run
+def test_run_dir(run: Path):
+  new = compose()
+  assert re.fullmatch(r"results/quickstart/\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d", new.run_dir or "")
+  assert new.resolved["run_dir"] is None
+  assert compose(["run_dir=/tmp/here"]).run_dir == "/tmp/here"
+  assert compose([f"resume={run}"]).run_dir == str(run)
 
 
 def test_tree_shows_every_value():
@@ -283,7 +286,7 @@ def test_errors_are_one_sentence(line: str):
 
 def test_a_key_that_only_a_file_sets_is_refused(configs: Path):
   (configs / "experiment/typo.yaml").write_text("# @package _global_\nagent: {lerning_rate: 1}\n")
-  with pytest.raises(UnknownNameError, match=r"agent\.lerning_rate, set by a chosen file.*'learning_rate'"):
+  with pytest.raises(UnknownNameError, match=r"agent\.lerning_rate, set by a chosen file.*'agent\.learning_rate'"):
     compose(["experiment=typo"], configs)
 
 

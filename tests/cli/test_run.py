@@ -52,7 +52,7 @@ def test_trains_the_default_run_and_prints_it(
 ):
   assert command() == 0
   (config,) = trained
-  assert config == compose()
+  assert config.resolved == compose().resolved
   assert "num_timesteps: 1000000" in capsys.readouterr().out
 
 
