@@ -56,6 +56,7 @@ class Learner(Protocol):
   init: Any  # (key, model) -> state
   train: Any  # (state, model, number of updates) -> (state, metrics); takes the state's buffers over
   reset: Any  # (state, key, model) -> state; takes the state's buffers over
+  copy: Any  # (state) -> state in buffers of its own
 
   def policy(self, state: Any) -> Any:
     """The part of the state that acting needs."""
@@ -128,9 +129,9 @@ def compile_program(learner: Learner, evaluate: Any, model: ModelFields, eval_mo
     train, _ = submit(learner.train, state, model, jax.ShapeDtypeStruct((), jnp.int32))
     evaluated, _ = submit(evaluate, learner.policy(state), key, eval_model)
     reset, _ = submit(learner.reset, state, key, model)
-    compiled = [future.result() for future in (init, train, reset, evaluated)]
-  copy = jax.jit(lambda state: jax.tree.map(jnp.copy, state))
-  return Program(*compiled, copy=copy, trace_s=trace_s, compile_s=time.perf_counter() - start - trace_s)
+    copied, _ = submit(learner.copy, state)
+    compiled = [future.result() for future in (init, train, reset, evaluated, copied)]
+  return Program(*compiled, trace_s=trace_s, compile_s=time.perf_counter() - start - trace_s)
 
 
 @dataclasses.dataclass

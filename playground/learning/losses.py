@@ -1,4 +1,4 @@
-"""PPO's loss, equal to Brax's `compute_ppo_loss` on the same batch, for time-major data that is normalised already."""
+"""PPO's loss, equal to Brax's `compute_ppo_loss` on the same batch, for data that is normalised already."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from playground.learning.networks import ActorCritic, ActorCriticParams
 
 
 class Batch(struct.PyTreeNode):
-  """Trajectories of one minibatch: T steps of B environments.
+  """B trajectories of T steps each, time first.
 
   Attributes:
     obs: normalised observations the actions were taken on, each [T, B, ...].

@@ -38,7 +38,6 @@ def test_loss_and_gradient_equal_brax(clip_value: float | None) -> None:
   obs = normalize(raw_obs, normalizer)
   done, truncated = flags(0.3), flags(0.5)
   truncation = done * truncated
-  old_value = draw(T, B)
   batch = Batch(
     obs=jax.tree.map(lambda x: x[:-1], obs),
     last_obs=jax.tree.map(lambda x: x[-1], obs),
@@ -47,7 +46,7 @@ def test_loss_and_gradient_equal_brax(clip_value: float | None) -> None:
     reward=draw(T, B),
     termination=done * (1 - truncation),
     truncation=truncation,
-    value=old_value,
+    value=draw(T, B),
   )
   options: dict[str, Any] = dict(
     entropy_cost=0.02, discounting=0.97, reward_scaling=0.1, gae_lambda=0.9, clipping_epsilon=0.2,
@@ -68,8 +67,8 @@ def test_loss_and_gradient_equal_brax(clip_value: float | None) -> None:
       "policy_extras": {
         "raw_action": batch_first(batch.raw_action),
         "log_prob": batch_first(batch.log_prob),
-        "distribution_params": batch_first(draw(T, B, 2 * ACTIONS)),
-        "value": batch_first(old_value),
+        "distribution_params": draw(B, T, 2 * ACTIONS),
+        "value": batch_first(batch.value),
       },
     },
   )

@@ -112,7 +112,8 @@ def test_a_bad_gradient_is_left_out() -> None:
   rng = np.random.default_rng(0)
   obs = {"state": rng.normal(size=(5, 8, 2)), "privileged_state": rng.normal(size=(5, 8, 4))}
   zeros = np.zeros((5, 8), np.float32)
-  batch = Batch(obs, jax.tree.map(lambda x: x[0], obs), rng.normal(size=(5, 8, 2)), zeros, zeros * np.nan, zeros, zeros)
+  last_obs = jax.tree.map(lambda x: x[0], obs)
+  batch: Any = Batch(obs, last_obs, rng.normal(size=(5, 8, 2)), zeros, zeros * np.nan, zeros, zeros)  # pyright: ignore
   step = lambda batch, carry, x: learner._sgd_step(batch, carry, x)
   mapped = jit_on_mesh(step, learner.mesh, (P(), P(), P()), P())
   columns = np.arange(8)
