@@ -1,6 +1,7 @@
 """`playground eval <run>`: episodes of a trained policy, measured on this machine."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 from rich.console import Console
@@ -8,7 +9,7 @@ from rich.table import Table
 
 from playground import config as configs
 from playground import registry
-from playground.errors import HardwareError
+from playground.errors import ConfigError
 from playground.hardware.setup import setup
 from playground.learning.checkpoints import Checkpoint, find_checkpoints
 from playground.learning.evaluation import make_evaluator
@@ -18,6 +19,14 @@ from playground.runs.files import write_json
 from playground.runs.job import episodes_of
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import randomized_models
+
+
+def this_machine(hardware: Any) -> Any:
+  """A run's `hardware` config for looking at it here: one device of whatever kind there is."""
+  hardware = hardware.copy_and_resolve_references()
+  hardware.devices = 1
+  hardware.platform = "cpu" if hardware.platform == "cpu" else "auto"
+  return hardware
 
 
 def evaluate_run(
@@ -49,12 +58,11 @@ def evaluate_run(
   checkpoint = Checkpoint(find_checkpoints(path)[0])
   run_dir = RunDirectory.open(checkpoint.path.parents[1])
   run = configs.from_dict(run_dir.config)
-  hardware = setup(run.hardware)
+  hardware = setup(this_machine(run.hardware))
   agent = PPOConfig.from_config(run.agent)
   count = agent.num_eval_envs if episodes is None else episodes
-  if count < 1 or count % hardware.mesh.size:
-    devices = hardware.mesh.size
-    raise HardwareError(f"--episodes={count} must be a positive multiple of the number of devices, {devices}.")
+  if count < 1:
+    raise ConfigError(f"--episodes={count} must be above 0.")
   env = registry.load(run.choices["env"], config=run.env)
   _, model = randomized_models(env, run, 1, count)
   learner = PPO(env, agent, hardware.mesh, {}, hardware.network_precision)

@@ -5,6 +5,7 @@ from rich.console import Console
 
 from playground import config as configs
 from playground import registry
+from playground.cli.eval import this_machine
 from playground.hardware.setup import setup
 from playground.runs.nonfinite import Dump, nonfinite_fields
 
@@ -22,7 +23,7 @@ def replay(path: str, console: Console | None = None) -> int:
   console = console or Console()
   dump = Dump(path)
   run = configs.from_dict(dump.config)
-  hardware = setup(run.hardware)
+  hardware = setup(this_machine(run.hardware))
   env = registry.load(run.choices["env"], config=run.env)
   before = dump.state(env)
   console.print(f"{run.choices['env']} at physics time {float(before.data.time):.3f} s, action {dump.action.tolist()}")

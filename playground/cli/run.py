@@ -5,7 +5,9 @@ Our check comes first, so that a mistake is one sentence; the rest is a Hydra ap
 """
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 
 import hydra
@@ -35,6 +37,13 @@ def main() -> None:
   except BrokenPipeError:  # `playground-run --help | head`
     sys.stderr.close()
     code = 0
+  except KeyboardInterrupt:  # before training listens for signals
+    code = 128 + signal.SIGINT
+  if any(thread.name.startswith("compiler") for thread in threading.enumerate()):
+    # Interrupted while compiling: a normal exit would wait for the compiler, minutes perhaps.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
   sys.exit(code)
 
 

@@ -6,6 +6,7 @@ A checkpoint has three items: `policy` (normaliser and networks: what evaluation
 
 import hashlib
 import logging
+import shutil
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -25,8 +26,19 @@ Arrays = list[np.ndarray]
 class CheckpointStore:
   """The `checkpoints/` folder of one run. Saving happens on a thread of its own; one save at a time."""
 
-  def __init__(self, folder: str | Path, keep: int = 3):
-    """Opens (and makes) the folder; the newest `keep` checkpoints are kept."""
+  def __init__(self, folder: str | Path, keep: int = 3, continued: int | None = None):
+    """Opens (and makes) the folder.
+
+    Args:
+      folder: where to.
+      keep: how many are kept, the newest.
+      continued: the step that the run goes on from. Checkpoints after it are removed: they were found damaged, and the
+        run is about to make them again.
+    """
+    if continued is not None:
+      for path in Path(folder).glob("*"):
+        if path.name.isdigit() and int(path.name) > continued:
+          shutil.rmtree(path)
     options = ocp.CheckpointManagerOptions(
       max_to_keep=keep, step_format_fixed_length=12, enable_async_checkpointing=False, cleanup_tmp_directories=True
     )

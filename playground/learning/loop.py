@@ -1,10 +1,10 @@
 """The host's side of training, the same for every algorithm: when to train, evaluate, reset, save and stop.
 
-The device is never kept waiting: work is queued one mark of the schedule ahead, and results are fetched, logged and
-saved while it runs.
+The device is not kept waiting: a thread of its own logs and saves what was done while the next stretch runs.
 """
 
 import dataclasses
+import gc
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
@@ -18,6 +18,7 @@ from jax.sharding import PartitionSpec as P
 from playground.envs.wrappers import ModelFields
 
 Metrics = dict[str, float]
+COMPILER = "compiler"  # name of the threads that compile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,12 +81,16 @@ class Learner(Protocol):
 
 
 class Hooks(Protocol):
-  """What a run does with what happens; called on the host while the device works on."""
+  """What a run does with what happens; called on a thread of its own while the device works on."""
 
-  def on_metrics(self, step: int, metrics: Metrics, state: Any, recording: Any) -> None:
-    """A row of the log. `state` is the newest state there is: it may be ahead of the row.
+  def on_metrics(self, step: int, metrics: Metrics, capture: Any, recording: Any) -> None:
+    """A row of the log.
 
-    `recording` (on the device) is what the row's evaluation recorded, None for a row without one.
+    Args:
+      step: control steps trained.
+      metrics: its columns.
+      capture: the run's first non-finite step (on the host) if the row counts any, else None.
+      recording: what the row's evaluation recorded (on the device), None for a row without one.
     """
     ...
 
@@ -115,33 +120,43 @@ def compile_program(learner: Learner, evaluate: Any, model: ModelFields, eval_mo
   """Traces each function once and compiles them side by side, ahead of the first step."""
   key = jax.ShapeDtypeStruct((2,), jnp.uint32)
   start, trace_s = time.perf_counter(), 0.0
-  with ThreadPoolExecutor() as pool:
+  pool = ThreadPoolExecutor(thread_name_prefix=COMPILER)
 
-    def submit(function: Any, *args: Any) -> tuple[Any, Any]:
-      nonlocal trace_s
-      begin = time.perf_counter()
-      traced = function.trace(*args)
-      lowered = traced.lower()
-      trace_s += time.perf_counter() - begin
-      return pool.submit(lowered.compile), traced.out_info
+  def submit(function: Any, *args: Any) -> tuple[Any, Any]:
+    nonlocal trace_s
+    begin = time.perf_counter()
+    traced = function.trace(*args)
+    lowered = traced.lower()
+    trace_s += time.perf_counter() - begin
+    return pool.submit(lowered.compile), traced.out_info
 
+  collecting = gc.isenabled()
+  gc.disable()  # tracing makes millions of objects that stay: looking through them again and again is a quarter of it
+  try:
     init, state = submit(learner.init, key, model)
     train, _ = submit(learner.train, state, model, jax.ShapeDtypeStruct((), jnp.int32))
     evaluated, _ = submit(evaluate, learner.policy(state), key, eval_model)
     reset, _ = submit(learner.reset, state, key, model)
     copied, _ = submit(learner.copy, state)
     compiled = [future.result() for future in (init, train, reset, evaluated, copied)]
+  finally:
+    pool.shutdown(wait=False, cancel_futures=True)  # an interrupted run does not wait for its compiler
+    if collecting:
+      gc.enable()
   return Program(*compiled, trace_s=trace_s, compile_s=time.perf_counter() - start - trace_s)
 
 
 @dataclasses.dataclass
-class Pending:
-  """Work that is queued on the device for one mark, to be fetched later."""
+class Done:
+  """What was done up to one mark, on the device."""
 
   mark: Mark
-  num_updates: int
+  steps: int
   trained: Any = None
+  train_s: float = 0.0
   evaluated: Any = None
+  eval_s: float = 0.0
+  capture: Any = None
   snapshot: Any = None
 
 
@@ -180,7 +195,6 @@ class Loop:
     self._replicated = NamedSharding(learner.mesh, P())
     self._init_key, self._eval_key, self._reset_key = jax.random.split(jax.random.PRNGKey(seed), 3)
     self.train_s = 0.0  # device time of training alone
-    self.trained_steps = 0
     self.first_update_s: float | None = None
 
   def init(self) -> Any:
@@ -198,66 +212,69 @@ class Loop:
       The last state, and whether the schedule was completed.
     """
     marks = [mark for mark in self._marks if update is None or mark.update > update]
-    at, pending = update or 0, None
-    self._clock = self._last_save = time.perf_counter()
-    for mark in marks:
-      state, queued = self._queue(state, mark, mark.update - at)
-      at = mark.update
-      if pending:
-        self._fetch(pending, state)
-      pending = queued
-      if self._hooks.should_stop() and mark is not marks[-1]:
-        pending.snapshot = state
-        self._fetch(pending, state)
-        return state, False
-    if pending:
-      self._fetch(pending, state)
-    return state, True
+    at, reported = update or 0, None
+    self._last_save = time.perf_counter()
+    with ThreadPoolExecutor(1, thread_name_prefix="report") as reports:
+      for mark in marks:
+        state, done = self._work(state, mark, mark.update - at)
+        at = mark.update
+        if reported:
+          reported.result()  # one row is in flight; what went wrong with it stops the run here
+        stop = self._hooks.should_stop() and mark is not marks[-1]
+        if stop:
+          done.snapshot = state
+        reported = reports.submit(self._report, done)
+        if stop:
+          break
+      if reported:
+        reported.result()
+    return state, at == self._marks[-1].update
 
-  def _queue(self, state: Any, mark: Mark, num_updates: int) -> tuple[Any, Pending]:
-    queued = Pending(mark, num_updates)
+  def _work(self, state: Any, mark: Mark, num_updates: int) -> tuple[Any, Done]:
+    """Trains up to a mark and does what it asks for; waits for the numbers, not for resets and copies."""
+    done = Done(mark, num_updates * self._learner.steps_per_update)
     if num_updates:
-      state, queued.trained = self._program.train(state, self._model, np.int32(num_updates))
+      start = time.perf_counter()
+      state, done.trained = self._program.train(state, self._model, np.int32(num_updates))
+      jax.block_until_ready(done.trained)
+      done.train_s = time.perf_counter() - start
+      self.train_s += done.train_s
+      self.first_update_s = self.first_update_s or done.train_s / num_updates
+      if done.trained["nonfinite"] > 0:
+        done.capture = jax.device_get(state.capture)
     if mark.evaluate:
+      start = time.perf_counter()
       policy = self._learner.policy(state)
-      queued.evaluated = self._program.evaluate(policy, self._key(self._eval_key, mark), self._eval_model)
+      done.evaluated = self._program.evaluate(policy, self._key(self._eval_key, mark), self._eval_model)
+      jax.block_until_ready(done.evaluated)
+      done.eval_s = time.perf_counter() - start
     if mark.reset:
       state = self._program.reset(state, self._key(self._reset_key, mark), self._model)
     due = mark.evaluate or mark is self._marks[-1] or time.perf_counter() - self._last_save > self._save_every_s
     if due and mark.update:
       # A copy, because the next training call takes the state's buffers over while this one is written to disk.
-      queued.snapshot = self._program.copy(state)
+      done.snapshot = self._program.copy(state)
       self._last_save = time.perf_counter()
-    return state, queued
+    return state, done
 
-  def _fetch(self, done: Pending, newest: Any) -> None:
-    """Waits for queued work, then hands it to the hooks."""
+  def _report(self, done: Done) -> None:
+    """Hands finished work to the hooks."""
     row: Metrics = {}
     step = done.mark.update * self._learner.steps_per_update
+    recording = None
     if done.trained is not None:
       report = {k: float(v) for k, v in jax.device_get(done.trained).items()}
       # No episode ended in this stretch: then there is no mean over episodes to log.
       means = () if report["episodes"] else [k for k in report if k.startswith("episode_")]
       row |= {f"training/{k}": v for k, v in report.items() if k not in means}
-      seconds = self._lap()
-      steps = done.num_updates * self._learner.steps_per_update
-      row["time/steps_per_second"] = steps / seconds
-      self.train_s += seconds
-      self.trained_steps += steps
-      self.first_update_s = self.first_update_s or seconds / done.num_updates
-    recording = None
+      row["time/steps_per_second"] = done.steps / done.train_s
     if done.evaluated is not None:
       scores, recording = done.evaluated
       row |= {f"eval/{k}": float(v) for k, v in jax.device_get(scores).items()}
-      row["time/eval_s"] = self._lap()
-    self._hooks.on_metrics(step, row, newest, recording)
+      row["time/eval_s"] = done.eval_s
+    self._hooks.on_metrics(step, row, done.capture, recording)
     if done.snapshot is not None:
       self._hooks.on_save(done.mark.update, step, done.snapshot)
-
-  def _lap(self) -> float:
-    now = time.perf_counter()
-    seconds, self._clock = now - self._clock, now
-    return seconds
 
   def _key(self, key: jax.Array, mark: Mark) -> jax.Array:
     return jax.device_put(jax.random.fold_in(key, mark.update), self._replicated)

@@ -17,6 +17,7 @@ from playground.runs.interrupts import Interrupts
 from playground.runs.nonfinite import write_dump
 from playground.runs.plots import plot_learning_curve
 from playground.runs.progress import Progress
+from playground.runs.provenance import process_age_s
 from playground.runs.run_dir import RunDirectory
 from playground.runs.start import Start
 from playground.runs.trackers import make_trackers
@@ -48,16 +49,20 @@ class Job:
     self._learner = learner
     self._progress = progress
     self._interrupts = interrupts
-    self._trackers = make_trackers(config.resolved, run_dir, start.step, progress.print)
-    self._store = CheckpointStore(run_dir.checkpoints, config.checkpoint.keep)
+    # A run that is resumed from the beginning logs all its rows again: step 0 is after "step -1".
+    continued = -1 if start.run_dir and start.step is None else start.step
+    self._trackers = make_trackers(config.resolved, run_dir, continued, progress.print)
+    self._store = CheckpointStore(run_dir.checkpoints, config.checkpoint.keep, continued)
     self._videos = ThreadPoolExecutor(1, thread_name_prefix="video")
     self._video: Future[Path | None] | None = None
     self._earlier_s = start.wall_clock_s
     self._began = time.perf_counter()
     self._evaluations = 0
-    self._last: dict[str, Any] = {"step": start.step or 0, "episode_reward": None, "recording": None}
-    self._counted_step = start.step or 0
-    self._dumped = False
+    self._step = start.step or 0
+    self._recording: Any = None
+    self._rates: list[float] = []  # steps per second, by row
+    self._start_to_first_update_s: float | None = None
+    self._dumped = any(run_dir.nan_dump.glob("*.npz"))  # by an earlier start of this run
     self._closed = False
     self._tracing: int | None = None
 
@@ -66,19 +71,20 @@ class Job:
     """Time the run has taken, over all its starts, without compiling."""
     return self._earlier_s + time.perf_counter() - self._began
 
-  def on_metrics(self, step: int, metrics: Metrics, state: Any, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, capture: Any, recording: Any) -> None:
     score = metrics.get("eval/episode_reward")
     self._trackers.log(step, metrics | {"time/wall_clock_s": self.wall_clock_s})
     self._progress.update(step, metrics.get("time/steps_per_second"), score)
-    self._last |= {"step": step, "recording": recording}
+    taken = step - self._step
+    self._time(taken, metrics)
+    self._step, self._recording = step, recording
     if score is not None:
-      self._last["episode_reward"] = score
       self._evaluations += 1
       every = self._config.video.every_evals
       if every and self._evaluations % every == 0:
         self._start_video(step, recording)
     self._trace(metrics)
-    self._check_numbers(step, metrics, state)
+    self._check_numbers(step, taken, metrics, capture)
 
   def on_save(self, update: int, step: int, state: Any) -> None:
     policy, rest = self._learner.split(state)
@@ -97,25 +103,28 @@ class Job:
     """Waits for what is being written, and writes the run's result."""
     self._progress.phase("saving")
     self._store.close()
-    if self._config.video.enable and self._config.video.at_end and self._last["recording"] is not None:
+    wanted = self._config.video.enable and self._config.video.at_end and not self.should_stop()
+    if wanted and self._recording is not None:
       self._progress.phase("rendering the video")
-      self._start_video(self._last["step"], self._last["recording"])
+      self._start_video(self._step, self._recording)
     policy, _ = self._learner.split(state)
-    steps_per_second = loop.trained_steps / loop.train_s if loop.train_s else None
     wall_clock_s = self.wall_clock_s
     if self._video:
       self._video.result()
     self.close("finished" if completed else "preempted")
     plot_learning_curve(self._run_dir.metrics_csv, self._run_dir.plots)
-    self._run_dir.update_manifest(timings={"first_update_s": loop.first_update_s, "train_s": loop.train_s})
+    timings = {
+      "start_to_first_update_s": self._start_to_first_update_s,
+      "first_update_s": loop.first_update_s,
+      "train_s": loop.train_s,
+      "steady_steps_per_second": float(np.median(self._rates)) if self._rates else None,
+    }
+    self._run_dir.update_manifest(timings=timings)
     self._run_dir.write_summary(
       {
         "status": "finished" if completed else "preempted",
         "env": self._config.choices["env"],
-        "final_return": self._last["episode_reward"],
-        "best_return": self._best_return(),
-        "steps": self._last["step"],
-        "steps_per_second": steps_per_second,
+        **self._scores(),
         "wall_clock_s": wall_clock_s,
         "params_sha256": checksum([np.asarray(x) for x in jax.device_get(jax.tree.leaves(policy))]),
       }
@@ -128,12 +137,32 @@ class Job:
       self._videos.shutdown(cancel_futures=True)
       self._trackers.close(status)
 
-  def _best_return(self) -> float | None:
+  def _scores(self) -> dict[str, float | None]:
+    """The result as metrics.csv has it: of the whole run, however often it was resumed."""
     import pandas as pd
 
     table = pd.read_csv(self._run_dir.metrics_csv)
-    scores = table["eval/episode_reward"].dropna() if "eval/episode_reward" in table else table.iloc[:0, 0]
-    return float(scores.max()) if len(scores) else None
+    column = lambda name: np.asarray(table[name] if name in table else np.full(len(table), np.nan), float)
+    returns, rate = column("eval/episode_reward"), column("time/steps_per_second")
+    returns, trained = returns[np.isfinite(returns)], np.isfinite(rate)
+    taken = np.diff(column("step"), prepend=0)[trained]
+    seconds = float((taken / rate[trained]).sum())
+    return {
+      "final_return": float(returns[-1]) if len(returns) else None,
+      "best_return": float(returns.max()) if len(returns) else None,
+      "steps": self._step,
+      "steps_per_second": float(taken.sum()) / seconds if seconds else None,
+    }
+
+  def _time(self, taken: int, metrics: Metrics) -> None:
+    """Notes how fast a row was trained and, at the first, when the first training step was done."""
+    rate = metrics.get("time/steps_per_second")
+    if rate is None:
+      return
+    if not self._rates:
+      after_first = (taken - self._learner.steps_per_update) / rate
+      self._start_to_first_update_s = process_age_s() - after_first
+    self._rates.append(rate)
 
   def _start_video(self, step: int, recording: Any) -> None:
     """Renders the first recorded episodes in a child process while training goes on."""
@@ -163,16 +192,15 @@ class Job:
       jax.profiler.stop_trace()
       self._tracing = 1
 
-  def _check_numbers(self, step: int, metrics: Metrics, state: Any) -> None:
+  def _check_numbers(self, step: int, taken: int, metrics: Metrics, capture: Any) -> None:
     """Dumps the first non-finite step, and stops the run when there are too many of them."""
     bad = metrics.get("training/nonfinite", 0.0)
-    taken, self._counted_step = step - self._counted_step, step
     if not bad:
       return
     where = ""
     if not self._dumped:
       self._dumped = True
-      dump = write_dump(self._run_dir.nan_dump, step, state.capture, self._config.resolved)
+      dump = write_dump(self._run_dir.nan_dump, step, capture, self._config.resolved)
       where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
       self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN or infinite.{where}")
     fraction = bad * self._env.action_repeat / max(taken, 1)

@@ -66,7 +66,7 @@ class Dump:
 
   def replay(self, env: Env) -> State:
     """Takes the step again, on this machine's backend."""
-    model = env.mjx_model.tree_replace(dict(self.model)) if self.model else None
+    model: Any = env.mjx_model.tree_replace(dict(self.model)) if self.model else None
     return jax.jit(lambda state, action: env.step(state, action, model))(self.state(env), self.action)
 
 

@@ -48,12 +48,16 @@ class Start:
       CheckpointError: nothing usable there, or `run_dir` holds a run already.
     """
     if config.resume is not None:
-      start = cls(run_dir=RunDirectory.open(config.resume))
+      run_dir = RunDirectory.open(config.resume)
+      start = cls(run_dir=run_dir)
       try:
         start.checkpoints = find_checkpoints(config.resume)
       except CheckpointError:
         start.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
+        weights = run_dir.config["init_from"]  # which `config`, being that of a resumed run, no longer says
+        start.weights = Checkpoint(find_checkpoints(weights)[0]) if weights else None
       return start
+    assert config.run_dir is not None, "composing names one"
     RunDirectory(config.run_dir).must_be_new()
     if config.init_from is not None:
       return cls(weights=Checkpoint(find_checkpoints(config.init_from)[0]))

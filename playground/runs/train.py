@@ -60,8 +60,8 @@ def _train(config: "RunConfig", interrupts: Interrupts) -> int:
 
   num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
   marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
-  run_dir = start.run_dir or RunDirectory.create(config.run_dir, config.resolved, config.overrides)
-  with recorded(run_dir, interrupts), Progress(num_updates * learner.steps_per_update) as progress:
+  run_dir = start.run_dir or RunDirectory.create(str(config.run_dir), config.resolved, config.overrides)
+  with recorded(run_dir), Progress(num_updates * learner.steps_per_update) as progress:
     notes = [] if not env.parity else ["env.parity=true: playground 0.2.0 bug for bug"]
     run_dir.write_manifest(
       seed=config.seed, task=config.choices["env"], impl=env.impl, task_notes=notes, **hardware.facts
@@ -85,7 +85,7 @@ def _train(config: "RunConfig", interrupts: Interrupts) -> int:
       state, completed = loop.run(state, start.update)
       job.finish(loop, state, completed)
   _say_where(run_dir)
-  return 0 if interrupts.signum is None else exit_code(interrupts.signum)
+  return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
 
 
 def randomized_models(
@@ -101,13 +101,13 @@ def randomized_models(
 
 
 @contextlib.contextmanager
-def recorded(run_dir: RunDirectory, interrupts: Interrupts) -> Iterator[None]:
-  """Keeps `status.json` true, whatever ends the block."""
+def recorded(run_dir: RunDirectory) -> Iterator[None]:
+  """Keeps `status.json` true, whatever ends the block; a block that ends well has written the summary."""
   run_dir.set_status("running")
   try:
     yield
   except Interrupted as interrupt:
-    run_dir.set_status("preempted", f"{interrupt}, before anything was trained")
+    run_dir.set_status("preempted", f"{interrupt}, without a last checkpoint; resume={run_dir.path} continues")
     raise
   except PlaygroundError as error:
     run_dir.set_status("failed", str(error))
@@ -115,10 +115,10 @@ def recorded(run_dir: RunDirectory, interrupts: Interrupts) -> Iterator[None]:
   except BaseException as error:
     run_dir.set_status("failed", f"{type(error).__name__}: {error}")
     raise
-  if interrupts.signum is None:
+  if run_dir.summary["status"] == "finished":
     run_dir.set_status("finished")
   else:
-    run_dir.set_status("preempted", f"signal {interrupts.signum}; resume={run_dir.path} continues")
+    run_dir.set_status("preempted", f"interrupted and saved; resume={run_dir.path} continues")
 
 
 def _say_where(run_dir: RunDirectory) -> None:

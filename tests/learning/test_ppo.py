@@ -29,7 +29,7 @@ class Recorder:
     self.saved: list[tuple[int, Any]] = []
     self.stop_after = stop_after
 
-  def on_metrics(self, step: int, metrics: Metrics, state: Any, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, capture: Any, recording: Any) -> None:
     self.rows.append((step, {k: v for k, v in metrics.items() if not k.startswith("time/")}))
 
   def on_save(self, update: int, step: int, state: Any) -> None:

@@ -1,0 +1,117 @@
+"""`playground eval`: a run, one of its checkpoints, and what is neither."""
+
+import json
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from playground import registry
+from playground.cli.main import main
+from playground.config import compose
+from playground.learning.checkpoints import find_checkpoints
+from playground.runs.train import train
+from tests.dummy import PointTask
+
+Command = Callable[..., int]
+
+
+class Point(PointTask):
+  """The task without physics, as far as a run needs more of it than its trainer does."""
+
+  mj_model: Any = None  # pyright: ignore[reportIncompatibleVariableOverride]
+  impl = "jax"
+  parity = False
+
+
+@pytest.fixture(autouse=True)
+def point(monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(registry, "load", lambda name, config=None: Point())
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+  """A finished run with two checkpoints."""
+  run = tmp_path_factory.mktemp("trained") / "run"
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(registry, "load", lambda name, config=None: Point())
+    args = ["env=CartpoleBalance", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv", f"run_dir={run}"]
+    args += ["agent.num_evals=3", "agent.num_timesteps=4000", "agent.learning_rate=0.01"]
+    assert train(compose(args)) == 0
+  return run
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Command:
+  def call(*args: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["playground", "eval", *args])
+    with pytest.raises(SystemExit) as exit_:
+      main()
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+  return call
+
+
+def report(run: Path, step: int, seed: int = 0) -> dict[str, Any]:
+  return json.loads((run / "eval" / f"step_{step:012d}_seed_{seed}.json").read_text())
+
+
+def test_a_run_is_evaluated_at_its_newest_checkpoint(
+  command: Command, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+  assert command(str(trained)) == 0
+  out = capsys.readouterr().out
+  written = report(trained, 4000)
+  assert written["checkpoint"] == str(find_checkpoints(trained)[0])
+  assert (written["episodes"], written["seed"], written["platform"]) == (4, 0, "cpu")
+  assert written["scores"]["episode_length"] == 20
+  assert re.search(rf"reward\W+{written['scores']['episode_reward']:.4g}\b", out)
+  assert "CartpoleBalance, 4 episodes, 4,000 steps trained" in " ".join(out.split())
+  assert f"written to {trained}/eval/step_000000004000_seed_0.json" in out
+
+
+def test_one_checkpoint_with_more_episodes_and_another_seed(command: Command, trained: Path) -> None:
+  older = find_checkpoints(trained)[1]
+  assert command(str(older), "--episodes", "6", "--seed", "3") == 0
+  written = report(trained, 2000, seed=3)
+  assert (written["checkpoint"], written["episodes"], written["seed"]) == (str(older), 6, 3)
+
+
+def test_the_mode_of_the_policy_is_another_score(command: Command, trained: Path) -> None:
+  scores = []
+  for flags in ([], ["--deterministic"], ["--deterministic"]):
+    assert command(str(trained), "--seed", "5", *flags) == 0
+    scores.append(report(trained, 4000, seed=5)["scores"]["episode_reward"])
+  assert scores[0] != scores[1] == scores[2]
+
+
+@pytest.mark.parametrize("missing", ["gone", "empty", "run/checkpoints/000000000001"])
+def test_a_wrong_path_is_one_sentence(
+  command: Command, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
+) -> None:
+  (tmp_path / "empty").mkdir()
+  path = trained.parent / missing if missing.startswith("run") else tmp_path / missing
+  assert command(str(path)) == 2
+  (line,) = capsys.readouterr().err.splitlines()
+  assert line.startswith("error: ")
+  assert str(path) in line
+
+
+def test_a_run_of_a_larger_machine_is_evaluated_on_this_one(command: Command, trained: Path, tmp_path: Path) -> None:
+  run = shutil.copytree(trained, tmp_path / "run")
+  config = yaml.safe_load((run / "config.yaml").read_text())
+  config["hardware"] |= {"platform": "gpu", "devices": 64}
+  (run / "config.yaml").write_text(yaml.safe_dump(config))
+  assert command(str(run)) == 0
+  assert report(run, 4000)["num_devices"] == 1
+
+
+def test_no_episodes_are_refused(command: Command, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  assert command(str(trained), "--episodes", "0") == 2
+  assert "--episodes=0 must be above 0" in capsys.readouterr().err

@@ -1,0 +1,390 @@
+"""Whole runs: what they leave behind, and that nothing that ends one early changes what comes out."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from playground.cli.replay import replay
+from playground.cli.run import main
+from playground.config import compose
+from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
+from playground.learning.loop import Loop
+from playground.runs import train as train_module
+from playground.runs.run_dir import RunDirectory
+from playground.runs.start import Start
+from playground.runs.train import train
+
+BATCH = 80  # environment steps of one training step with debug=fast
+STEPS = 400_000  # seconds of training, so that a signal finds the run at work
+TASK = ["env=CartpoleBalance", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv"]
+LONG = [*TASK, f"agent.num_timesteps={STEPS - 10}", "agent.num_evals=5"]  # a checkpoint every quarter
+COMMAND = [sys.executable, "-c", "from playground.cli.run import main; main()"]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+  """One compilation cache for all runs of this module, those in this process included; empty at first."""
+  folder = tmp_path_factory.mktemp("cache")
+  before = jax.config.jax_compilation_cache_dir
+  jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
+  compilation_cache.reset_cache()
+  yield folder
+  jax.config.update("jax_compilation_cache_dir", before)
+  compilation_cache.reset_cache()
+
+
+def start(run: Path, cache: Path, *overrides: str) -> "subprocess.Popen[str]":
+  """Starts `playground-run` in a process of its own."""
+  log = run.with_suffix(".log").open("w")
+  args = [*COMMAND, *LONG, f"run_dir={run}", f"hardware.cache_dir={cache}", *overrides]
+  env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+  return subprocess.Popen(args, stdout=log, stderr=subprocess.STDOUT, text=True, env=env)
+
+
+def stop(process: "subprocess.Popen[str]", signum: int, when: Callable[[], bool]) -> int:
+  """Sends a signal as soon as something is so; returns how the process ended."""
+  until = time.monotonic() + 240
+  while not when():
+    assert process.poll() is None, "the run ended before it could be stopped"
+    assert time.monotonic() < until, "what the test waits for does not come"
+    time.sleep(0.002)
+  process.send_signal(signum)
+  return process.wait(60)
+
+
+def last_row(run: Path) -> int:
+  """Steps of the last whole row of metrics.csv, -1 if there is none."""
+  try:
+    rows = (run / "metrics.csv").read_text().rpartition("\n")[0].splitlines()[1:]
+  except FileNotFoundError:
+    return -1
+  return int(rows[-1].split(",")[0]) if rows else -1
+
+
+def resume(run: Path) -> int:
+  return train(compose([f"resume={run}"]))
+
+
+def assert_same_result(run: Path, whole: Path) -> None:
+  """Same parameters and same rows as the run that was left alone."""
+  ours, theirs = RunDirectory(run), RunDirectory(whole)
+  assert ours.status["status"] == "finished"
+  for key in ("params_sha256", "final_return", "best_return", "steps", "status"):
+    assert ours.summary[key] == theirs.summary[key], key
+  assert ours.summary["steps_per_second"] > 0
+  tables = [pd.read_csv(path / "metrics.csv") for path in (run, whole)]
+  ours, theirs = (table.filter(regex="^(?!time/)") for table in tables)
+  assert len(theirs) == 101
+  pd.testing.assert_frame_equal(ours, theirs, check_like=True, check_exact=True)
+  assert sorted(tables[0]) == sorted(tables[1])
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+  """The run that nothing happens to, started with an empty compilation cache."""
+  run = tmp_path_factory.mktemp("whole") / "run"
+  assert start(run, cache).wait(300) == 0, run.with_suffix(".log").read_text()
+  return run
+
+
+@pytest.fixture
+def copy(whole: Path, tmp_path: Path) -> Path:
+  """The whole run as it would lie there had its process been killed right after the last checkpoint."""
+  run = shutil.copytree(whole, tmp_path / "copy")
+  (run / "summary.json").unlink()
+  RunDirectory(run).set_status("running")
+  return run
+
+
+def truncate(checkpoint: Path) -> None:
+  """Halves the file that holds the arrays of the training state."""
+  largest = max((p for p in (checkpoint / "state").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+  os.truncate(largest, largest.stat().st_size // 2)
+
+
+def test_a_run_leaves_everything_behind(whole: Path) -> None:
+  run = RunDirectory(whole)
+  assert run.config["agent"]["num_timesteps"] == STEPS - 10
+  assert run.config["env"]["episode_length"] == 20, "resolved: debug=fast is in it"
+  assert f"agent.num_timesteps={STEPS - 10}" in run.overrides
+  assert run.status["status"] == "finished"
+
+  manifest = run.manifest
+  assert (manifest["seed"], manifest["task"], manifest["platform"]) == (1, "CartpoleBalance", "cpu")
+  assert (manifest["matmul_precision"], manifest["network_precision"]) == ("highest", "tensorfloat32")
+  assert manifest["versions"]["jax"] == jax.__version__
+  timings = manifest["timings"]
+  for name in ("trace_s", "compile_s", "start_to_compiled_s", "start_to_first_update_s", "first_update_s", "train_s"):
+    assert timings[name] > 0, name
+  assert timings["trace_s"] + timings["compile_s"] < timings["start_to_compiled_s"] < timings["start_to_first_update_s"]
+
+  table = pd.read_csv(run.metrics_csv)
+  assert table["step"].is_monotonic_increasing
+  assert table["eval/episode_reward"].notna().sum() == 5
+  rates = table["time/steps_per_second"].dropna()
+  assert timings["steady_steps_per_second"] == pytest.approx(rates.median())
+  summary = run.summary
+  assert STEPS - 10 <= summary["steps"] < STEPS - 10 + BATCH, "the budget is met to within one batch"
+  assert table["step"].to_numpy()[-1] == summary["steps"]
+  assert summary["final_return"] == table["eval/episode_reward"].to_numpy()[-1]
+  assert summary["best_return"] == np.nanmax(table["eval/episode_reward"].to_numpy())
+  assert summary["steps_per_second"] == pytest.approx(summary["steps"] / timings["train_s"])
+  assert summary["wall_clock_s"] > timings["train_s"]
+  newest, *others = find_checkpoints(whole)
+  assert len(others) == 2, "checkpoint.keep"
+  checkpoint = Checkpoint(newest)
+  assert checkpoint.step == summary["steps"]
+  assert checkpoint.meta["sha256"]["policy"] == summary["params_sha256"]
+  assert {p.name for p in run.plots.iterdir()} == {"return_over_steps.png", "return_over_wall_clock.png"}
+  log = whole.with_suffix(".log").read_text()
+  assert all(str(path) in log for path in (run.metrics_csv, run.plots, run.checkpoints))
+
+
+@pytest.mark.parametrize("moment", ["before the first checkpoint", "while one is written", "after one"])
+def test_sigkill_and_resume_change_nothing(
+  moment: str, whole: Path, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+  run = tmp_path / "run"
+  checkpoints = run / "checkpoints"
+  when: dict[str, Callable[[], bool]] = {
+    "before the first checkpoint": lambda: last_row(run) > 0,
+    "while one is written": lambda: (checkpoints / f"{STEPS // 4:012d}").exists() and any(checkpoints.glob("*tmp*")),
+    "after one": lambda: last_row(run) > 0.6 * STEPS and (checkpoints / f"{STEPS // 2:012d}").exists(),
+  }
+  assert stop(start(run, cache), signal.SIGKILL, when[moment]) == -signal.SIGKILL
+  assert RunDirectory(run).status["status"] == "running"
+  found = {int(p.name): p for p in checkpoints.glob("*") if p.name.isdigit()}
+  assert bool(found) == (moment != "before the first checkpoint")
+  assert resume(run) == 0
+  said = capsys.readouterr().out
+  assert (f"training state of {found[max(found)]}" if found else f"{run} stopped before its first checkpoint") in said
+  assert_same_result(run, whole)
+  assert len(RunDirectory(run).manifest["earlier_starts"]) == 1
+
+
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_and_leaves(signum: int, whole: Path, cache: Path, tmp_path: Path) -> None:
+  run = tmp_path / "run"
+  assert stop(start(run, cache), signum, lambda: last_row(run) > 0.3 * STEPS) == 128 + signum
+  assert RunDirectory(run).status["status"] == "preempted"
+  summary = RunDirectory(run).summary
+  newest = find_checkpoints(run)[0]
+  assert Checkpoint(newest).step == summary["steps"] == last_row(run), "saved where it was, not at the last evaluation"
+  assert 0.3 * STEPS < summary["steps"] < STEPS
+  assert resume(run) == 0
+  assert_same_result(run, whole)
+
+
+def test_a_signal_while_compiling(whole: Path, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  run = tmp_path / "run"
+  log = run.with_suffix(".log")
+  compiling_since: list[float] = []
+
+  def compiling() -> bool:
+    if not compiling_since and "compiling for" in log.read_text():
+      compiling_since.append(time.monotonic())
+    return bool(compiling_since) and time.monotonic() > compiling_since[0] + 3
+
+  process = start(run, cache, "hardware.compilation_cache=false")
+  assert stop(process, signal.SIGTERM, compiling) == 143
+  status = RunDirectory(run).status
+  assert (status["status"], "SIGTERM" in status["reason"]) == ("preempted", True)
+  assert "Traceback" not in log.read_text()
+  assert resume(run) == 0
+  assert "stopped before its first checkpoint: starting from the beginning" in capsys.readouterr().out
+  assert_same_result(run, whole)
+
+
+def test_a_second_start_takes_less_than_half_the_time(whole: Path, cache: Path, tmp_path: Path) -> None:
+  run = tmp_path / "run"
+  assert start(run, cache, f"agent.num_timesteps={BATCH}").wait(300) == 0
+  cold, warm = (RunDirectory(path).manifest["timings"]["start_to_first_update_s"] for path in (whole, run))
+  assert warm < 0.5 * cold
+
+
+def test_a_damaged_checkpoint_is_passed_over(whole: Path, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  newest, before, _ = find_checkpoints(copy)
+  truncate(newest)
+  assert resume(copy) == 0
+  said = capsys.readouterr().out
+  assert f"{newest} is damaged" in said
+  assert "Falling back to the checkpoint before it." in said
+  assert f"training state of {before}" in said
+  assert_same_result(copy, whole)
+
+
+def test_a_run_killed_after_its_last_checkpoint_ends_with_the_same_result(whole: Path, copy: Path) -> None:
+  assert resume(copy) == 0
+  assert_same_result(copy, whole)
+
+
+# What is refused
+
+
+@pytest.fixture
+def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+  """Runs the command in this process: exit code 2 and one sentence, which it returns."""
+
+  def run(*args: str) -> str:
+    monkeypatch.setattr(sys, "argv", ["playground-run", *args])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+      main()
+    assert exit_.value.code == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+  return run
+
+
+def test_nothing_but_damaged_checkpoints(copy: Path, refused: Callable[..., str]) -> None:
+  checkpoints = find_checkpoints(copy)
+  for path in checkpoints:
+    truncate(path)
+  before = (copy / "metrics.csv").read_bytes()
+  assert f"{checkpoints[-1]} is damaged" in refused(f"resume={copy}")
+  assert (copy / "metrics.csv").read_bytes() == before
+
+
+def test_a_run_directory_is_not_used_twice(whole: Path, refused: Callable[..., str]) -> None:
+  sentence = refused(*TASK, f"run_dir={whole}")
+  assert f"resume={whole}" in sentence
+  assert f"init_from={whole}" in sentence
+  assert RunDirectory(whole).status["status"] == "finished"
+
+
+def test_a_finished_run_is_not_resumed(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  before = (whole / "status.json").read_bytes()
+  assert resume(whole) == 0
+  assert f"{whole} is finished: nothing to resume (init_from={whole}" in capsys.readouterr().out
+  assert (whole / "status.json").read_bytes() == before
+
+
+def test_more_devices_than_there_are(tmp_path: Path, refused: Callable[..., str]) -> None:
+  assert "hardware.devices=99, but this machine has" in refused(
+    *TASK, "hardware.devices=99", f"run_dir={tmp_path / 'run'}"
+  )
+  assert not (tmp_path / "run").exists()
+
+
+# Starting from weights
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+  """For every run in this process: the update that its loop began after, the policy before and the policy after."""
+  seen: list[Any] = []
+
+  class Watched(Loop):
+    def run(self, state: Any, update: int | None = None) -> tuple[Any, bool]:
+      before = jax.device_get(self._learner.policy(state))
+      state, completed = super().run(state, update)
+      seen.append((update, before, jax.device_get(self._learner.policy(state))))
+      return state, completed
+
+  monkeypatch.setattr(train_module, "Loop", Watched)
+  return seen
+
+
+def test_weights_of_another_task_are_refused(whole: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+  sentence = refused(
+    "env=Go1JoystickFlatTerrain", *TASK[1:], "randomization=none", f"init_from={whole}", f"run_dir={tmp_path / 'run'}"
+  )
+  assert f"{find_checkpoints(whole)[0]} does not fit this run: .params.policy" in sentence
+  assert "float32[5, 16] there and float32[48, 16] here" in sentence
+  assert not (tmp_path / "run").exists(), "nothing was compiled or begun"
+
+
+@pytest.mark.parametrize("source", ["run", "checkpoint"])
+def test_a_new_run_starts_from_weights(
+  source: str,
+  whole: Path,
+  tmp_path: Path,
+  watched: list[Any],
+  capsys: pytest.CaptureFixture[str],
+) -> None:
+  newest, older, _ = find_checkpoints(whole)
+  path, checkpoint = (whole, Checkpoint(newest)) if source == "run" else (older, Checkpoint(older))
+  args = [*TASK, "agent.num_timesteps=320", f"init_from={path}", f"run_dir={tmp_path / 'run'}"]
+  assert train(compose(args)) == 0
+  ((update, policy, _),) = watched
+  assert checksum(jax.tree.leaves(policy)) == checkpoint.meta["sha256"]["policy"]
+  assert update is None
+  said = capsys.readouterr().out
+  assert f"{checkpoint.path} (CartpoleBalance, {checkpoint.step:,} steps)" in said
+  assert "the optimiser is fresh" in said
+  summary = RunDirectory(tmp_path / "run").summary
+  assert summary["steps"] == 320, "a new budget"
+  assert summary["params_sha256"] != checkpoint.meta["sha256"]["policy"], "it trained on"
+
+
+def test_resumed_before_its_first_checkpoint_it_starts_from_the_weights_again(whole: Path, tmp_path: Path) -> None:
+  run = RunDirectory.create(tmp_path / "run", compose([*TASK, f"init_from={whole}"]).resolved)
+  found = Start.find(compose([f"resume={run.path}"]))
+  assert found.weights is not None
+  assert found.weights.path == find_checkpoints(whole)[0]
+
+
+# Numbers that are not finite
+
+UNSTABLE = [*TASK, "agent.num_timesteps=800", "env.ctrl_dt=10", "env.sim_dt=10"]  # blows up within a few steps
+
+
+def test_nan_is_counted_dumped_and_kept_out(
+  tmp_path: Path, cache: Path, watched: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+  run = tmp_path / "run"
+  assert train(compose([*UNSTABLE, "on_nonfinite.max_fraction=1", f"run_dir={run}"])) == 0
+  assert RunDirectory(run).status["status"] == "finished"
+  table = pd.read_csv(run / "metrics.csv")
+  assert np.sum(table["training/nonfinite"].to_numpy() > 0) > 1, "more than one row has them"
+  assert table["eval/nonfinite"].to_numpy()[-1] > 0
+  numbers = table.filter(regex="^(eval|training)/").to_numpy()
+  assert not np.isinf(numbers).any()
+  trained = table[table["training/episodes"] > 0].filter(regex="^training/")
+  assert len(trained)
+  assert np.isfinite(trained.to_numpy()).all()
+  (dump,) = (run / "nan_dump").iterdir()
+  said = capsys.readouterr().out
+  assert said.count("playground replay") == 1
+  assert f"playground replay {dump}" in said
+
+  ((_, _, policy),) = watched  # the normaliser's sum of squares may overflow: a step before NaN is huge
+  kept_out = (policy.params, policy.normalizer.mean, policy.normalizer.std)
+  assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(kept_out))
+
+  assert replay(str(dump)) == 0
+  recorded, replayed = capsys.readouterr().out.split("replayed on cpu with impl=jax: not finite in ")
+  assert "recorded: not finite in" in recorded
+  assert "['qpos']: 2 of 2" in recorded
+  assert "['data'].qpos: 2 of 2" in replayed
+
+  (newest,) = find_checkpoints(run)
+  newest.rename(newest.with_name("kept"))  # as if killed before the checkpoint: the first bad step is found again
+  RunDirectory(run).set_status("running")
+  assert resume(run) == 0
+  assert list((run / "nan_dump").iterdir()) == [dump], "one dump a run, however often it is resumed"
+
+
+def test_too_many_nan_stop_the_run(tmp_path: Path, cache: Path, refused: Callable[..., str]) -> None:
+  run = tmp_path / "run"
+  sentence = refused(*UNSTABLE, "on_nonfinite.max_fraction=0.001", f"run_dir={run}")
+  assert "went NaN or infinite, more than on_nonfinite.max_fraction=0.001" in sentence
+  (dump,) = (run / "nan_dump").iterdir()
+  assert f"playground replay {dump}" in sentence
+  status = RunDirectory(run).status
+  assert (status["status"], f"error: {status['reason']}") == ("failed", sentence)
