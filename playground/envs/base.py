@@ -1,7 +1,8 @@
 """What a task is: a pure `reset` and `step` for one environment, and the three calls a step is made of."""
 
 import abc
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import jax
@@ -112,8 +113,19 @@ class Env(abc.ABC):
   @property
   def observation_size(self) -> int | dict[str, tuple[int, ...]]:
     """Length of the observation vector, or the shape of each entry of a dict observation."""
-    obs = jax.eval_shape(self.reset, jax.random.PRNGKey(0)).obs
+    obs = jax.eval_shape(self.jitted[0], jax.random.PRNGKey(0), {}).obs
     return {k: v.shape for k, v in obs.items()} if isinstance(obs, Mapping) else obs.shape[-1]
+
+  @functools.cached_property
+  def jitted(self) -> tuple[Callable[..., State], Callable[..., State]]:
+    """`reset(key, fields)` and `step(state, action, fields)`, with randomised model fields by name ({} for none).
+
+    Jitted inside whatever maps or scans over them: the task's Python is traced once, for all batch sizes.
+    """
+    model: Callable[..., Any] = lambda fields: self.mjx_model.tree_replace(fields) if fields else None
+    reset = jax.jit(lambda key, fields: self.reset(key, model(fields)))
+    step = jax.jit(lambda state, action, fields: self.step(state, action, model(fields)))
+    return reset, step
 
   @property
   def unwrapped(self) -> "Env":

@@ -4,7 +4,6 @@ Each wrapper takes and returns batches of `State` (leading axis N). A randomised
 from field name ("geom_friction", dotted for nested ones) to values with leading axis N, or None for the task's own.
 """
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -18,6 +17,7 @@ ModelFields = Mapping[str, jax.Array]
 # `info` keys that wrappers own; a fresh reset of a task never touches them.
 EPISODE_KEYS = ("steps", "truncation", "episode_done", "episode_metrics")
 PREFIX = "AutoResetWrapper_"
+MAX_VALUE = 1e10  # MuJoCo's own limit for positions and velocities (mjMAXVAL)
 PRESERVE_INFO = PREFIX + "preserve_info"  # what a task puts here survives a full reset (a curriculum's level, say)
 
 
@@ -50,8 +50,7 @@ class Vectorize(Wrapper):
 
   def __init__(self, env: Env):
     super().__init__(env)
-    # Jitted inside the vmap: the task's Python is traced once, whatever batch sizes it is then used with.
-    self._reset_one, self._step_one = _jitted(env)
+    self._reset_one, self._step_one = env.jitted
 
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
     return jax.vmap(self._reset_one)(rng, dict(model or {}))
@@ -60,16 +59,10 @@ class Vectorize(Wrapper):
     return jax.vmap(self._step_one)(state, action, dict(model or {}))
 
 
-@functools.lru_cache(maxsize=8)  # one trace serves training, evaluation and resets of the same task
-def _jitted(env: Env) -> tuple[Callable[..., State], Callable[..., State]]:
-  randomised = lambda fields: env.mjx_model.tree_replace(fields) if fields else None
-  reset = jax.jit(lambda key, fields: env.reset(key, randomised(fields)))
-  step = jax.jit(lambda state, action, fields: env.step(state, action, randomised(fields)))
-  return reset, step
-
-
 class FiniteGuard(Wrapper):
-  """Ends an episode whose numbers went NaN or infinite, before they reach anything that learns.
+  """Ends an episode whose numbers went NaN, infinite or absurd, before they reach anything that learns.
+
+  Absurd is beyond `MAX_VALUE`: the step before a NaN may hold finite values that ruin observation statistics as surely.
 
   Such a step gives done = 1, reward 0, the previous observation, metrics 0 and the previous info; `info["nonfinite"]`
   is 1 for it, and `info["nonfinite_state"]` holds the simulator's state as it came out of the step.
@@ -86,7 +79,7 @@ class FiniteGuard(Wrapper):
     finite = jnp.ones_like(after.done, bool)
     for leaf in jax.tree.leaves(watched):
       if jnp.issubdtype(leaf.dtype, jnp.floating):
-        finite &= jnp.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim)))
+        finite &= (jnp.abs(leaf) <= MAX_VALUE).all(axis=tuple(range(1, leaf.ndim)))  # false for NaN, too
     bad = ~finite
     zeros = jax.tree.map(jnp.zeros_like, (after.reward, after.metrics))
     reward, metrics = where_done(bad, zeros, (after.reward, after.metrics))

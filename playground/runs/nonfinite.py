@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from playground.envs.base import Env, State
+from playground.envs.wrappers import MAX_VALUE
 from playground.errors import CheckpointError
 from playground.learning.rollout import NonfiniteCapture
 from playground.runs.files import replacing
@@ -71,12 +72,13 @@ class Dump:
 
 
 def nonfinite_fields(tree: Any) -> list[str]:
-  """Names of the leaves that hold a NaN or infinity, with how many."""
+  """Names of the leaves that hold a NaN, infinity or value beyond the guard's limit, with how many."""
   lines = []
   for name, leaf in _named(tree):
     values = np.asarray(leaf)
-    if np.issubdtype(values.dtype, np.floating) and not np.isfinite(values).all():
-      lines.append(f"{name}: {int((~np.isfinite(values)).sum())} of {values.size}")
+    bad = ~(np.abs(values) <= MAX_VALUE) if np.issubdtype(values.dtype, np.floating) else np.zeros(1, bool)
+    if bad.any():
+      lines.append(f"{name}: {int(bad.sum())} of {values.size}")
   return lines
 
 

@@ -53,7 +53,7 @@ def test_trains_the_default_run_and_prints_it(
   assert command() == 0
   (config,) = trained
   assert config.resolved == compose().resolved
-  assert "num_timesteps: 1000000" in capsys.readouterr().out
+  assert "num_timesteps: 6000000" in capsys.readouterr().out
 
 
 def test_leaves_nothing_of_hydras_behind(command: Command, trained: list[RunConfig], tmp_path: Path):
@@ -78,7 +78,7 @@ def test_resumes(command: Command, trained: list[RunConfig], tmp_path: Path, cap
 @pytest.mark.parametrize(
   ("args", "shown"),
   [
-    (["--cfg", "job"], ["num_envs: 256\n", "num_timesteps: 1000000\n"]),
+    (["--cfg", "job"], ["num_envs: 256\n", "num_timesteps: 6000000\n"]),
     (["agent.num_timesteps=2e6", "--cfg", "job", "agent.num_envs=64"], ["num_envs: 64\n", "num_timesteps: 2000000\n"]),
     (["env=CartpoleBalance", "--cfg", "job", "--package", "agent"], ["num_envs: 2048\n"]),
     (["--help"], ["hardware: auto, cpu, gpu", "num_envs: 256\n"]),

@@ -62,7 +62,7 @@ def test_loss_and_gradient_equal_brax(clip_value: float | None) -> None:
     reward=batch_first(batch.reward),
     discount=batch_first(1 - done),
     next_observation=jax.tree.map(lambda x: batch_first(x[1:]), raw_obs),
-    extras={
+    extras={  # pyright: ignore[reportArgumentType]
       "state_extras": {"truncation": batch_first(truncation)},
       "policy_extras": {
         "raw_action": batch_first(batch.raw_action),

@@ -107,7 +107,7 @@ def test_nan_is_counted_captured_and_kept_from_the_parameters() -> None:
 
 def test_a_bad_gradient_is_left_out() -> None:
   learner, _ = built()
-  params = learner.networks.init(jax.random.PRNGKey(0))
+  params: Any = learner.networks.init(jax.random.PRNGKey(0))
   opt_state = learner.optimizer.init(params)
   rng = np.random.default_rng(0)
   obs = {"state": rng.normal(size=(5, 8, 2)), "privileged_state": rng.normal(size=(5, 8, 4))}

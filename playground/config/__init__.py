@@ -1,0 +1,40 @@
+"""From command line to configuration: finds configs/, composes them with Hydra, checks them, hands out ConfigDicts.
+
+The only place that knows OmegaConf. Nothing here needs JAX, so that a mistake is reported at once.
+
+How a value is chosen, later wins: config.yaml and the chosen option of every group; the tuned set of the pair agent and
+env; the experiment; debug; the command line. The options alone are also the schema: what they do not have does not
+exist, and what they have fixes each value's type, wherever that value is set.
+
+  files        where configs/ lies, which groups and options it has
+  overrides    the command line, one `key=value` at a time
+  composition  all of it together, for a new run and for one that goes on
+  schema       keys that exist and the types of their values
+  limits       what types cannot say: choices, ranges, sizes that must divide
+  run_config   the result, and how it is saved, read and shown
+"""
+
+from playground.config.composition import compose, override_section
+from playground.config.files import ENTRY_POINTS, config_roots, options, search_path_override, task_names
+from playground.config.overrides import DEFAULT_EXPERIMENT, with_default_experiment
+from playground.config.run_config import RunConfig, Section, from_dict, load, to_yaml, tree
+from playground.config.text import format_value
+
+__all__ = [
+  "DEFAULT_EXPERIMENT",
+  "ENTRY_POINTS",
+  "RunConfig",
+  "Section",
+  "compose",
+  "config_roots",
+  "format_value",
+  "from_dict",
+  "load",
+  "options",
+  "override_section",
+  "search_path_override",
+  "task_names",
+  "to_yaml",
+  "tree",
+  "with_default_experiment",
+]

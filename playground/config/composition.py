@@ -1,0 +1,167 @@
+"""All of it together: Hydra composes the files, the command line is set on top, the whole is checked."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from ml_collections import ConfigDict
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from playground.config.files import DELTAS, config_roots, groups, options, search_path_override
+from playground.config.limits import check_limits
+from playground.config.overrides import Override, canonical, group_overrides, parse, with_default_experiment
+from playground.config.run_config import SCALARS, SECTIONS, RunConfig, Section, from_dict, load
+from playground.config.schema import check_key, fit
+from playground.config.text import first_line
+from playground.errors import ConfigError, nearest
+
+_RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
+_NO_DELTAS = [f"~{group}" for group in DELTAS]
+
+
+def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> RunConfig:
+  """Composes the configuration of a run.
+
+  Args:
+    overrides: as on the command line, `env=CartpoleBalance`, `agent.num_envs=1024`.
+    config_dir: the folder that holds config.yaml, by default the one we ship.
+
+  Raises:
+    ConfigError: whatever cannot work, in one sentence.
+    UnknownNameError: a group, option or key that does not exist.
+  """
+  roots = config_roots(config_dir)
+  ours = [text for text in overrides if not text.lstrip("+~").startswith(("hydra.", "hydra/"))]
+  parsed = [parse(text, roots) for text in with_default_experiment(ours, config_dir)]
+  given = {o.key: o.value for o in parsed}
+  for key in ("resume", "init_from"):
+    if given.get(key) is not None:
+      _check_path(key, given[key])
+  if given.get("resume") is not None:
+    return _compose_resumed(Path(given["resume"]), parsed, roots)
+
+  config, choices = _hydra(group_overrides(parsed), roots)
+  schema, _ = _hydra([f"{g}={c}" for g, c in choices.items() if c and g not in DELTAS] + _NO_DELTAS, roots)
+  _check_robot(config, choices, roots)
+  resolved = _apply(config, [o for o in parsed if not o.is_group], _plain(schema))
+  check_limits(resolved)
+  name = choices.get("experiment") or choices["env"]
+  head = {"name": name, "choices": choices}
+  ordered = {key: resolved[key] for key in (*SCALARS, *SECTIONS) if key in resolved}
+  run_config = from_dict({**head, **ordered, **resolved}, canonical(parsed, resolved))
+  return dataclasses.replace(run_config, run_dir=run_config.run_dir or _new_run_dir(str(name)))
+
+
+def override_section(section: str, default: Section, overrides: Mapping[str, Any]) -> dict[str, Any]:
+  """Returns a section, e.g. env, with dotted keys such as `reward.scales.energy` replaced, checked as in `compose`."""
+  schema = {section: _plain(default)}
+  parsed = [Override(f"{section}.{key}", value, False, "") for key, value in overrides.items()]
+  resolved = _apply(OmegaConf.create(schema), parsed, schema)
+  check_limits(resolved)
+  return resolved[section]
+
+
+def _new_run_dir(name: str) -> str:
+  """A run directory named by the clock, numbered from _2 on if another run of this second took the name."""
+  path = f"results/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
+  candidates = itertools.chain([path], (f"{path}_{n}" for n in itertools.count(2)))
+  return next(candidate for candidate in candidates if not Path(candidate).exists())
+
+
+def _hydra(overrides: Sequence[str], roots: Sequence[Path]) -> tuple[DictConfig, dict[str, str | None]]:
+  """Hydra's composition, and what it chose for each group."""
+  outer = GlobalHydra.instance().hydra  # the app's, when this is a job of a sweep: Hydra allows one at a time
+  GlobalHydra.instance().clear()
+  try:
+    with hydra.initialize_config_dir(str(roots[0]), version_base="1.3"):
+      lines = [*overrides, *search_path_override(roots)]
+      config = hydra.compose("config", overrides=lines, return_hydra_config=True)
+      chosen = dict(config.hydra.runtime.choices)
+  except (HydraException, YAMLError, OmegaConfBaseException) as error:
+    files = " ".join(o for o in overrides if not o.startswith("~"))
+    raise ConfigError(f"The files of {files or 'config.yaml'} do not compose: {first_line(error)}.") from None
+  finally:
+    GlobalHydra.instance().hydra = outer
+  OmegaConf.set_struct(config, False)
+  del config["hydra"]
+  choices = {group: chosen.get(group) for group in groups(roots)}
+  if choices.get("tuned") not in options("tuned", roots):  # it is optional, and this pair has none
+    choices["tuned"] = None
+  return config, choices
+
+
+def _apply(config: DictConfig, overrides: Iterable[Override], schema: Mapping[str, Any]) -> dict[str, Any]:
+  """Sets values, resolves, and checks the whole against the schema."""
+  try:
+    for override in overrides:
+      check_key(override.key, schema)
+      OmegaConf.update(config, override.key, override.value, merge=isinstance(override.value, Mapping))
+    if missing := OmegaConf.missing_keys(config):
+      raise ConfigError(f"{min(missing)} has no value: set {min(missing)}=<value>.")
+    return fit(OmegaConf.to_container(config, resolve=True), schema)
+  except OmegaConfBaseException as error:
+    raise ConfigError(f"{first_line(error)}.") from None
+
+
+def _plain(config: Any) -> Any:
+  """Plain dicts and lists, interpolations resolved."""
+  config = config.to_dict() if isinstance(config, ConfigDict) else config
+  return OmegaConf.to_container(config if isinstance(config, DictConfig) else OmegaConf.create(config), resolve=True)
+
+
+def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path]) -> RunConfig:
+  """The configuration of a run that goes on: its own, but for the sections that may differ."""
+  _check_resumable(run, parsed)
+  saved = load(run / "config.yaml").resolved
+  fresh, choices = _hydra(group_overrides(parsed), roots)
+  schema = _plain(fresh)
+  chosen = {o.key for o in parsed if o.is_group}
+  sections = {s: schema[s] if s in chosen else saved[s] for s in _RESUMABLE}
+  values = [o for o in parsed if not o.is_group and o.key != "resume"]
+  changed = _apply(OmegaConf.create(sections), values, {s: schema[s] for s in sections})
+  resolved = {**saved, **changed, "resume": str(run), "run_dir": str(run), "init_from": None}
+  resolved["choices"] = {**saved["choices"], **{group: choices[group] for group in chosen}}
+  check_limits(resolved)
+  return from_dict(resolved, canonical(parsed, resolved))
+
+
+def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:
+  """A resumed run ends as if it had never stopped, so nothing that changes its numbers may change."""
+  for override in parsed:
+    if override.key == "init_from":
+      what = "resume continues a run exactly, init_from starts a new one from its weights"
+      raise ConfigError(f"{override.text} and resume={run} exclude each other: {what}.")
+    if override.key.split(".")[0] not in ("resume", *_RESUMABLE):
+      what = f"which continues exactly that run and takes only {', '.join(_RESUMABLE)}"
+      instead = f"init_from={run} starts a new run from its weights"
+      raise ConfigError(f"{override.text} cannot be given with resume, {what}; {instead}.")
+
+
+def _check_path(key: str, value: Any) -> None:
+  """What `resume` and `init_from` name must be there."""
+  path = Path(str(value))
+  wanted, what = (path / "config.yaml", "run directory") if key == "resume" else (path, "run directory or checkpoint")
+  if not wanted.exists():
+    siblings = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
+    raise ConfigError(f"{key}={value} is no {what}: {wanted} does not exist.{nearest(path.name, siblings)}")
+
+
+def _check_robot(config: DictConfig, choices: Mapping[str, str | None], roots: Sequence[Path]) -> None:
+  """A task that names a robot gets one, and one that names none gets none."""
+  env, robot = choices["env"], choices.get("robot")
+  robots = ", ".join(options("robot", roots))
+  if OmegaConf.is_missing(config.env, "robot"):
+    raise ConfigError(f"env={env} needs a robot: add robot=<name>, one of {robots}.")
+  if robot is not None:
+    own, chosen = _hydra([f"env={env}", *_NO_DELTAS], roots)
+    # `in` would be false for a mandatory robot that nobody has set
+    if not chosen.get("robot") and "robot" not in list(own.env):
+      raise ConfigError(f"robot={robot}: env={env} takes no robot, leave robot= out.")

@@ -1,0 +1,74 @@
+"""What types cannot say: choices, ranges, and sizes that must divide. A new limit is a new entry here."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from playground.config.schema import wrong_type
+from playground.config.text import format_value
+from playground.errors import ConfigError, nearest
+
+_PRECISIONS = ("default", "high", "highest", "bfloat16", "tensorfloat32", "float32")
+_CHOICES = {
+  "env.impl": ("auto", "jax", "warp"),
+  "hardware.platform": ("auto", "cpu", "gpu"),
+  "hardware.matmul_precision": _PRECISIONS,
+  "hardware.network_precision": _PRECISIONS,
+}
+_PATHS = ("run_dir", "resume", "init_from", "hardware.cache_dir")
+_RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
+  (
+    "above 0",
+    lambda x: x > 0,
+    "agent.num_timesteps agent.num_evals agent.num_envs agent.num_eval_envs agent.unroll_length agent.batch_size "
+    "agent.num_minibatches agent.num_updates_per_batch agent.learning_rate agent.max_grad_norm agent.clipping_epsilon "
+    "agent.clipping_epsilon_value env.ctrl_dt env.sim_dt env.episode_length env.action_repeat checkpoint.keep "
+    "video.every_evals video.episodes video.width video.height hardware.devices profile.steps",
+  ),
+  ("0 or more", lambda x: x >= 0, "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient"),
+  (
+    "between 0 and 1",
+    lambda x: 0 <= x <= 1,
+    "agent.discounting agent.gae_lambda hardware.memory_fraction on_nonfinite.max_fraction",
+  ),
+)
+
+
+def check_limits(resolved: Mapping[str, Any]) -> None:
+  """Checks the values that are there; a configuration may lack sections, and null is no value.
+
+  Raises:
+    ConfigError: the first value that cannot work.
+  """
+  for key, allowed in _CHOICES.items():
+    value = _get(resolved, key)
+    if value is not None and value not in allowed:
+      near = nearest(str(value), allowed)
+      raise ConfigError(f"{key}={format_value(value)} is unknown: choose from {', '.join(allowed)}.{near}")
+  for key in _PATHS:
+    value = _get(resolved, key)
+    if value is not None and not isinstance(value, str):
+      raise wrong_type(key, value, "text (put quotes around a number)")
+  for what, holds, keys in _RANGES:
+    for key in keys.split():
+      value = _get(resolved, key)
+      if value is not None and (isinstance(value, str | bool) or not holds(value)):
+        raise ConfigError(f"{key}={format_value(value)} must be a number {what}.")
+  _check_batch(*(_get(resolved, f"agent.{key}") for key in ("num_envs", "batch_size", "num_minibatches")))
+
+
+def _check_batch(num_envs: int | None, batch_size: int | None, num_minibatches: int | None) -> None:
+  if num_envs is None or batch_size is None or num_minibatches is None:
+    return
+  if batch_size * num_minibatches % num_envs:
+    product = f"agent.batch_size * agent.num_minibatches = {batch_size} * {num_minibatches}"
+    raise ConfigError(
+      f"agent.num_envs={num_envs} does not divide {product} = {batch_size * num_minibatches}: "
+      "choose sizes so that it does."
+    )
+
+
+def _get(node: Any, key: str) -> Any:
+  """The value of a dotted key, None if there is none."""
+  for part in key.split("."):
+    node = node.get(part) if isinstance(node, Mapping) else None
+  return node

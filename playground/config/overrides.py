@@ -1,0 +1,91 @@
+"""The command line: one `key=value` at a time, and the groups among them."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+
+from playground.config.files import DELTAS, config_roots, groups, options, task_names
+from playground.config.text import format_value
+from playground.errors import ConfigError, UnknownNameError, nearest
+
+DEFAULT_EXPERIMENT = "quickstart"
+# Any of these on the command line, and it is not the default run that is meant.
+_CHOOSES_A_RUN = {"experiment", "env", "agent", "robot", "curriculum", "resume"}
+
+
+class Override(NamedTuple):
+  """One `key=value` of the command line; the value of a group that is switched off is None."""
+
+  key: str
+  value: Any
+  is_group: bool
+  text: str
+
+
+def with_default_experiment(overrides: Sequence[str], config_dir: Path | None = None) -> list[str]:
+  """Adds the default experiment if the command line chooses no run of its own."""
+  chosen = {re.split(r"[=@]", text.lstrip("+~"))[0] for text in overrides}
+  available = (config_roots(config_dir)[0] / "experiment" / f"{DEFAULT_EXPERIMENT}.yaml").is_file()
+  return [f"experiment={DEFAULT_EXPERIMENT}"] * (available and not chosen & _CHOOSES_A_RUN) + list(overrides)
+
+
+def parse(text: str, roots: Sequence[Path]) -> Override:
+  """Reads one override and checks that the option it chooses, if any, exists.
+
+  Raises:
+    ConfigError: not an override, several values, or a key to remove.
+    UnknownNameError: no such option.
+  """
+  try:
+    parsed = OverridesParser.create().parse_override(text)
+  except HydraException:
+    example = "such as env=CartpoleBalance or agent.num_envs=1024 (quote a value with special characters)"
+    raise ConfigError(f"{text!r} is not an override: write key=value, {example}.") from None
+  key = parsed.key_or_group
+  if parsed.is_sweep_override():
+    raise ConfigError(f"{text} names several values, which is a sweep: add -m, or quote the value.")
+  is_group = key in groups(roots) and parsed.package is None
+  value = parsed.value()
+  if parsed.is_delete():
+    if not is_group:
+      raise ConfigError(f"{text}: a key cannot be removed, set another value.")
+    value = None
+  if is_group and (value is not None or key not in ("robot", *DELTAS)):
+    for option in value if isinstance(value, list) and key in DELTAS else [value]:
+      _check_option(key, option, roots)
+  return Override(key if parsed.package is None else f"{key}@{parsed.package}", value, is_group, text.lstrip("+"))
+
+
+def group_overrides(overrides: Iterable[Override]) -> list[str]:
+  """The choices of groups for Hydra, which knows no group=null: switching a group off is removing it."""
+  return [f"~{o.key}" if o.value is None else f"{o.key}={format_value(o.value)}" for o in overrides if o.is_group]
+
+
+def canonical(overrides: Iterable[Override], resolved: Mapping[str, Any]) -> list[str]:
+  """Overrides for Hydra's own use: as typed, but with groups that are off and numbers in the form that it takes."""
+  config = OmegaConf.create(dict(resolved))
+  lines = []
+  for override in overrides:
+    if override.is_group:
+      lines += group_overrides([override])
+    elif isinstance(override.value, int | float):
+      lines.append(f"{override.key}={format_value(OmegaConf.select(config, override.key))}")
+    else:
+      lines.append(override.text)
+  return lines
+
+
+def _check_option(group: str, option: Any, roots: Sequence[Path]) -> None:
+  known = options(group, roots)
+  if option in known:
+    return
+  shown = task_names(roots) if group == "env" else known
+  allowed = ", ".join(shown) if len(shown) <= 12 else f"the {len(shown)} that `playground list` shows"
+  raise UnknownNameError(
+    f"{group}={format_value(option)} does not exist: choose from {allowed}.{nearest(str(option), shown)}"
+  )

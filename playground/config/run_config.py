@@ -1,0 +1,109 @@
+"""A run's configuration as the rest of the program sees it, and how it is saved, read and shown."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ml_collections import ConfigDict
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from playground.config.text import first_line, format_value
+from playground.errors import ConfigError
+
+if TYPE_CHECKING:
+  from rich.tree import Tree
+
+SECTIONS = (
+  *("env", "agent", "randomization", "curriculum", "hardware", "tracking"),
+  *("video", "checkpoint", "on_nonfinite", "profile"),
+)
+SCALARS = ("seed", "run_dir", "resume", "init_from")
+
+Section = Any  # a ConfigDict; pyright cannot know its attributes
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+  """A run's whole configuration, checked. The sections are those of `configs/`, every value resolved.
+
+  Attributes:
+    name: the experiment, or the task if there is none.
+    run_dir: where the run lives; without `run_dir` or `resume` a new name from the time of composing, which `resolved`
+      leaves null.
+    choices: the option of each group, None where none is chosen.
+    overrides: the command line in Hydra's form, numbers in their final type, the default experiment spelt out.
+    resolved: all of it as plain dicts, lists and scalars; what `config.yaml` in the run directory holds.
+  """
+
+  name: str
+  env: Section
+  agent: Section
+  randomization: Section
+  curriculum: Section
+  hardware: Section
+  tracking: Section
+  video: Section
+  checkpoint: Section
+  on_nonfinite: Section
+  profile: Section
+  seed: int
+  run_dir: str | None
+  resume: str | None
+  init_from: str | None
+  choices: dict[str, Any]
+  overrides: tuple[str, ...]
+  resolved: dict[str, Any]
+
+
+def from_dict(resolved: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunConfig:
+  """Rebuilds a configuration from its `resolved` dict, e.g. a run directory's config.yaml.
+
+  Raises:
+    ConfigError: a part is missing, so this is not a run's configuration.
+  """
+  resolved = dict(resolved)
+  if missing := [key for key in ("name", "choices", *SECTIONS, *SCALARS) if key not in resolved]:
+    raise ConfigError(f"This is not the configuration of a run: it lacks {', '.join(missing)}.")
+  return RunConfig(
+    name=resolved["name"],
+    **{key: ConfigDict(resolved[key]) for key in SECTIONS},
+    **{key: resolved[key] for key in SCALARS},
+    choices=dict(resolved["choices"]),
+    overrides=tuple(overrides),
+    resolved=resolved,
+  )
+
+
+def load(path: Path) -> RunConfig:
+  """Reads a saved config.yaml; raises ConfigError if it is not one."""
+  try:
+    resolved = OmegaConf.to_container(OmegaConf.load(path))
+  except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
+    raise ConfigError(f"{path} cannot be read: {first_line(error)}.") from None
+  if not isinstance(resolved, dict):
+    raise ConfigError(f"{path} is not the configuration of a run.")
+  return from_dict(resolved)  # pyright: ignore[reportArgumentType]
+
+
+def to_yaml(config: RunConfig) -> str:
+  """The resolved configuration as YAML, which `load` reads."""
+  return OmegaConf.to_yaml(OmegaConf.create(config.resolved))
+
+
+def tree(config: RunConfig) -> "Tree":
+  """The configuration as a tree for printing with rich."""
+  from rich.text import Text
+  from rich.tree import Tree
+
+  def grow(branch: Tree, node: Mapping[str, Any]) -> Tree:
+    for key, value in node.items():
+      if isinstance(value, Mapping) and value:
+        grow(branch.add(Text(str(key), style="bold")), value)
+      else:
+        branch.add(Text.assemble((f"{key}: ", "cyan"), format_value(value)))
+    return branch
+
+  return grow(Tree(Text(config.name, style="bold")), {k: v for k, v in config.resolved.items() if k != "name"})

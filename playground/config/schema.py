@@ -1,0 +1,103 @@
+"""Keys that exist and the types of their values. The schema is a nested dict of default values."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from playground.config.files import DELTAS
+from playground.config.text import format_value, join, nearest_in
+from playground.errors import ConfigError, UnknownNameError, nearest
+
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", list: "a list"}
+
+
+def check_key(key: str, schema: Mapping[str, Any]) -> None:
+  """Raises UnknownNameError, with what is there instead, if the schema has no such dotted key."""
+  node: Any = schema
+  parts = key.split(".")
+  for i, part in enumerate(parts):
+    if isinstance(node, list) and part.isdigit() and int(part) < len(node):
+      node = node[int(part)]
+    elif isinstance(node, Mapping) and part in node:
+      node = node[part]
+    else:
+      raise _unknown_key(key, ".".join(parts[:i]), part, node, schema)
+
+
+def fit(value: Any, default: Any, key: str = "") -> Any:
+  """Returns a value in the type of its default, e.g. 1e6 as the whole number that the default is.
+
+  Args:
+    value: of the configuration, or a part of it.
+    default: the same part of the schema; None takes any single value or list, an empty mapping any mapping.
+    key: where the part is, for errors.
+
+  Raises:
+    ConfigError: it has another type.
+    UnknownNameError: it has a key that the default has not.
+  """
+  if isinstance(default, Mapping) and default:
+    return _fit_mapping(value, default, key)
+  if isinstance(default, list) and isinstance(value, list):
+    return _fit_list(value, default, key)
+  if default is None:
+    if isinstance(value, Mapping):
+      raise wrong_type(key, value, "a single value, a list or null")
+    return value
+  if not _fits(value, default):
+    kind = _KINDS.get(type(default), "a mapping")
+    raise wrong_type(key, value, f"{kind}, as its default {format_value(default)} is")
+  return type(default)(value) if isinstance(default, int | float) else value
+
+
+def wrong_type(key: str, value: Any, allowed: str) -> ConfigError:
+  """The error for a value of another type than is allowed."""
+  return ConfigError(f"{key}={format_value(value)} has the wrong type: it must be {allowed}.")
+
+
+def _fits(value: Any, default: Any) -> bool:
+  if isinstance(default, bool) or not isinstance(default, int | float):
+    return isinstance(value, type(default))
+  if not isinstance(value, int | float) or isinstance(value, bool) or value != value:  # NaN fits nothing
+    return False
+  return isinstance(default, float) or float(value).is_integer()
+
+
+def _fit_mapping(value: Any, default: Mapping[str, Any], key: str) -> dict[str, Any]:
+  if not isinstance(value, Mapping):
+    raise wrong_type(key, value, f"a mapping with the keys {', '.join(map(str, default))}")
+  for name in value:
+    if name not in default:
+      near = nearest_in(key, str(name), default)
+      raise UnknownNameError(f"{join(key, name)}, set by a chosen file or mapping, does not exist.{near}")
+  return {name: fit(value[name], default[name], join(key, name)) for name in value}
+
+
+def _fit_list(value: list[Any], default: list[Any], key: str) -> list[Any]:
+  """Lists may differ in length; if the default's entries are all of one scalar type, so must the value's be."""
+  kinds = {type(entry) for entry in default}
+  if float in kinds:
+    kinds.discard(int)  # [0, 0.5] is a list of numbers
+  if len(kinds) != 1 or not kinds <= {bool, int, float, str}:
+    return value
+  sample = next(entry for entry in default if type(entry) in kinds)
+  return [fit(entry, sample, f"{key}[{i}]") for i, entry in enumerate(value)]
+
+
+def _unknown_key(key: str, parent: str, part: str, node: Any, schema: Mapping[str, Any]) -> UnknownNameError:
+  if not isinstance(node, Mapping):
+    what = f"a list of {len(node)}" if isinstance(node, list) else "a single value"
+    return UnknownNameError(f"{key} does not exist: {parent} is {what}.")
+  known = [str(k) for k in node] if parent else [*schema, "robot", *DELTAS]
+  near = nearest_in(parent, part, known)
+  if not near and not parent:  # perhaps only the section is missing
+    near = nearest(part, _keys(schema))
+  has = f"has {', '.join(known)}" if len(known) <= 12 or not near else f"has {len(known)} keys (--cfg job shows them)"
+  return UnknownNameError(f"{key} does not exist: {parent or 'the configuration'} {has}.{near}")
+
+
+def _keys(node: Any, prefix: str = "") -> Iterable[str]:
+  """Dotted names of everything in a nested mapping."""
+  if isinstance(node, Mapping):
+    for name, value in node.items():
+      yield join(prefix, name)
+      yield from _keys(value, join(prefix, name))

@@ -1,0 +1,30 @@
+"""Values and errors in the words of the command line."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from playground.errors import nearest
+
+
+def format_value(value: Any) -> str:
+  """A value as one would write it on the command line."""
+  if value is None or isinstance(value, bool):
+    return {None: "null", True: "true", False: "false"}[value]
+  if isinstance(value, Mapping):
+    return "{" + ", ".join(f"{k}: {format_value(v)}" for k, v in value.items()) + "}"
+  return f"[{', '.join(map(format_value, value))}]" if isinstance(value, list | tuple) else str(value)
+
+
+def first_line(error: Exception) -> str:
+  """What an error says first, to be put into a sentence of ours."""
+  return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+def join(parent: str, name: object) -> str:
+  """The dotted key of something in `parent`, which is '' at the top."""
+  return f"{parent}.{name}" if parent else str(name)
+
+
+def nearest_in(parent: str, name: str, known: Iterable[Any]) -> str:
+  """As `nearest`, with the whole dotted key."""
+  return nearest(name, map(str, known)).replace("'", f"'{join(parent, '')}", 1)
