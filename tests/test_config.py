@@ -71,10 +71,10 @@ def test_a_task_without_a_tuned_set_has_the_agents_defaults(configs: Path):
 
 def test_later_layers_win(configs: Path):
   (configs / "experiment/mine.yaml").write_text(
-    "# @package _global_\ndefaults:\n  - override /env: CartpoleBalance\nagent: {num_envs: 1024, learning_rate: 1}\n"
+    "# @package _global_\ndefaults:\n  - override /env: CartpoleBalance\nagent: {num_envs: 512, learning_rate: 1}\n"
   )
   agent = compose(["experiment=mine"], configs).agent
-  assert (agent.num_envs, agent.learning_rate, agent.num_minibatches) == (1024, 1.0, 32)  # experiment over tuned
+  assert (agent.num_envs, agent.learning_rate, agent.num_minibatches) == (512, 1.0, 32)  # experiment over tuned
   assert isinstance(agent.learning_rate, float)
   assert compose(["experiment=mine", "agent.num_envs=256"], configs).agent.num_envs == 256
   assert compose(["agent.num_envs=4", "debug=fast", "experiment=mine"], configs).agent.num_envs == 4
@@ -132,7 +132,7 @@ def test_paper_values_of_go1():
   agent = compose(["experiment=go1_joystick"]).agent
   assert (agent.num_timesteps, agent.num_evals, agent.num_resets_per_eval) == (200_000_000, 10, 1)
   assert (agent.num_envs, agent.batch_size, agent.unroll_length, agent.max_grad_norm) == (8192, 256, 20, 1.0)
-  assert tuple(agent.network.policy_hidden_layer_sizes) == (1024, 256, 128)
+  assert tuple(agent.network.policy_hidden_layer_sizes) == (512, 256, 128)
 
 
 @pytest.mark.parametrize(
@@ -263,7 +263,7 @@ ERRORS = {
   "seed=-1": ["seed=-1 must be a number 0 or more."],
   "env.impl=wrap": ["env.impl=wrap is unknown: choose from auto, jax, warp. Did you mean 'warp'?"],
   "hardware.matmul_precision=higest": ["choose from default, high, highest, ", "Did you mean 'highest'?"],
-  "agent.num_envs=100": ["agent.num_envs=100 does not divide", "64 * 8 = 1024"],
+  "agent.num_envs=100": ["agent.num_envs=100 does not divide", "128 * 8 = 1024"],
   "env=joystick": ["env=joystick needs a robot: add robot=<name>, one of go1"],
   "env=CartpoleBalance robot=go1": ["robot=go1: env=CartpoleBalance takes no robot"],
   "init_from=/nowhere/run": ["init_from=/nowhere/run is no run directory or checkpoint", "does not exist."],
