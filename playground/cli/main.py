@@ -115,7 +115,7 @@ def describe(config: RunConfig, env: "Env") -> "Iterable[RenderableType]":
     "backend": auto if section["impl"] == "auto" else section["impl"],
   }
   yield _table(f"{choices['env']}", facts.items())
-  yield _table("observation", _observation(env, state.obs, section))
+  yield _table("observation", _observation(env, state.obs))
   scales = section.get("reward", {}).get("scales", {})
   terms = [name.removeprefix("reward/") for name in state.metrics if name.startswith("reward/")]
   yield _table("reward terms and weights", ((t, scales.get(t, "")) for t in dict.fromkeys([*scales, *terms])))
@@ -126,14 +126,13 @@ def describe(config: RunConfig, env: "Env") -> "Iterable[RenderableType]":
   yield _table(f"{config.agent.name} ({origin})", _flat(config.resolved["agent"]))
 
 
-def _observation(env: "Env", obs: Any, section: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
-  """Rows of the observation: each entry's size, below it its parts, with sizes where the task tells them."""
-  parts: Mapping[str, Any] = getattr(env, "observation_parts", None) or section.get("obs", {})
+def _observation(env: "Env", obs: Any) -> Iterable[tuple[str, Any]]:
+  """Rows of the observation: each entry's size, below it its parts with theirs."""
+  parts = env.observation_parts
   entries = obs if isinstance(obs, Mapping) else {"state": obs}
   for group in [g for g in parts if g in entries] + [g for g in entries if g not in parts]:
     yield group, " x ".join(map(str, entries[group].shape))
-    named = parts.get(group, ())
-    yield from ((f"  {part}", named[part] if isinstance(named, Mapping) else "") for part in named)
+    yield from ((f"  {part}", size) for part, size in parts.get(group, {}).items())
 
 
 def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:

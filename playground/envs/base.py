@@ -116,6 +116,11 @@ class Env(abc.ABC):
     obs = jax.eval_shape(self.jitted[0], jax.random.PRNGKey(0), {}).obs
     return {k: v.shape for k, v in obs.items()} if isinstance(obs, Mapping) else obs.shape[-1]
 
+  @property
+  def observation_parts(self) -> dict[str, dict[str, int]]:
+    """What each observation entry is made of, in order: part name to length ("state" for a flat observation)."""
+    return {}
+
   @functools.cached_property
   def jitted(self) -> tuple[Callable[..., State], Callable[..., State]]:
     """`reset(key, fields)` and `step(state, action, fields)`, with randomised model fields by name ({} for none).

@@ -48,6 +48,14 @@ def test_batched_step(kicked: Joystick, start: State, step) -> None:
   assert (after.reward >= 0).all()
 
 
+def test_observation_parts_add_up(kicked: Joystick) -> None:
+  sizes = {name: value.shape[0] for name, value in dict(shapes(kicked).obs).items()}
+  parts = kicked.observation_parts
+  assert {name: sum(of.values()) for name, of in parts.items()} == sizes
+  assert list(parts["state"].items())[:2] == [("linvel", 3), ("gyro", 3)]
+  assert parts["privileged_state"]["feet_velocity"] == 12
+
+
 def test_resets_differ(start: State) -> None:
   for value in (start.data.qpos[:, 0], start.info["command"][:, 0], start.info["pert_mag"]):
     assert len(np.unique(value)) == 4

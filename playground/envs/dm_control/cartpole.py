@@ -38,6 +38,10 @@ class Cartpole(Env):
     self._terms = _sparse if config.sparse else _dense
     self._pole = self.mj_model.body("pole_1").id
 
+  @property
+  def observation_parts(self) -> dict[str, dict[str, int]]:
+    return {"state": {"cart_position": 1, "pole_cos": 1, "pole_sin": 1, "velocity": 2}}
+
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
     keys = jax.random.split(rng, 3)
     cart_key, pole_key, velocity_key = keys

@@ -71,6 +71,19 @@ class Joystick(Env):
         lookup(OBSERVATIONS if group == ACTOR else {ACTOR: None, **OBSERVATIONS}, part, f"env.obs.{group}")
     self._pushing: bool = config.pushes.enable
 
+  @property
+  def observation_parts(self) -> dict[str, dict[str, int]]:
+    names = {part for parts in self._obs.values() for part in parts} - {ACTOR}
+
+    def every_part(rng: jax.Array) -> dict[str, jax.Array]:
+      state = self.reset(rng)
+      now = self._context(state.data, state.info, jnp.zeros(self.action_size))
+      return {name: OBSERVATIONS[name](now) for name in names}
+
+    sizes = {name: part.size for name, part in jax.eval_shape(every_part, jax.random.PRNGKey(0)).items()}
+    sizes[ACTOR] = sum(sizes[part] for part in self._obs[ACTOR])
+    return {group: {part: sizes[part] for part in parts} for group, parts in self._obs.items()}
+
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
     model = self.mjx_model if model is None else model
     rng, data = self._start(rng, model)
