@@ -1,7 +1,6 @@
 """All of it together: Hydra composes the files, the command line is set on top, the whole is checked."""
 
 import dataclasses
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -57,7 +56,8 @@ def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> Ru
   head = {"name": name, "choices": choices}
   ordered = {key: resolved[key] for key in (*SCALARS, *SECTIONS) if key in resolved}
   run_config = from_dict({**head, **ordered, **resolved}, canonical(parsed, resolved))
-  return dataclasses.replace(run_config, run_dir=run_config.run_dir or _new_run_dir(str(name)))
+  run_dir = run_config.run_dir or f"results/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
+  return dataclasses.replace(run_config, run_dir=run_dir)
 
 
 def override_section(section: str, default: Section, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,13 +67,6 @@ def override_section(section: str, default: Section, overrides: Mapping[str, Any
   resolved = _apply(OmegaConf.create(schema), parsed, schema)
   check_limits(resolved)
   return resolved[section]
-
-
-def _new_run_dir(name: str) -> str:
-  """A run directory named by the clock, numbered from _2 on if another run of this second took the name."""
-  path = f"results/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
-  candidates = itertools.chain([path], (f"{path}_{n}" for n in itertools.count(2)))
-  return next(candidate for candidate in candidates if not Path(candidate).exists())
 
 
 def _hydra(overrides: Sequence[str], roots: Sequence[Path]) -> tuple[DictConfig, dict[str, str | None]]:

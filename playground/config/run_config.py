@@ -31,8 +31,8 @@ class RunConfig:
 
   Attributes:
     name: the experiment, or the task if there is none.
-    run_dir: where the run lives; without `run_dir` or `resume` a new name from the time of composing, which `resolved`
-      leaves null.
+    run_dir: where the run lives; without `run_dir` or `resume` a name from the time of composing, which `resolved`
+      leaves null, and which the run numbers (`_2`) if another has it by then.
     choices: the option of each group, None where none is chosen.
     overrides: the command line in Hydra's form, numbers in their final type, the default experiment spelt out.
     resolved: all of it as plain dicts, lists and scalars; what `config.yaml` in the run directory holds.

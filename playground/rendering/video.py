@@ -6,6 +6,7 @@
 import contextlib
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import numpy as np
 
 from playground.errors import PlaygroundError, nearest
 from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
+from playground.runs.files import replacing
 
 MAX_FPS = 50.0
 _CAMERAS = ("track", "tracking", "fixed", "side", "front", "back", "cam0")
@@ -91,9 +93,9 @@ def render_video(
   if backend is None:
     notify(f"No video at {out_path.name}. {NO_GL_REMEDY}")
     return None
-  partial = _partial(out_path)
   timeout_s = timeout_s or 60.0 + 0.5 * len(qpos)
-  with tempfile.TemporaryDirectory(prefix="playground_video_") as folder, open(f"{folder}/stderr", "w+") as stderr:
+  scratch = tempfile.TemporaryDirectory(prefix="playground_video_", ignore_cleanup_errors=True)
+  with scratch as folder, open(f"{folder}/stderr", "w+") as stderr:
     view = {"camera": camera, "width": width, "height": height}
     trajectory = save_trajectory(Path(folder) / "trajectory.npz", mj_model, qpos, mocap_pos, mocap_quat, dt, **view)
     out_path.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +104,8 @@ def render_video(
       "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
       "JAX_PLATFORMS": "cpu",  # and must never reach for the GPU memory that training holds
     }
-    command = [sys.executable, "-m", "playground.rendering.video", str(trajectory), str(out_path)]
+    rendered = Path(folder) / "video.mp4"  # what a killed encoder leaves goes with the folder
+    command = [sys.executable, "-m", "playground.rendering.video", str(trajectory), str(rendered)]
     child = subprocess.Popen(command, cwd=folder, env=environment, stderr=stderr, start_new_session=True)
     try:
       code = child.wait(timeout_s)
@@ -115,9 +118,10 @@ def render_video(
       with contextlib.suppress(OSError):
         os.killpg(child.pid, signal.SIGKILL)  # the whole group: the encoder would live on and write its file
       child.wait()
-      partial.unlink(missing_ok=True)
-  if code == 0 and out_path.is_file():
-    return out_path
+    if code == 0 and rendered.is_file():
+      with replacing(out_path) as temporary:
+        shutil.copyfile(rendered, temporary)
+      return out_path
   notify(f"No video at {out_path.name}: {reason}; `playground doctor` shows what rendering needs.")
   return None
 
@@ -127,12 +131,8 @@ def frame_stride(dt: float) -> int:
   return max(1, math.ceil(1 / (MAX_FPS * dt) - 1e-6))
 
 
-def _partial(out_path: Path) -> Path:
-  return out_path.with_name(f".{out_path.name}.partial")
-
-
 def _render(trajectory: Path, out_path: Path) -> None:
-  """The child's work: draws and encodes under a temporary name, then gives the file its own."""
+  """The child's work: draws and encodes."""
   import imageio_ffmpeg
   import mujoco
 
@@ -151,15 +151,14 @@ def _render(trajectory: Path, out_path: Path) -> None:
   model.vis.quality.shadowsize = min(2048, model.vis.quality.shadowsize)
   stride = frame_stride(dt)
   fps: Any = 1 / (dt * stride)  # declared int by imageio_ffmpeg, which prints it with two decimals
-  partial = _partial(out_path)
   writer = imageio_ffmpeg.write_frames(
-    str(partial),
+    str(out_path),
     (width, height),
     fps=fps,
     codec="libx264",
     quality=7,
     macro_block_size=2,
-    output_params=["-f", "mp4", "-movflags", "+faststart"],  # the temporary name does not tell the format
+    output_params=["-movflags", "+faststart"],
   )
   writer.send(None)
   with mujoco.Renderer(model, height, width) as renderer:
@@ -172,7 +171,6 @@ def _render(trajectory: Path, out_path: Path) -> None:
       renderer.update_scene(data, camera)
       writer.send(renderer.render())
   writer.close()
-  partial.replace(out_path)
 
 
 def _camera(model: Any, name: str | None) -> Any:

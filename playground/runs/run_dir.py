@@ -1,6 +1,8 @@
 """The folder of one run: what was asked, on what it ran, how it ended. Layout in design §4."""
 
+import contextlib
 import datetime
+import itertools
 import os
 import socket
 from collections.abc import Mapping, Sequence
@@ -25,16 +27,30 @@ class RunDirectory:
 
   @classmethod
   def create(
-    cls, path: str | Path, config: Mapping[str, Any] | ConfigDict, overrides: Sequence[str] = ()
+    cls,
+    path: str | Path,
+    config: Mapping[str, Any] | ConfigDict,
+    overrides: Sequence[str] = (),
+    numbered: bool = False,
   ) -> "RunDirectory":
     """Makes the folder and writes the resolved `config` and the command line's `overrides`.
 
+    Args:
+      path: the folder.
+      config: the resolved configuration.
+      overrides: the command line's.
+      numbered: take a new folder in any case, `<path>_2`, `_3`, ... if the name is taken: for names that nobody
+        chose, which several processes may come up with in the same second.
+
     Raises:
-      CheckpointError: the folder already holds a run, or cannot be made.
+      CheckpointError: the folder already holds a run (unless numbered), or cannot be made.
     """
     run = cls(path)
-    run.must_be_new()
+    if not numbered:
+      run.must_be_new()
     try:
+      if numbered:
+        run = cls(_make_new(run.path))
       run.path.mkdir(parents=True, exist_ok=True)
       write_text(run.overrides_path, yaml.safe_dump(list(overrides), sort_keys=False))
       # Last, because this file is what makes the folder a run: a creation cut short can simply be repeated.
@@ -148,6 +164,17 @@ class RunDirectory:
   def write_summary(self, summary: Mapping[str, Any]) -> None:
     """Writes the run's result, which sweeps and tables read."""
     write_json(self.path / "summary.json", summary)
+
+
+def _make_new(path: Path) -> Path:
+  """Makes a folder that was not there before; making it is the claim, so no two processes get the same."""
+  path.parent.mkdir(parents=True, exist_ok=True)
+  for number in itertools.count(1):
+    folder = path if number == 1 else path.with_name(f"{path.name}_{number}")
+    with contextlib.suppress(FileExistsError):
+      folder.mkdir()
+      return folder
+  raise AssertionError("unreachable")
 
 
 def _now() -> str:

@@ -58,7 +58,8 @@ class Start:
         start.weights = Checkpoint(find_checkpoints(weights)[0]) if weights else None
       return start
     assert config.run_dir is not None, "composing names one"
-    RunDirectory(config.run_dir).must_be_new()
+    if config.resolved["run_dir"] is not None:  # else the name is a proposal, which `create` numbers if it is taken
+      RunDirectory(config.run_dir).must_be_new()
     if config.init_from is not None:
       return cls(weights=Checkpoint(find_checkpoints(config.init_from)[0]))
     return cls()

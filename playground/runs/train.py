@@ -60,7 +60,9 @@ def _train(config: "RunConfig", interrupts: Interrupts) -> int:
 
   num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
   marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
-  run_dir = start.run_dir or RunDirectory.create(str(config.run_dir), config.resolved, config.overrides)
+  run_dir = start.run_dir or RunDirectory.create(
+    str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
+  )
   with recorded(run_dir), Progress(num_updates * learner.steps_per_update) as progress:
     notes = [] if not env.parity else ["env.parity=true: playground 0.2.0 bug for bug"]
     run_dir.write_manifest(

@@ -2,6 +2,7 @@ import json
 import math
 import os
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import ml_collections
@@ -32,6 +33,15 @@ def test_create_refuses_an_existing_run_and_names_both_verbs(tmp_path: Path, tra
   message = str(error.value)
   assert f"resume={tmp_path}" in message and f"init_from={tmp_path}" in message and "run_dir=" in message
   assert "\n" not in message
+
+
+def test_runs_named_alike_in_the_same_moment_get_folders_of_their_own(tmp_path: Path):
+  path = tmp_path / "results" / "2026-01-01_00-00-00"
+  with ThreadPoolExecutor(8) as pool:
+    runs = list(pool.map(lambda seed: RunDirectory.create(path, {"seed": seed}, numbered=True), range(8)))
+  names = {path.name, *(f"{path.name}_{number}" for number in range(2, 9))}
+  assert {run.path.name for run in runs} == names
+  assert [run.config["seed"] for run in runs] == list(range(8))
 
 
 def test_create_takes_an_empty_or_unrelated_folder(tmp_path: Path):
