@@ -1,0 +1,75 @@
+"""From the hardware config to devices, and training on more than one (simulated on the CPU)."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ml_collections import ConfigDict
+
+from playground.config import compose
+from playground.errors import ConfigError, HardwareError
+from playground.hardware.setup import setup
+
+TWO_DEVICES = """
+import jax, numpy as np
+from playground.hardware.mesh import make_mesh
+from playground.learning.evaluation import make_evaluator
+from playground.learning.networks import NetworkConfig
+from playground.learning.ppo import PPO, PPOConfig
+from tests.dummy import SMALL, PointTask
+
+assert jax.device_count() == 2
+config = PPOConfig(**SMALL, network=NetworkConfig((16, 16), (16, 16)))
+mesh = make_mesh(2)
+env = PointTask()
+learner = PPO(env, config, mesh, {})
+state = learner.init(jax.random.PRNGKey(0), {})
+state, metrics = learner.train(state, {}, np.int32(30))
+for leaf in jax.tree.leaves((state.params, state.opt_state, state.normalizer)):
+  ours, theirs = (np.asarray(shard.data) for shard in leaf.addressable_shards)
+  np.testing.assert_array_equal(ours, theirs)
+first, second = (np.asarray(shard.data) for shard in state.env_state.data.qpos.addressable_shards)
+assert first.shape == second.shape == (8, 2)
+assert not np.isin(first, second).any(), "devices must not live the same lives"
+count = state.normalizer.count
+assert int(count.hi) == 0 and int(count.lo) == 30 * learner.steps_per_update
+scores, recording = make_evaluator(env, learner.act, 16, mesh, 1)(learner.policy(state), jax.random.PRNGKey(1), {})
+assert float(scores["episode_length"]) == 20 and recording["qpos"].shape == (20, 2, 2)
+assert float(scores["episode_reward"]) > -12, scores["episode_reward"]
+"""
+
+
+def hardware(**changes: Any) -> ConfigDict:
+  config = ConfigDict(compose(["experiment=quickstart"]).hardware)
+  config.update(changes)
+  return config
+
+
+@pytest.mark.parametrize(
+  ("changes", "error", "words"),
+  [
+    ({"devices": 99}, HardwareError, ["hardware.devices=99", "this machine has 1"]),
+    ({"platform": "tpu"}, ConfigError, ["hardware.platform='tpu'", "auto, cpu, gpu"]),
+    ({"matmul_precision": "hihgest"}, ConfigError, ["hardware.matmul_precision='hihgest'", "highest"]),
+  ],
+)
+def test_what_cannot_be_had_is_one_sentence(changes: dict[str, Any], error: type[Exception], words: list[str]) -> None:
+  with pytest.raises(error) as caught:
+    setup(hardware(**changes))
+  assert all(word in str(caught.value) for word in words)
+
+
+def test_training_over_two_devices_keeps_parameters_equal_and_environments_apart() -> None:
+  flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+  done = subprocess.run(
+    [sys.executable, "-c", TWO_DEVICES],
+    cwd=Path(__file__).parents[2],
+    env=os.environ | flags,
+    capture_output=True,
+    text=True,
+    timeout=300,
+  )
+  assert done.returncode == 0, done.stderr[-2000:]
