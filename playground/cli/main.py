@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from playground import registry
 from playground.config import RunConfig, compose, format_value
 from playground.errors import PlaygroundError, UnknownNameError, nearest
+from playground.rendering.gl import withhold_gl
 
 if TYPE_CHECKING:
   from rich.console import RenderableType
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 def main() -> None:
   """Runs a command and exits with its code; 2 for what the user can act on."""
+  withhold_gl()
   args = _parser().parse_args()
   try:
     code = args.command(args)

@@ -25,10 +25,12 @@ from playground.config import (
   with_default_experiment,
 )
 from playground.errors import PlaygroundError
+from playground.rendering.gl import withhold_gl
 
 
 def main() -> None:
   """Runs the command and exits: 0 done, 2 for what the user can act on, 130 or 143 when interrupted."""
+  withhold_gl()
   os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is not a PlaygroundError is a bug: show all of it
   try:
     code = _main(sys.argv[1:])

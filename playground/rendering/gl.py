@@ -19,7 +19,17 @@ with mujoco.Renderer(model, 16, 16) as renderer:
   renderer.update_scene(data)
   assert renderer.render().any()
 """
+_ASKED = "PLAYGROUND_MUJOCO_GL"  # where `withhold_gl` puts what the user asked for
 _OFF = ("disable", "disabled", "off", "false", "0")  # what MuJoCo itself takes for "no GL"
+
+
+def withhold_gl() -> None:
+  """Keeps the user's MUJOCO_GL for the children that draw.
+
+  A process that trains draws nothing, yet `import mujoco` fails in it if the backend named there is not installed.
+  """
+  if "MUJOCO_GL" in os.environ:
+    os.environ[_ASKED] = os.environ.pop("MUJOCO_GL")
 
 
 @functools.cache
@@ -29,7 +39,7 @@ def find_gl() -> str | None:
   The user's own MUJOCO_GL comes first (and `MUJOCO_GL=disable` means none), then EGL, OSMesa and, if there is a
   display, GLFW.
   """
-  asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+  asked = os.environ.get("MUJOCO_GL", os.environ.get(_ASKED, "")).lower().strip()
   if asked in _OFF:
     return None
   candidates = [asked, "egl", "osmesa", "glfw" if os.environ.get("DISPLAY") else ""]

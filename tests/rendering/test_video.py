@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,14 @@ def test_a_bogus_backend_is_passed_over(monkeypatch: pytest.MonkeyPatch):
   assert not gl.works("bogus")
   monkeypatch.setenv("MUJOCO_GL", "bogus")
   assert find_gl() in ("egl", "osmesa", None)
+
+
+def test_a_process_that_only_trains_is_spared_the_users_backend(monkeypatch: pytest.MonkeyPatch):
+  monkeypatch.setenv("MUJOCO_GL", "disable")
+  monkeypatch.setenv("PLAYGROUND_MUJOCO_GL", "")
+  gl.withhold_gl()
+  assert "MUJOCO_GL" not in os.environ
+  assert find_gl() is None, "children still follow the user's wish"
 
 
 def test_a_stale_platform_variable_does_not_break_the_probe(monkeypatch: pytest.MonkeyPatch, needs_gl: str):
