@@ -30,10 +30,20 @@ class Interrupts:
     for signum, handler in self._before.items():
       signal.signal(signum, handler)  # pyright: ignore[reportArgumentType]
 
+  def start_saving(self) -> None:
+    """From here on the first signal is a flag. Raises `Interrupted` if there was one already.
+
+    An exception that a signal raises inside a destructor or a callback of C code is swallowed there: compiling is full
+    of both.
+    """
+    self.saving = True
+    if self.signum is not None:
+      raise Interrupted(self.signum)
+
   def _handle(self, signum: int, frame: FrameType | None) -> None:
-    if not self.saving or self.signum is not None:
+    again, self.signum = self.signum is not None, signum
+    if not self.saving or again:
       raise Interrupted(signum)
-    self.signum = signum
 
 
 def exit_code(signum: int) -> int:

@@ -80,7 +80,7 @@ def _train(config: "RunConfig", interrupts: Interrupts) -> int:
     job = Job(config, run_dir, env, learner, progress, interrupts, start)
     with contextlib.closing(job):
       loop = Loop(learner, program, marks, config.seed, job, model, eval_model)
-      interrupts.saving = True
+      interrupts.start_saving()
       state = loop.init() if start.state is None else start.state
       if start.policy is not None:
         state = learner.with_policy(state, start.policy)
