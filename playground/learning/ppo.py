@@ -104,7 +104,7 @@ TRAIN_STATE_SPEC = TrainState(params=P(), opt_state=P(), normalizer=P(), key=P()
 
 
 class PPO:
-  """The algorithm for one task: pure functions, jitted over the mesh by `compile` of the loop that runs them."""
+  """The algorithm for one task: what `learning.loop.Learner` asks for, each function jitted over the mesh."""
 
   def __init__(self, env: Env, config: PPOConfig, mesh: Mesh, model: ModelFields, network_precision: str | None = None):
     """Args:
@@ -142,7 +142,6 @@ class PPO:
     self.train = jit_on_mesh(
       self._train, mesh, (TRAIN_STATE_SPEC, P(AXIS), P()), (TRAIN_STATE_SPEC, P()), donate_argnums=0
     )
-
     self.copy = jit_on_mesh(partial(jax.tree.map, jnp.copy), mesh, (TRAIN_STATE_SPEC,), TRAIN_STATE_SPEC)
 
   def policy(self, state: TrainState) -> Policy:
