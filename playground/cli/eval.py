@@ -1,7 +1,6 @@
 """`playground eval <run>`: episodes of a trained policy, measured on this machine."""
 
 from pathlib import Path
-from typing import Any
 
 import jax
 from rich.console import Console
@@ -10,7 +9,7 @@ from rich.table import Table
 from playground import config as configs
 from playground import registry
 from playground.errors import ConfigError
-from playground.hardware.setup import setup
+from playground.hardware.setup import setup, this_machine
 from playground.learning.checkpoints import Checkpoint, find_checkpoints
 from playground.learning.evaluation import make_evaluator
 from playground.learning.ppo import PPO, PPOConfig
@@ -19,14 +18,6 @@ from playground.runs.files import write_json
 from playground.runs.job import episodes_of
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import randomized_models
-
-
-def this_machine(hardware: Any) -> Any:
-  """A run's `hardware` config for looking at it here: one device of whatever kind there is."""
-  hardware = hardware.copy_and_resolve_references()
-  hardware.devices = 1
-  hardware.platform = "cpu" if hardware.platform == "cpu" else "auto"
-  return hardware
 
 
 def evaluate_run(

@@ -5,8 +5,7 @@ from rich.console import Console
 
 from playground import config as configs
 from playground import registry
-from playground.cli.eval import this_machine
-from playground.hardware.setup import setup
+from playground.hardware.setup import setup, this_machine
 from playground.runs.nonfinite import Dump, nonfinite_fields
 
 

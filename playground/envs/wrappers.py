@@ -17,8 +17,8 @@ ModelFields = Mapping[str, jax.Array]
 # `info` keys that wrappers own; a fresh reset of a task never touches them.
 EPISODE_KEYS = ("steps", "truncation", "episode_done", "episode_metrics")
 PREFIX = "AutoResetWrapper_"
-MAX_VALUE = 1e10  # MuJoCo's own limit for positions and velocities (mjMAXVAL)
 PRESERVE_INFO = PREFIX + "preserve_info"  # what a task puts here survives a full reset (a curriculum's level, say)
+MAX_VALUE = 1e10  # MuJoCo's own limit for positions and velocities (mjMAXVAL)
 
 
 def where_done(done: jax.Array, new: Any, old: Any) -> Any:
@@ -194,13 +194,16 @@ def start_of(state: State) -> dict[str, jax.Array]:
 
 def wrap_for_training(env: Env, *, full_reset: bool = False) -> AutoReset:
   """The stack that trainers step: a batch of guarded, limited, self-resetting episodes of one task."""
-  guarded = FiniteGuard(Vectorize(env))
-  return AutoReset(Episode(guarded, env.episode_length, env.action_repeat), full_reset)
+  return AutoReset(wrap_for_evaluation(env), full_reset)
 
 
 def wrap_for_evaluation(env: Env) -> Episode:
   """As for training, but an episode that ends stays ended."""
-  return Episode(FiniteGuard(Vectorize(env)), env.episode_length, env.action_repeat)
+  return _episodes(env, env.episode_length, env.action_repeat)
+
+
+def _episodes(env: Env, length: int, action_repeat: int) -> Episode:
+  return Episode(FiniteGuard(Vectorize(env)), length, action_repeat)
 
 
 class _FixedModels(Wrapper):
@@ -239,8 +242,7 @@ def wrap_for_brax_training(
     An environment with batched `reset(keys [N])` and `step(state, actions [N, action_size])`.
   """
   fields = None if randomization_fn is None else _batched_fields(*randomization_fn(env.mjx_model))
-  guarded = FiniteGuard(Vectorize(env))
-  return _FixedModels(AutoReset(Episode(guarded, episode_length, action_repeat), full_reset), fields)
+  return _FixedModels(AutoReset(_episodes(env, episode_length, action_repeat), full_reset), fields)
 
 
 def _batched_fields(model: mjx.Model, in_axes: mjx.Model) -> dict[str, jax.Array]:

@@ -62,6 +62,14 @@ def setup(config: Any) -> Hardware:
   return Hardware(make_mesh(count), config.network_precision, facts)
 
 
+def this_machine(hardware: Any) -> Any:
+  """A run's `hardware` config for looking at it here: one device of whatever kind there is."""
+  hardware = hardware.copy_and_resolve_references()
+  hardware.devices = 1
+  hardware.platform = "cpu" if hardware.platform == "cpu" else "auto"
+  return hardware
+
+
 def cache_dir(config: Any) -> Path:
   """Where compiled programs are kept between runs."""
   return Path(config.cache_dir or CACHE).expanduser()

@@ -64,7 +64,7 @@ class Job:
     self._start_to_first_update_s: float | None = None
     self._dumped = any(run_dir.nan_dump.glob("*.npz"))  # by an earlier start of this run
     self._closed = False
-    self._tracing: int | None = None
+    self._trace = "due" if config.profile.enable else "off"  # then "on", for one row, then "off"
 
   @property
   def wall_clock_s(self) -> float:
@@ -83,7 +83,7 @@ class Job:
       every = self._config.video.every_evals
       if every and self._evaluations % every == 0:
         self._start_video(step, recording)
-    self._trace(metrics)
+    self._advance_trace(metrics)
     self._check_numbers(step, taken, metrics, capture)
 
   def on_save(self, update: int, step: int, state: Any) -> None:
@@ -134,6 +134,8 @@ class Job:
     """Ends the trackers and the video thread, once; without a status the run did not get to its end."""
     if not self._closed:
       self._closed = True
+      if self._trace == "on":  # the run ended inside the stretch
+        jax.profiler.stop_trace()
       self._videos.shutdown(cancel_futures=True)
       self._trackers.close(status)
 
@@ -179,18 +181,16 @@ class Job:
       **episodes_of(recording, view.episodes),
     )
 
-  def _trace(self, metrics: Metrics) -> None:
+  def _advance_trace(self, metrics: Metrics) -> None:
     """With `profile.enable`, traces the stretch between the first two rows that trained."""
-    if not self._config.profile.enable or "training/total_loss" not in metrics:
-      return
-    if self._tracing is None:
+    if self._trace == "on":
+      jax.profiler.stop_trace()
+      self._trace = "off"
+    elif self._trace == "due" and "time/steps_per_second" in metrics:
       folder = self._run_dir.path / "profile"
       jax.profiler.start_trace(str(folder))
-      self._tracing = 0
+      self._trace = "on"
       self._progress.print(f"tracing into {folder}")
-    elif self._tracing == 0:
-      jax.profiler.stop_trace()
-      self._tracing = 1
 
   def _check_numbers(self, step: int, taken: int, metrics: Metrics, capture: Any) -> None:
     """Dumps the first non-finite step, and stops the run when there are too many of them."""

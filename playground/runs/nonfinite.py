@@ -67,8 +67,7 @@ class Dump:
 
   def replay(self, env: Env) -> State:
     """Takes the step again, on this machine's backend."""
-    model: Any = env.mjx_model.tree_replace(dict(self.model)) if self.model else None
-    return jax.jit(lambda state, action: env.step(state, action, model))(self.state(env), self.action)
+    return env.jitted[1](self.state(env), self.action, self.model)
 
 
 def nonfinite_fields(tree: Any) -> list[str]:
