@@ -2,27 +2,24 @@
 
 import functools
 import operator
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
-from playground.envs.base import Env, State
-from playground.envs.physics import PhysicsData, mjx
+from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
+from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
 
 _SLIDER, _HINGE = 0, 1
 
 
-class Cartpole(Env):
+class Cartpole(SuiteTask):
   """Moves a cart (one motor, action in [-1, 1]) to keep a pole upright in the middle of the rails.
 
   Observation [5]: cart position m, cos and sin of the pole's angle, cart velocity m/s, pole velocity rad/s. The dense
   reward is the product of upright, centered, small_control and small_velocity, the sparse one of cart_in_bounds and
-  angle_in_bounds (paper, appendix "DM Control"). Only numbers that are not finite end an episode early.
+  angle_in_bounds.
 
   The initial positions and velocities are drawn independently; Playground 0.2.0 draws several of them from one key, so
   that they are functions of each other (when swinging up, the cart's velocity in m/s is its position in m), and with
@@ -33,7 +30,7 @@ class Cartpole(Env):
 
   def __init__(self, config: Any):
     """Loads the model. `config`: see `configs/env/_cartpole.yaml`."""
-    super().__init__(config, mujoco.MjModel.from_xml_path(str(Path(__file__).with_suffix(".xml"))))
+    super().__init__(config, load_spec("cartpole").compile())
     self._swing_up: bool = config.swing_up
     self._terms = _sparse if config.sparse else _dense
     self._pole = self.mj_model.body("pole_1").id
@@ -42,7 +39,7 @@ class Cartpole(Env):
   def observation_parts(self) -> dict[str, dict[str, int]]:
     return {"state": {"cart_position": 1, "pole_cos": 1, "pole_sin": 1, "velocity": 2}}
 
-  def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
+  def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     keys = jax.random.split(rng, 3)
     cart_key, pole_key, velocity_key = keys
     if self.parity:
@@ -54,28 +51,18 @@ class Cartpole(Env):
     else:
       cart = jax.random.uniform(cart_key, minval=-0.1, maxval=0.1)
       pole = jax.random.uniform(pole_key, minval=-0.034, maxval=0.034)
-    data = self.physics.make(qpos=jnp.stack([cart, pole]), qvel=0.01 * jax.random.normal(velocity_key, (2,)))
-    data = self.physics.forward(self.mjx_model if model is None else model, data)
-    zero = jnp.zeros(())
-    metrics = {f"reward/{name}": zero for name in self._terms(data, jnp.zeros(1), zero)}
-    return State(data, self._observe(data), zero, zero, metrics, {})
+    return {"qpos": jnp.stack([cart, pole]), "qvel": 0.01 * jax.random.normal(velocity_key, (2,))}
 
-  def control(self, state: State, action: jax.Array) -> jax.Array:
-    return action
-
-  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
-    terms = self._terms(data, action, data.xmat[self._pole, 2, 2])
-    reward = functools.reduce(operator.mul, terms.values())
-    done = ~(jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all())
-    metrics = {f"reward/{name}": value for name, value in terms.items()}
-    return State(data, self._observe(data), reward, done.astype(jnp.float32), metrics, dict(info))
-
-  def _observe(self, data: PhysicsData) -> jax.Array:
+  def observe(self, data: PhysicsData) -> jax.Array:
     axis = data.xmat[self._pole, :, 2]
     return jnp.stack([data.qpos[_SLIDER], axis[2], axis[0], *data.qvel])
 
+  def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
+    terms = self._terms(data, action, data.xmat[self._pole, 2, 2])
+    return functools.reduce(operator.mul, terms.values()), terms
 
-def _dense(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> dict[str, jax.Array]:
+
+def _dense(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> Terms:
   return {
     "upright": (cosine + 1) / 2,
     "centered": (1 + tolerance(data.qpos[_SLIDER], margin=2)) / 2,
@@ -84,7 +71,7 @@ def _dense(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> dict[str,
   }
 
 
-def _sparse(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> dict[str, jax.Array]:
+def _sparse(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> Terms:
   return {
     "cart_in_bounds": tolerance(data.qpos[_SLIDER], (-0.25, 0.25)),
     "angle_in_bounds": tolerance(cosine, (0.995, 1.0)),
