@@ -1,7 +1,7 @@
 """Actor and critic on Brax's networks and distributions, with observation normalisation."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -35,6 +35,27 @@ class NetworkConfig:
   activation: str = "swish"
   policy_obs_key: str = "state"  # entry of a dict observation that the actor sees
   value_obs_key: str = "state"  # entry that the critic sees, "privileged_state" for an asymmetric pair
+  value_dtype: str = "auto"  # of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere
+
+
+class Critic(linen.Module):
+  """Brax's value MLP with its hidden layers computed in `dtype`; parameters and output are float32.
+
+  Writing and reading the hidden activations is most of what an update costs on a GPU. The actor stays in float32: the
+  loss compares its log-probabilities with those at acting time.
+  """
+
+  hidden_layer_sizes: Sequence[int]
+  activation: Callable[[jax.Array], jax.Array]
+  dtype: Any
+
+  @linen.compact
+  def __call__(self, obs: jax.Array) -> jax.Array:
+    init, hidden = jax.nn.initializers.lecun_uniform(), obs
+    for i, size in enumerate(self.hidden_layer_sizes):
+      hidden = self.activation(linen.Dense(size, dtype=self.dtype, kernel_init=init, name=f"hidden_{i}")(hidden))
+    last = linen.Dense(1, dtype=jnp.float32, kernel_init=init, name=f"hidden_{len(self.hidden_layer_sizes)}")
+    return last(hidden)[..., 0]
 
 
 class ActorCritic:
@@ -59,6 +80,8 @@ class ActorCritic:
     if config.activation not in ACTIVATIONS:
       allowed = ", ".join(ACTIVATIONS) + "." + nearest(config.activation, ACTIVATIONS)
       raise ConfigError(f"agent.network.activation={config.activation!r} must be one of {allowed}")
+    if config.value_dtype not in ("auto", "bfloat16", "float32"):
+      raise ConfigError(f"agent.network.value_dtype={config.value_dtype!r} must be one of auto, bfloat16, float32.")
     sizes = obs_size if isinstance(obs_size, Mapping) else {"state": (obs_size,)}
     for name in ("policy_obs_key", "value_obs_key"):
       key = getattr(config, name)
@@ -69,20 +92,24 @@ class ActorCritic:
     self.precision = precision
     self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key}))
     self._sizes = {key: sizes[key] for key in self.obs_keys}
+    auto = "bfloat16" if jax.default_backend() == "gpu" else "float32"
+    self.value_dtype = auto if config.value_dtype == "auto" else config.value_dtype
+    self._critic = Critic(
+      tuple(config.value_hidden_layer_sizes), ACTIVATIONS[config.activation], jnp.dtype(self.value_dtype)
+    )
     self._networks = brax_networks.make_ppo_networks(
       dict(sizes),
       action_size,
       policy_hidden_layer_sizes=tuple(config.policy_hidden_layer_sizes),
-      value_hidden_layer_sizes=tuple(config.value_hidden_layer_sizes),
       activation=ACTIVATIONS[config.activation],
       policy_obs_key=config.policy_obs_key,
-      value_obs_key=config.value_obs_key,
     )
     self.distribution = self._networks.parametric_action_distribution
 
   def init(self, key: jax.Array) -> ActorCriticParams:
     policy, value = jax.random.split(key)
-    return ActorCriticParams(self._networks.policy_network.init(policy), self._networks.value_network.init(value))
+    obs = jnp.zeros((1, *self._sizes[self.config.value_obs_key]))
+    return ActorCriticParams(self._networks.policy_network.init(policy), self._critic.init(value, obs))
 
   def init_normalizer(self) -> Normalizer:
     shapes = {key: specs.Array(size, jnp.dtype("float32")) for key, size in self._sizes.items()}
@@ -104,7 +131,7 @@ class ActorCritic:
   def value(self, value_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
     """State values, [...], for normalised observations."""
     with jax.default_matmul_precision(self.precision or jax.config.jax_default_matmul_precision):
-      return self._networks.value_network.apply(None, value_params, obs[self.config.value_obs_key])
+      return self._critic.apply(value_params, obs[self.config.value_obs_key])
 
   def act(
     self, policy: Any, normalizer: Normalizer | None, obs: Observation, key: jax.Array, deterministic: bool = False
