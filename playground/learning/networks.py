@@ -131,7 +131,7 @@ class ActorCritic:
   def value(self, value_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
     """State values, [...], for normalised observations."""
     with jax.default_matmul_precision(self.precision or jax.config.jax_default_matmul_precision):
-      return self._critic.apply(value_params, obs[self.config.value_obs_key])
+      return self._critic.apply(value_params, obs[self.config.value_obs_key])  # pyright: ignore[reportReturnType]
 
   def act(
     self, policy: Any, normalizer: Normalizer | None, obs: Observation, key: jax.Array, deterministic: bool = False
