@@ -16,17 +16,40 @@ import numpy as np
 
 import playground
 from playground.envs.base import Env, State
+from playground.envs.dm_control.suite import SuiteTask
+from playground.envs.locomotion.stand import Stand
 from playground.envs.physics import STATE_FIELDS
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 TASKS = sorted(path.stem for path in GOLDEN.glob("*.npz"))
-_OVERRIDES = {"impl": "impl", "noise_config.level": "noise.level", "pert_config.enable": "pushes.enable"}
-_UNREAD_INFO = {"Cartpole": ("info/rng", "info/time_out")}  # upstream carries them, nothing reads them
+_OVERRIDES = {
+  "impl": "impl",
+  "noise_config.level": "noise.level",
+  "obs_noise.level": "noise.level",
+  "pert_config.enable": "pushes.enable",
+}
+_UNREAD_INFO = {SuiteTask: {"info/rng", "info/time_out"}, Stand: {"info/step"}}  # upstream has it, nothing reads it
+_PROGRAMS: dict[Any, Any] = {}  # compiled physics by structure of the model and fields that are kept
+BATCH = 8  # T of all recordings
+KEYS = jnp.stack([jax.random.PRNGKey(seed) for seed in range(BATCH)])
+_ROWS = {"data/sensordata": "sensor", "data/site_xpos": "site", "data/site_xmat": "site"}
 
 
 def load_task(name: str, overrides: Mapping[str, Any] | None = None) -> Any:
   """Builds a task (typed Any, since tests look into it); `{"reward.scales.energy": 0}` overrides its config."""
   return playground.load(name, overrides=overrides)
+
+
+def compiled_task(name: str, overrides: Mapping[str, Any] | None = None) -> Any:
+  """Builds a task in pieces, each compiled once: its physics, together with all tasks whose models differ in numbers
+  only, and its `evaluate`. Map its `reset` and `step` over a batch of `BATCH`, and do not jit them.
+  """
+  env = load_task(name, {**(overrides or {}), "impl": "jax"})
+  physics = env.physics
+  programs = jax.jit(physics.forward), jax.jit(physics.step, static_argnames="num_substeps")
+  physics.forward, physics.step = _PROGRAMS.setdefault((jax.tree.structure(physics.model), env.derived), programs)
+  env.evaluate = jax.jit(env.evaluate)
+  return env
 
 
 class Golden:
@@ -45,9 +68,11 @@ class Golden:
     header = json.loads(str(self._arrays.pop("header")))
     overrides = {_OVERRIDES[key]: value for key, value in header["overrides"].items()}
     self.name = name
-    self.env: Env = load_task(name, {**overrides, "impl": "jax", "parity": True})
+    self.env: Env = compiled_task(name, {**overrides, "parity": True})
+    for key in self._arrays.keys() & _ROWS.keys():
+      self._arrays[key] = self._our_rows(self._arrays[key], _ROWS[key], header["model"])
     self.actions = jnp.array(self._arrays.pop("action"))
-    self.first: State = jax.jit(self.env.reset)(jax.random.PRNGKey(0))
+    self.first: State = jax.tree.map(lambda x: x[0], jax.vmap(self.env.reset)(KEYS))
     self.states: State = jax.tree_util.tree_map_with_path(self._recorded, self.first)
 
   def _recorded(self, path: tuple[Any, ...], ours: jax.Array) -> jax.Array:
@@ -58,10 +83,23 @@ class Golden:
     assert name.startswith("data/") and name.removeprefix("data/") in STATE_FIELDS, f"{name} was not recorded"
     return jnp.broadcast_to(ours, (len(self.actions) + 1, *ours.shape))
 
+  def _our_rows(self, recorded: np.ndarray, kind: str, names: Mapping[str, list[Any]]) -> np.ndarray:
+    """Sensors or sites in our model's order; NaN for those not recorded, so that reading one shows."""
+    model = self.env.mj_model
+    ours = [getattr(model, kind)(i) for i in range(getattr(model, f"n{kind}"))]
+    if kind == "sensor":
+      rows = {name: list(range(start, start + size)) for name, start, size in names[kind]}
+    else:
+      rows = {name: [i] for i, name in enumerate(names[kind])}
+    sizes = [int(model.sensor_dim[entry.id]) if kind == "sensor" else 1 for entry in ours]
+    picked = [row for entry, size in zip(ours, sizes, strict=True) for row in rows.get(entry.name, [-1] * size)]
+    nothing = np.full_like(recorded[:, :1], np.nan)
+    return np.concatenate([recorded, nothing], axis=1)[:, picked]
+
   def missing(self) -> list[str]:
     """What was recorded and the task does not have, except unread data and metrics that are zero throughout."""
     ours = {_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(self.first)[0]}
-    unread = {key for prefix, keys in _UNREAD_INFO.items() if self.name.startswith(prefix) for key in keys}
+    unread = next((names for task, names in _UNREAD_INFO.items() if isinstance(self.env, task)), set())
     return [
       name
       for name, values in self._arrays.items()
@@ -76,10 +114,11 @@ def _name(path: tuple[Any, ...]) -> str:
 
 
 def pairs(actual: State, expected: State) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-  """The leaves of two states as (name, actual, expected), floats in double precision."""
+  """The leaves of two states as (name, actual, expected), floats in double precision, NaN where nothing was recorded."""
   leaves = jax.tree_util.tree_flatten_with_path(actual)[0]
   for (path, a), b in zip(leaves, jax.tree.leaves(expected), strict=True):
-    yield _name(path), np.asarray(a, np.float64), np.asarray(b, np.float64)
+    expected = np.asarray(b, np.float64)
+    yield _name(path), np.where(np.isnan(expected), np.nan, np.asarray(a, np.float64)), expected
 
 
 @functools.cache

@@ -11,6 +11,8 @@ import mujoco
 
 from playground.envs.base import Env, State
 from playground.envs.physics import PhysicsData, mjx
+from playground.errors import ConfigError
+from playground.mdp.tolerance import tolerance
 
 Terms = dict[str, jax.Array]
 
@@ -18,6 +20,22 @@ Terms = dict[str, jax.Array]
 def load_spec(domain: str) -> mujoco.MjSpec:
   """The domain's MJCF, for a task to edit and compile."""
   return mujoco.MjSpec.from_file(str(Path(__file__).with_name(f"{domain}.xml")))
+
+
+def move_speed(config: Any) -> float:
+  """`env.move_speed` in m/s, of tasks where 0 means to stand.
+
+  Raises:
+    ConfigError: it is negative.
+  """
+  if config.move_speed < 0:
+    raise ConfigError(f"env.move_speed={config.move_speed} must be at least 0 m/s (0: stand).")
+  return config.move_speed
+
+
+def small_control(action: jax.Array) -> jax.Array:
+  """1 for no action, 0.8 where all are at (or beyond) full scale."""
+  return (4 + tolerance(action, margin=1, sigmoid="quadratic", value_at_margin=0).mean()) / 5
 
 
 class SuiteTask(Env):
@@ -46,6 +64,18 @@ class SuiteTask(Env):
     state = self.evaluate(self.settle(data, model).replace(**late), {}, jnp.zeros(self.action_size))
     zero = jnp.zeros(())
     return state.replace(reward=zero, done=zero, metrics={name: zero for name in state.metrics})
+
+  def sensor(self, data: PhysicsData, name: str) -> jax.Array:
+    """The reading of the model's sensor `name`, shape [dim]."""
+    sensor = self.mj_model.sensor(name)
+    return data.sensordata[sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
+
+  def planar_pose(self, angle_key: jax.Array, joints_key: jax.Array) -> jax.Array:
+    """`qpos` of a planar model (two slides, a hinge, then joints) at the origin, turned and bent at random."""
+    low, high = self.mj_model.jnt_range[3:].T
+    angle = jax.random.uniform(angle_key, (1,), minval=-jnp.pi, maxval=jnp.pi)
+    joints = jax.random.uniform(joints_key, low.shape, minval=low, maxval=high)
+    return jnp.concatenate([jnp.zeros(2), angle, joints])
 
   def settle(self, data: PhysicsData, model: mjx.Model | None) -> PhysicsData:
     """Lets the initial state come to rest, where a task needs that."""
