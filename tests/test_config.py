@@ -103,11 +103,10 @@ def test_debug_fast_is_small_for_every_task(env: str):
   assert agent.num_timesteps / (agent.batch_size * agent.num_minibatches * agent.unroll_length) == 4
 
 
-@pytest.mark.parametrize("group", ["experiment", "hardware", "tracking", "tuned", "debug"])
+@pytest.mark.parametrize("group", ["experiment", "hardware", "tracking", "debug"])  # tuned: test_hyperparameters.py
 def test_every_option_we_ship_composes(group: str):
   for option in config.options(group):
-    env = [f"env={option.split('/')[1]}"] if group == "tuned" else []
-    assert compose([f"{group}={option}", *env]).choices[group] == option
+    assert compose([f"{group}={option}"]).choices[group] == option
 
 
 def test_several_debug_presets():
@@ -217,11 +216,11 @@ def test_composing_needs_no_jax():
 # What is refused
 
 ERRORS = {
-  "env=Go1Joystic": ["env=Go1Joystic does not exist", "CartpoleBalance, ", "Did you mean 'Go1JoystickFlatTerrain'?"],
-  "experiment=quickstar": ["experiment=quickstar", "go1_joystick, quickstart", "Did you mean 'quickstart'?"],
+  "env=Go1Joystic": ["env=Go1Joystic does not exist", "that `playground list` shows", "'Go1JoystickFlatTerrain'?"],
+  "experiment=quickstar": ["experiment=quickstar", "that `playground-run --help` shows", "Did you mean 'quickstart'?"],
   "hardware=tpu": ["hardware=tpu does not exist: choose from auto, cpu, gpu."],
   "env=_cartpole": ["env=_cartpole does not exist", "Did you mean 'Cartpole"],
-  "env=null": ["env=null does not exist: choose from Cartpole"],
+  "env=null": ["env=null does not exist: choose from the "],
   "experimen=foo": ["experimen does not exist", "Did you mean 'experiment'?"],
   "sead=1": ["sead does not exist", "Did you mean 'seed'?"],
   "learning_rate=1": ["learning_rate does not exist", "Did you mean 'agent.learning_rate'?"],
@@ -264,7 +263,7 @@ ERRORS = {
   "env.impl=wrap": ["env.impl=wrap is unknown: choose from auto, jax, warp. Did you mean 'warp'?"],
   "hardware.matmul_precision=higest": ["choose from default, high, highest, ", "Did you mean 'highest'?"],
   "agent.num_envs=100": ["agent.num_envs=100 does not divide", "128 * 8 = 1024"],
-  "env=joystick": ["env=joystick needs a robot: add robot=<name>, one of go1"],
+  "env=joystick": ["env=joystick needs a robot: add robot=<name>, one of "],
   "env=CartpoleBalance robot=go1": ["robot=go1: env=CartpoleBalance takes no robot"],
   "init_from=/nowhere/run": ["init_from=/nowhere/run is no run directory or checkpoint", "does not exist."],
   "resume=/nowhere/run": ["resume=/nowhere/run is no run directory: /nowhere/run/config.yaml does not exist."],

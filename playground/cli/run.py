@@ -19,6 +19,9 @@ from playground.config import (
   RunConfig,
   compose,
   config_roots,
+  expand,
+  first_job,
+  is_hydras,
   search_path_override,
   to_yaml,
   tree,
@@ -54,11 +57,14 @@ def _main(argv: Sequence[str]) -> int:
   overrides = [*args.overrides, *(other for other in others if not other.startswith("-"))]
   flags = [arg for arg in argv if arg not in overrides]
   config = None
-  if args.multirun or args.help:  # the jobs of a sweep are checked one by one
+  if args.help:
     overrides = with_default_experiment(overrides)
+  elif args.multirun:
+    overrides = with_default_experiment(expand(overrides))
+    compose(first_job(overrides))  # what is wrong with it is mostly wrong with all; the others are checked as they come
   elif not (args.hydra_help or args.info or args.shell_completion):
     config = compose(overrides)
-    overrides = [*config.overrides, *(o for o in overrides if o.lstrip("+~").startswith(("hydra.", "hydra/")))]
+    overrides = [*config.overrides, *filter(is_hydras, overrides)]
     if args.cfg == "job" and config.resume:  # the run's own, which Hydra cannot compose
       print(to_yaml(config))
       return 0

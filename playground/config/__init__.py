@@ -8,6 +8,7 @@ exist, and what they have fixes each value's type, wherever that value is set.
 
   files        where configs/ lies, which groups and options it has
   overrides    the command line, one `key=value` at a time
+  sweeps       a command line that stands for many runs
   composition  all of it together, for a new run and for one that goes on
   schema       keys that exist and the types of their values
   limits       what types cannot say: choices, ranges, sizes that must divide
@@ -16,8 +17,9 @@ exist, and what they have fixes each value's type, wherever that value is set.
 
 from playground.config.composition import compose, override_section
 from playground.config.files import ENTRY_POINTS, config_roots, options, search_path_override, task_names
-from playground.config.overrides import DEFAULT_EXPERIMENT, with_default_experiment
+from playground.config.overrides import DEFAULT_EXPERIMENT, is_hydras, with_default_experiment
 from playground.config.run_config import RunConfig, Section, from_dict, load, to_yaml, tree
+from playground.config.sweeps import expand, first_job
 from playground.config.text import format_value
 
 __all__ = [
@@ -27,8 +29,11 @@ __all__ = [
   "Section",
   "compose",
   "config_roots",
+  "expand",
+  "first_job",
   "format_value",
   "from_dict",
+  "is_hydras",
   "load",
   "options",
   "override_section",

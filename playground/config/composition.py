@@ -16,7 +16,7 @@ from yaml import YAMLError
 
 from playground.config.files import DELTAS, config_roots, groups, options, search_path_override
 from playground.config.limits import check_limits
-from playground.config.overrides import Override, canonical, group_overrides, parse, with_default_experiment
+from playground.config.overrides import Override, canonical, group_overrides, is_hydras, parse, with_default_experiment
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, Section, from_dict, load
 from playground.config.schema import check_key, fit
 from playground.config.text import first_line
@@ -38,7 +38,7 @@ def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> Ru
     UnknownNameError: a group, option or key that does not exist.
   """
   roots = config_roots(config_dir)
-  ours = [text for text in overrides if not text.lstrip("+~").startswith(("hydra.", "hydra/"))]
+  ours = [text for text in overrides if not is_hydras(text)]
   parsed = [parse(text, roots) for text in with_default_experiment(ours, config_dir)]
   given = {o.key: o.value for o in parsed}
   for key in ("resume", "init_from"):
@@ -48,6 +48,10 @@ def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> Ru
     return _compose_resumed(Path(given["resume"]), parsed, roots)
 
   config, choices = _hydra(group_overrides(parsed), roots)
+  shared = f"{config.agent.name}/{choices['env']}"
+  if "tuned" not in given and choices["tuned"] is None and shared in options("tuned", roots):
+    parsed.append(parse(f"tuned={shared}", roots))  # a variant such as ppo_v020 without a set of its own has ppo's
+    config, choices = _hydra(group_overrides(parsed), roots)
   schema, _ = _hydra([f"{g}={c}" for g, c in choices.items() if c and g not in DELTAS] + _NO_DELTAS, roots)
   _check_robot(config, choices, roots)
   resolved = _apply(config, [o for o in parsed if not o.is_group], _plain(schema))

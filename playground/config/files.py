@@ -1,4 +1,4 @@
-"""Where the files of configs/ lie, ours and those of outside packages, and which options they make."""
+"""Where the files of configs/ and sweeps/ lie, ours and those of outside packages, and which options they make."""
 
 import functools
 import importlib.metadata
@@ -12,11 +12,16 @@ ENTRY_POINTS = "playground.tasks"
 DELTAS = ("experiment", "tuned", "debug")  # groups that change what the others define, and define nothing
 
 
-def config_roots(config_dir: Path | None = None) -> list[Path]:
-  """Folders that hold groups: ours (in the wheel inside the package, else the checkout's), then outside packages'."""
+def shipped(folder: str) -> Path:
+  """A folder that stands at the top of the checkout; in the wheel it lies inside the package."""
   package = Path(__file__).parents[1]
-  inside = package / "configs"
-  return [(config_dir or (inside if inside.is_dir() else package.parent / "configs")).resolve(), *_outside_roots()]
+  inside = package / folder
+  return (inside if inside.is_dir() else package.parent / folder).resolve()
+
+
+def config_roots(config_dir: Path | None = None) -> list[Path]:
+  """Folders that hold groups: ours, then outside packages'."""
+  return [config_dir.resolve() if config_dir else shipped("configs"), *_outside_roots()]
 
 
 def groups(roots: Iterable[Path]) -> list[str]:
@@ -34,6 +39,11 @@ def options(group: str, roots: Iterable[Path] | None = None) -> list[str]:
 def task_names(roots: Iterable[Path] | None = None) -> list[str]:
   """Options of env that are tasks, in CamelCase; the others need a robot to become one."""
   return [name for name in options("env", roots) if name[0].isupper()]
+
+
+def listed_options(group: str, roots: Iterable[Path]) -> list[str]:
+  """Options that one chooses from when nothing else is said: of env those that are tasks."""
+  return task_names(roots) if group == "env" else options(group, roots)
 
 
 def search_path_override(roots: Sequence[Path]) -> list[str]:

@@ -21,14 +21,19 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     lambda x: x > 0,
     "agent.num_timesteps agent.num_evals agent.num_envs agent.num_eval_envs agent.unroll_length agent.batch_size "
     "agent.num_minibatches agent.num_updates_per_batch agent.learning_rate agent.max_grad_norm agent.clipping_epsilon "
-    "agent.clipping_epsilon_value env.ctrl_dt env.sim_dt env.episode_length env.action_repeat checkpoint.keep "
+    "agent.clipping_epsilon_value agent.grad_updates_per_step agent.max_replay_size "
+    "agent.alpha_learning_rate env.ctrl_dt env.sim_dt env.episode_length env.action_repeat checkpoint.keep "
     "video.every_evals video.episodes video.width video.height hardware.devices profile.steps",
   ),
-  ("0 or more", lambda x: x >= 0, "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient"),
+  (
+    "0 or more",
+    lambda x: x >= 0,
+    "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient agent.min_replay_size",
+  ),
   (
     "between 0 and 1",
     lambda x: 0 <= x <= 1,
-    "agent.discounting agent.gae_lambda hardware.memory_fraction on_nonfinite.max_fraction",
+    "agent.discounting agent.gae_lambda agent.tau hardware.memory_fraction on_nonfinite.max_fraction",
   ),
 )
 

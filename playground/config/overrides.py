@@ -6,16 +6,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override as HydraOverride
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from playground.config.files import DELTAS, config_roots, groups, options, task_names
+from playground.config.files import DELTAS, config_roots, groups, listed_options, options
 from playground.config.text import format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
 
 DEFAULT_EXPERIMENT = "quickstart"
 # Any of these on the command line, and it is not the default run that is meant.
 _CHOOSES_A_RUN = {"experiment", "env", "agent", "robot", "curriculum", "resume"}
+_SHORT = {"terrain": "env.scene.terrain"}  # keys that may be written without their section
 
 
 class Override(NamedTuple):
@@ -34,6 +36,20 @@ def with_default_experiment(overrides: Sequence[str], config_dir: Path | None = 
   return [f"experiment={DEFAULT_EXPERIMENT}"] * (available and not chosen & _CHOOSES_A_RUN) + list(overrides)
 
 
+def is_hydras(text: str) -> bool:
+  """Whether an override is about Hydra itself, such as hydra.verbose=true."""
+  return text.lstrip("+~").startswith(("hydra.", "hydra/"))
+
+
+def parse_with_hydra(text: str) -> HydraOverride:
+  """Reads one override as Hydra does; raises ConfigError if it is none."""
+  try:
+    return OverridesParser.create().parse_override(text)
+  except HydraException:
+    example = "such as env=CartpoleBalance or agent.num_envs=1024 (quote a value with special characters)"
+    raise ConfigError(f"{text!r} is not an override: write key=value, {example}.") from None
+
+
 def parse(text: str, roots: Sequence[Path]) -> Override:
   """Reads one override and checks that the option it chooses, if any, exists.
 
@@ -41,12 +57,12 @@ def parse(text: str, roots: Sequence[Path]) -> Override:
     ConfigError: not an override, several values, or a key to remove.
     UnknownNameError: no such option.
   """
-  try:
-    parsed = OverridesParser.create().parse_override(text)
-  except HydraException:
-    example = "such as env=CartpoleBalance or agent.num_envs=1024 (quote a value with special characters)"
-    raise ConfigError(f"{text!r} is not an override: write key=value, {example}.") from None
+  name, equals, value = text.partition("=")
+  text = _SHORT.get(name, name) + equals + value
+  parsed = parse_with_hydra(text)
   key = parsed.key_or_group
+  if key == "sweep":
+    raise ConfigError(f"{text} stands for many runs: add -m, as in `playground-run -m {text}`.")
   if parsed.is_sweep_override():
     raise ConfigError(f"{text} names several values, which is a sweep: add -m, or quote the value.")
   is_group = key in groups(roots) and parsed.package is None
@@ -84,8 +100,9 @@ def _check_option(group: str, option: Any, roots: Sequence[Path]) -> None:
   known = options(group, roots)
   if option in known:
     return
-  shown = task_names(roots) if group == "env" else known
-  allowed = ", ".join(shown) if len(shown) <= 12 else f"the {len(shown)} that `playground list` shows"
+  shown = listed_options(group, roots)
+  command = "playground list" if group == "env" else "playground-run --help"
+  allowed = ", ".join(shown) if len(shown) <= 12 else f"the {len(shown)} that `{command}` shows"
   raise UnknownNameError(
     f"{group}={format_value(option)} does not exist: choose from {allowed}.{nearest(str(option), shown)}"
   )

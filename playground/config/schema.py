@@ -28,7 +28,8 @@ def fit(value: Any, default: Any, key: str = "") -> Any:
 
   Args:
     value: of the configuration, or a part of it.
-    default: the same part of the schema; None takes any single value or list, an empty mapping any mapping.
+    default: the same part of the schema; None and ??? (no default) take any single value or list, an empty mapping any
+      mapping.
     key: where the part is, for errors.
 
   Raises:
@@ -39,7 +40,7 @@ def fit(value: Any, default: Any, key: str = "") -> Any:
     return _fit_mapping(value, default, key)
   if isinstance(default, list) and isinstance(value, list):
     return _fit_list(value, default, key)
-  if default is None:
+  if default is None or default == "???":
     if isinstance(value, Mapping):
       raise wrong_type(key, value, "a single value, a list or null")
     return value

@@ -104,6 +104,8 @@ def test_shows_and_does_not_train(
     (["seed=99"], "error: hardware.devices=9: this machine has 1."),
     (["-m", "seed=1", "env=Gone"], "error: "),
     (["-m", "agent.num_envs=0"], "error: agent.num_envs=0 must be a number above 0."),
+    (["-m", "sweep=dm_control_pop"], "error: sweep=dm_control_pop does not exist: choose from dm_control_ppo,"),
+    (["sweep=dm_control_ppo"], "add -m, as in `playground-run -m sweep=dm_control_ppo`."),
   ],
 )
 def test_errors_are_one_sentence_and_exit_2(
@@ -130,6 +132,13 @@ def test_multirun(command: Command, trained: list[RunConfig], capsys: pytest.Cap
   assert [config.seed for config in trained] == [1, 99, 3]
   assert {config.name for config in trained} == {"quickstart"}
   assert "error: hardware.devices=9" in capsys.readouterr().err
+
+
+def test_a_sweep_and_what_the_command_line_says_instead(command: Command, trained: list[RunConfig]):
+  assert command("-m", "sweep=dm_control_ppo", "env=glob(Cartpole*Sparse)", "seed=range(2)", "debug=fast") == 0
+  jobs = [(config.choices["env"], config.seed) for config in trained]
+  assert jobs == [(f"Cartpole{name}Sparse", seed) for name in ("Balance", "Swingup") for seed in (0, 1)]
+  assert {config.agent.num_timesteps for config in trained} == {320}
 
 
 def test_a_mistake_is_reported_before_jax_is_imported():

@@ -1,0 +1,116 @@
+"""Hyperparameters of every task and agent against the paper's and those of Playground 0.2.0 (benchmarks/paper)."""
+
+import csv
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from playground import registry
+from playground.config import RunConfig, compose, options
+
+TABLES = Path(__file__).parents[1] / "benchmarks/paper"
+SOURCES = {"ppo": "paper", "ppo_v020": "upstream_head", "sac": "paper", "sac_v020": "upstream_head"}
+
+# Columns that say where a row comes from or what follows from it, not what is set.
+NOT_SET = {
+  *("source", "suite", "env", "filled_from_brax_or_env_default", "env_steps_per_training_step"),
+  *("training_steps_per_epoch", "env_steps_run", "unrolls_per_training_step", "gradient_steps"),
+}
+OF_THE_TASK = ("episode_length", "action_repeat")
+OF_THE_NETWORK = (
+  *("policy_hidden_layer_sizes", "value_hidden_layer_sizes", "policy_obs_key", "value_obs_key"),
+  "q_network_layer_norm",
+)
+
+# What we set where the source is silent, and why.
+OURS: dict[str, dict[str, Any]] = {
+  "ppo": {"num_resets_per_eval": 10},  # the default of the script that the paper was run with
+}
+# What a source lists and nobody can have used: Brax's SAC has no such argument and refuses it.
+UNUSABLE = {"sac": ("num_resets_per_eval",), "sac_v020": ("num_resets_per_eval",)}
+
+
+def rows(agent: str) -> dict[str, dict[str, str]]:
+  """The table's rows of an agent's source, by task."""
+  with (TABLES / f"hyperparameters_{agent.removesuffix('_v020')}.csv").open() as file:
+    return {row["env"]: row for row in csv.DictReader(file) if row["source"] == SOURCES[agent]}
+
+
+def suite() -> list[str]:
+  """The tasks of the DM Control suite, for which both agents are tuned."""
+  return list(rows("sac"))
+
+
+def cases() -> Iterator[Any]:
+  for agent in SOURCES:
+    for task in rows(agent):
+      if task in registry.names():
+        yield pytest.param(agent, task, id=f"{agent}-{task}")
+
+
+@functools.cache
+def composed(agent: str, task: str) -> RunConfig:
+  """The run of a pair; a variant without a set of its own is its agent (the test below), and saves a composition."""
+  shared = agent.removesuffix("_v020")
+  if agent != shared and f"{agent}/{task}" not in options("tuned"):
+    return composed(shared, task)
+  return compose([f"agent={agent}", f"env={task}"])
+
+
+def value(text: str) -> Any:
+  """What a cell says: a list such as 32x32, true or false, a number, text, or None."""
+  if text in ("", "True", "False"):
+    return {"": None, "True": True, "False": False}[text]
+  if "x" in text:
+    return [int(size) for size in text.split("x")]
+  try:
+    return float(text)
+  except ValueError:
+    return text
+
+
+def test_the_whole_suite_has_a_table_and_is_there():
+  assert len(suite()) == 25
+  assert set(suite()) <= set(registry.names())
+  assert all(set(suite()) <= set(rows(agent)) for agent in SOURCES)
+
+
+@pytest.mark.parametrize(("agent", "task"), cases())
+def test_hyperparameters_are_those_of_the_source(agent: str, task: str):
+  row = rows(agent)[task]
+  unlisted = (row.get("filled_from_brax_or_env_default") or "").split()
+  expected = {key: value(text) for key, text in row.items() if key not in (*NOT_SET, *UNUSABLE.get(agent, ()))}
+  expected |= {key: chosen for key, chosen in OURS.get(agent, {}).items() if key in unlisted}
+
+  run = composed(agent, task)
+  sections = {"env": OF_THE_TASK, "network": OF_THE_NETWORK}
+  of = {key: section for section, keys in sections.items() for key in keys}
+  resolved = {**run.resolved, "network": run.resolved["agent"].get("network")}
+  assert {key: resolved[of.get(key, "agent")][key] for key in expected} == expected
+  assert run.agent.name == agent.removesuffix("_v020")  # so that checkpoints of both go together
+  assert run.choices["tuned"] == f"{run.choices['agent']}/{task}"
+
+
+@pytest.mark.parametrize("agent", ["ppo", "sac"])
+def test_a_variant_without_a_set_of_its_own_takes_its_agents(agent: str):
+  run = compose([f"agent={agent}_v020", "env=CartpoleBalance"])
+  own = composed(agent, "CartpoleBalance")
+  assert (run.choices["agent"], run.choices["tuned"]) == (f"{agent}_v020", f"{agent}/CartpoleBalance")
+  assert (run.resolved["agent"], run.resolved["env"]) == (own.resolved["agent"], own.resolved["env"])
+  assert compose(run.overrides).resolved == run.resolved
+
+
+def test_a_variant_can_do_without_a_tuned_set():
+  untuned = compose(["agent=ppo_v020", "env=CartpoleBalance", "tuned=null"])
+  assert untuned.choices["tuned"] is None
+  assert untuned.agent.num_timesteps == 50_000_000
+
+
+@pytest.mark.parametrize("option", options("tuned"))
+def test_a_tuned_set_belongs_to_an_agent_and_a_task(option: str):
+  agent, task = option.split("/")
+  assert agent in options("agent")
+  assert task in {*registry.names(), *(name for source in SOURCES for name in rows(source))}  # some are yet to come
