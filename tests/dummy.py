@@ -9,13 +9,27 @@ import numpy as np
 
 from playground.envs.base import Env, State
 from playground.envs.physics import STATE_FIELDS, PhysicsData, mjx
+from playground.envs.wrappers import MAX_VELOCITY
+from playground.hardware.mesh import make_mesh
+from playground.learning.learner import Learner
+from playground.learning.loop import Metrics
+from playground.learning.networks import NetworkConfig, SoftNetworkConfig
+from playground.learning.ppo import PPO, PPOConfig
+from playground.learning.sac import SAC, SACConfig
 
 
 class PointTask(Env):
-  """Position [2] follows the action; reward is minus the distance; NaN on demand (`nan_at` steps)."""
+  """Position [2] follows the action, reward is minus the distance; NaN or absurd velocity on demand (`*_at` steps)."""
 
-  def __init__(self, episode_length: int = 20, action_repeat: int = 1, nan_at: int | None = None):  # pyright: ignore[reportMissingSuperCall]
+  def __init__(
+    self,
+    episode_length: int = 20,
+    action_repeat: int = 1,
+    nan_at: int | None = None,
+    fast_at: int | None = None,
+  ):  # pyright: ignore[reportMissingSuperCall]
     self.dt, self.episode_length, self.action_repeat, self.nan_at = 0.1, episode_length, action_repeat, nan_at
+    self.fast_at = fast_at
 
   @property
   def action_size(self) -> int:
@@ -44,6 +58,8 @@ class PointTask(Env):
     age = info["age"] + 1
     if self.nan_at is not None:
       data = data.replace(qpos=jnp.where(age == self.nan_at, jnp.nan, data.qpos))
+    if self.fast_at is not None:
+      data = data.replace(qvel=jnp.where(age == self.fast_at, 2 * MAX_VELOCITY, data.qvel))
     distance = jnp.linalg.norm(data.qpos)
     done = (distance > 3).astype(jnp.float32)
     info = {**info, "age": age}
@@ -53,10 +69,48 @@ class PointTask(Env):
     return {"state": data.qpos, "privileged_state": jnp.concatenate([data.qpos, data.qvel])}
 
 
-SMALL: dict[str, Any] = dict(
+class Point(PointTask):
+  """As much of a task as a whole run needs: `registry.load` may return it."""
+
+  mj_model: Any = None  # pyright: ignore[reportIncompatibleVariableOverride]
+  impl = "jax"
+  parity = False
+
+
+SMALL_PPO = PPOConfig(
   num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, unroll_length=5, batch_size=8, num_minibatches=4,
-  num_updates_per_batch=2, learning_rate=1e-3, discounting=0.95, normalize_observations=True,
+  num_updates_per_batch=2, learning_rate=3e-3, discounting=0.95, normalize_observations=True,
+  network=NetworkConfig((16, 16), (16, 16), value_obs_key="privileged_state"),
 )  # fmt: skip
+SMALL_SAC = SACConfig(
+  num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, batch_size=32, grad_updates_per_step=2,
+  min_replay_size=64, max_replay_size=500, learning_rate=3e-3, discounting=0.95, normalize_observations=True,
+  network=SoftNetworkConfig((16, 16), q_network_layer_norm=True, value_obs_key="privileged_state"),
+)  # fmt: skip
+
+
+def point_learner(config: PPOConfig | SACConfig, num_devices: int = 1, nan_at: int | None = None) -> Learner:
+  """The algorithm that a config is of, for the point."""
+  algorithm: type[Any] = PPO if isinstance(config, PPOConfig) else SAC
+  return algorithm(PointTask(nan_at=nan_at), config, make_mesh(num_devices), {})
+
+
+class Recorder:
+  """Hooks that remember, and stop after a number of rows."""
+
+  def __init__(self, stop_after: int | None = None):
+    self.rows: list[tuple[int, Metrics]] = []
+    self.saved: list[tuple[int, Any]] = []
+    self.stop_after = stop_after
+
+  def on_metrics(self, step: int, metrics: Metrics, capture: Any, recording: Any) -> None:
+    self.rows.append((step, {k: v for k, v in metrics.items() if not k.startswith("time/")}))
+
+  def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
+    self.saved.append((update, jax.device_get(state)))
+
+  def should_stop(self) -> bool:
+    return self.stop_after is not None and len(self.rows) >= self.stop_after
 
 
 def numbers(tree: Any) -> list[np.ndarray]:

@@ -103,6 +103,14 @@ def test_debug_fast_is_small_for_every_task(env: str):
   assert agent.num_timesteps / (agent.batch_size * agent.num_minibatches * agent.unroll_length) == 4
 
 
+@pytest.mark.parametrize("agent", config.options("agent"))
+def test_debug_fast_is_small_for_every_algorithm(agent: str):
+  for preset in ("fast", "[fast,profile]"):
+    run = compose(["env=CartpoleSwingup", f"agent={agent}", f"debug={preset}"])
+    assert (run.agent.num_timesteps, run.agent.num_envs, run.env.episode_length) == (320, 8, 20)
+  assert compose([f"agent={agent}", "env=CartpoleSwingup", "debug=fast", "agent.num_envs=4"]).agent.num_envs == 4
+
+
 @pytest.mark.parametrize("group", ["experiment", "hardware", "tracking", "debug"])  # tuned: test_hyperparameters.py
 def test_every_option_we_ship_composes(group: str):
   for option in config.options(group):
@@ -118,13 +126,16 @@ def test_several_debug_presets():
 # What a RunConfig is
 
 
-def test_agent_is_what_ppo_reads():
-  from playground.learning.ppo import PPOConfig
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_agent_is_what_its_algorithm_reads(name: str):
+  from playground.learning.algorithms import ALGORITHMS
 
-  agent = compose().agent
-  names = {field.name for field in dataclasses.fields(PPOConfig)}
-  assert set(agent) - {"name"} == names
-  assert PPOConfig.from_config(agent).num_envs == 256
+  assert list(ALGORITHMS) == ["ppo", "sac"]
+  agent = compose([f"agent={name}", "agent.num_envs=256"]).agent
+  read = ALGORITHMS[name].Config.from_config(agent)
+  assert set(agent) - {"name"} == {field.name for field in dataclasses.fields(read)}
+  assert set(agent.network) == {field.name for field in dataclasses.fields(read.network)}
+  assert read.num_envs == 256
 
 
 def test_paper_values_of_go1():
@@ -258,6 +269,9 @@ ERRORS = {
   "agent.num_envs=0": ["agent.num_envs=0 must be a number above 0."],
   "agent.max_grad_norm=big": ["agent.max_grad_norm=big must be a number above 0."],
   "hardware.devices=0": ["hardware.devices=0 must be a number above 0."],
+  "agent=sac agent.tau=2": ["agent.tau=2.0 must be a number between 0 and 1."],
+  "agent=sac agent.grad_updates_per_step=0": ["agent.grad_updates_per_step=0 must be a number above 0."],
+  "agent=sac agent.min_replay_size=-1": ["agent.min_replay_size=-1 must be a number 0 or more."],
   "agent.discounting=2": ["agent.discounting=2.0 must be a number between 0 and 1."],
   "seed=-1": ["seed=-1 must be a number 0 or more."],
   "env.impl=wrap": ["env.impl=wrap is unknown: choose from auto, jax, warp. Did you mean 'warp'?"],

@@ -106,6 +106,34 @@ def test_go1_draws_in_the_order_of_playground(go1: mujoco.MjModel) -> None:
     np.testing.assert_array_equal(sample[field], value, err_msg=field)
 
 
+# Values drawn by each term, in order, as in Playground 0.2.0.
+DRAWN = {
+  "go1": [1, 12, 12, 3, 14, 1, 12],
+  "berkeley_humanoid": [1, 12, 12, 14, 1, 12],
+  "g1": [1, 29, 29, 31, 1, 29],
+  "t1": [1, 23, 23, 25, 1, 23, 23, 4],
+}
+
+
+def test_every_robots_terms_bind_to_its_model() -> None:
+  assert set(DRAWN) == {path.stem for path in CONFIGS.glob("*.yaml")} - {"none"}
+  for robot, drawn in DRAWN.items():
+    terms = yaml.safe_load((CONFIGS / f"{robot}.yaml").read_text())["terms"]
+    rows = Randomizer(build_scene(robot).compile(), terms).describe()
+    assert [int(row["values"]) for row in rows] == drawn, robot
+
+
+def test_g1s_feet_slide_alike_in_both_directions() -> None:
+  model = build_scene("g1").compile()
+  terms = yaml.safe_load((CONFIGS / "g1.yaml").read_text())["terms"][:1]
+  friction = np.array(Randomizer(model, terms).sample(keys(1)[0])["pair_friction"])
+  feet = [model.pair(f"{side}_foot_floor").id for side in ("left", "right")]
+  assert len(set(friction[feet][:, :2].ravel())) == 1 and 0.4 <= friction[feet[0], 0] <= 1.0
+  others = np.delete(np.arange(model.npair), feet)
+  np.testing.assert_array_equal(friction[others], model.pair_friction[others].astype(np.float32))
+  np.testing.assert_array_equal(friction[feet][:, 2:], model.pair_friction[feet][:, 2:].astype(np.float32))
+
+
 def test_terms_apply_in_order(small: mujoco.MjModel) -> None:
   fixed = {"field": "body_mass", "target": "hand"}
   set_then_scale = [fixed | {"operation": "set", "range": [2, 2]}, fixed | {"operation": "scale", "range": [3, 3]}]

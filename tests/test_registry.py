@@ -17,14 +17,18 @@ from playground import registry
 from playground.config import compose
 from playground.errors import ConfigError, UnknownNameError
 
-GENERIC = ["env=joystick", "robot=go1"]
+GENERIC = [
+  ["env=joystick", "robot=go1"],
+  ["env=getup", "robot=go1"],
+  ["env=stand", "robot=go1", "env.support=[FR,FL]"],
+]
 
 
 def test_names():
   names = registry.names()
   assert names == sorted(names)
   assert {"CartpoleBalance", "Go1JoystickFlatTerrain"} <= set(names)
-  assert not {"joystick", "_cartpole"} & set(names)
+  assert not {"joystick", "getup", "stand", "_cartpole"} & set(names)
   assert registry.names("GO1") == [name for name in names if name.startswith("Go1")]
   assert registry.names("nothing") == []
   assert tuple(names) == registry.ALL_ENVS
@@ -153,7 +157,7 @@ def _leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
       yield f"{prefix}{key}"
 
 
-@pytest.mark.parametrize("overrides", [*([f"env={name}"] for name in registry.names()), GENERIC], ids=" ".join)
+@pytest.mark.parametrize("overrides", [*([f"env={name}"] for name in registry.names()), *GENERIC], ids=" ".join)
 def test_every_key_is_read(overrides: list[str]):
   config = compose([*overrides, "tuned=null"]).resolved["env"]
   read: set[str] = set()

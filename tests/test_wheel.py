@@ -27,13 +27,17 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_contents(wheel: Path):
   names = set(zipfile.ZipFile(wheel).namelist())
-  configs = {path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / "configs").rglob("*.yaml")}
+  configs = {
+    path.relative_to(REPOSITORY).as_posix()
+    for folder in ("configs", "sweeps")
+    for path in (REPOSITORY / folder).rglob("*.yaml")
+  }
   package = {
     path.relative_to(REPOSITORY).as_posix()
     for pattern in ("*.py", "*.xml")
     for path in (REPOSITORY / "playground").rglob(pattern)
   }
-  assert "playground/configs/config.yaml" in names
+  assert {"playground/configs/config.yaml", "playground/sweeps/dm_control_ppo.yaml"} <= names
   assert any(name.endswith(".xml") for name in package)
   assert {f"playground/{name}" for name in configs} | package <= names
   outside = {name for name in names if not name.startswith("playground/")}

@@ -10,9 +10,9 @@ from playground import config as configs
 from playground import registry
 from playground.errors import ConfigError
 from playground.hardware.setup import setup, this_machine
+from playground.learning.algorithms import make_learner
 from playground.learning.checkpoints import Checkpoint, find_checkpoints
 from playground.learning.evaluation import make_evaluator
-from playground.learning.ppo import PPO, PPOConfig
 from playground.rendering.video import render_video
 from playground.runs.files import write_json
 from playground.runs.job import episodes_of
@@ -50,15 +50,13 @@ def evaluate_run(
   run_dir = RunDirectory.open(checkpoint.path.parents[1])
   run = configs.from_dict(run_dir.config)
   hardware = setup(this_machine(run.hardware))
-  agent = PPOConfig.from_config(run.agent)
-  count = agent.num_eval_envs if episodes is None else episodes
+  count = run.agent.num_eval_envs if episodes is None else episodes
   if count < 1:
     raise ConfigError(f"--episodes={count} must be above 0.")
   env = registry.load(run.choices["env"], config=run.env)
   _, model = randomized_models(env, run, 1, count)
-  learner = PPO(env, agent, hardware.mesh, {}, hardware.network_precision)
-  policy_shape = learner.policy(jax.eval_shape(learner.init, jax.random.PRNGKey(0), {}))
-  policy = learner.place_policy(checkpoint.restore("policy", policy_shape))
+  learner = make_learner(env, run.agent, hardware.mesh, hardware.network_precision)
+  policy = learner.place_policy(checkpoint.restore("policy", learner.policy_shape()))
   act = lambda policy, obs, key: learner.act(policy, obs, key, deterministic or None)
   evaluate = make_evaluator(env, act, count, hardware.mesh, 1 if video else 0)
   scores, recording = evaluate(policy, jax.random.PRNGKey(seed), model)

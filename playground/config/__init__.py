@@ -9,12 +9,14 @@ exist, and what they have fixes each value's type, wherever that value is set.
   files        where configs/ lies, which groups and options it has
   overrides    the command line, one `key=value` at a time
   sweeps       a command line that stands for many runs
+  chains       a curriculum's stages, each a run of its own
   composition  all of it together, for a new run and for one that goes on
   schema       keys that exist and the types of their values
   limits       what types cannot say: choices, ranges, sizes that must divide
   run_config   the result, and how it is saved, read and shown
 """
 
+from playground.config.chains import in_stage, stage_folders
 from playground.config.composition import compose, override_section
 from playground.config.files import ENTRY_POINTS, config_roots, options, search_path_override, task_names
 from playground.config.overrides import DEFAULT_EXPERIMENT, is_hydras, with_default_experiment
@@ -33,11 +35,13 @@ __all__ = [
   "first_job",
   "format_value",
   "from_dict",
+  "in_stage",
   "is_hydras",
   "load",
   "options",
   "override_section",
   "search_path_override",
+  "stage_folders",
   "task_names",
   "to_yaml",
   "tree",

@@ -1,10 +1,12 @@
 """All of it together: Hydra composes the files, the command line is set on top, the whole is checked."""
 
+import copy
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -14,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from playground.config.chains import SINGLE_RUN, budget, check_chain, in_stage, stage_folders, stage_overrides
 from playground.config.files import DELTAS, config_roots, groups, options, search_path_override
 from playground.config.limits import check_limits
 from playground.config.overrides import Override, canonical, group_overrides, is_hydras, parse, with_default_experiment
@@ -27,7 +30,7 @@ _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
 
 def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> RunConfig:
-  """Composes the configuration of a run.
+  """Composes the configuration of a run and, if that is a chain, of each of its stages.
 
   Args:
     overrides: as on the command line, `env=CartpoleBalance`, `agent.num_envs=1024`.
@@ -46,22 +49,12 @@ def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> Ru
       _check_path(key, given[key])
   if given.get("resume") is not None:
     return _compose_resumed(Path(given["resume"]), parsed, roots)
-
-  config, choices = _hydra(group_overrides(parsed), roots)
-  shared = f"{config.agent.name}/{choices['env']}"
-  if "tuned" not in given and choices["tuned"] is None and shared in options("tuned", roots):
-    parsed.append(parse(f"tuned={shared}", roots))  # a variant such as ppo_v020 without a set of its own has ppo's
-    config, choices = _hydra(group_overrides(parsed), roots)
-  schema, _ = _hydra([f"{g}={c}" for g, c in choices.items() if c and g not in DELTAS] + _NO_DELTAS, roots)
-  _check_robot(config, choices, roots)
-  resolved = _apply(config, [o for o in parsed if not o.is_group], _plain(schema))
-  check_limits(resolved)
-  name = choices.get("experiment") or choices["env"]
-  head = {"name": name, "choices": choices}
-  ordered = {key: resolved[key] for key in (*SCALARS, *SECTIONS) if key in resolved}
-  run_config = from_dict({**head, **ordered, **resolved}, canonical(parsed, resolved))
-  run_dir = run_config.run_dir or f"results/{name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
-  return dataclasses.replace(run_config, run_dir=run_dir)
+  files = functools.cache(functools.partial(_compose_files, roots))  # stages of one task differ in values only
+  config = _compose_new(parsed, files, roots)
+  stages = stage_overrides(config.resolved["curriculum"], parsed, roots)
+  composed = tuple(_compose_stage(config, name, theirs, files, roots) for name, theirs in stages)
+  run_dir = config.run_dir or f"results/{config.name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
+  return dataclasses.replace(config, run_dir=run_dir, stages=composed)
 
 
 def override_section(section: str, default: Section, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -71,6 +64,51 @@ def override_section(section: str, default: Section, overrides: Mapping[str, Any
   resolved = _apply(OmegaConf.create(schema), parsed, schema)
   check_limits(resolved)
   return resolved[section]
+
+
+class _Files(NamedTuple):
+  """What the files say for a choice of groups: the values, the option of each group, the keys that exist."""
+
+  config: DictConfig
+  choices: dict[str, str | None]
+  schema: dict[str, Any]
+  added: tuple[Override, ...]  # a choice of ours
+
+
+def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
+  """Composes the files."""
+  (config, choices), added = _hydra(groups, roots), ()
+  shared = f"{config.agent.name}/{choices['env']}"
+  named = any(text.lstrip("~").partition("=")[0] == "tuned" for text in groups)
+  if not named and choices["tuned"] is None and shared in options("tuned", roots):
+    added = (parse(f"tuned={shared}", roots),)  # a variant such as ppo_v020 without a set of its own has ppo's
+    config, choices = _hydra([*groups, *group_overrides(added)], roots)
+  schema, _ = _hydra([f"{g}={c}" for g, c in choices.items() if c and g not in DELTAS] + _NO_DELTAS, roots)
+  _check_robot(config, choices, roots)
+  return _Files(config, choices, _plain(schema), added)
+
+
+def _compose_new(parsed: Sequence[Override], files: Callable[..., _Files], roots: Sequence[Path]) -> RunConfig:
+  """The configuration that a command line stands for."""
+  config, choices, schema, added = files(*group_overrides(parsed))
+  resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], schema)
+  check_limits(resolved)
+  check_chain(resolved, parsed, roots)
+  head = {"name": choices.get("experiment") or choices["env"], "choices": dict(choices)}
+  ordered = {key: resolved[key] for key in (*SCALARS, *SECTIONS) if key in resolved}
+  return from_dict({**head, **ordered, **resolved}, canonical([*parsed, *added], resolved))
+
+
+def _compose_stage(
+  chain: RunConfig, name: str, parsed: Sequence[Override], files: Callable[..., _Files], roots: Sequence[Path]
+) -> RunConfig:
+  """The configuration of a stage, a single run; where it lies and what it starts from is left open."""
+  with in_stage(name):
+    stage = _compose_new(parsed, files, roots)
+  steps = budget(chain.resolved["curriculum"], name, stage.agent.num_timesteps)
+  own = {"name": f"{chain.name}/{name}", "choices": {**stage.choices, "curriculum": "none"}, "curriculum": SINGLE_RUN}
+  own |= {"agent": {**stage.resolved["agent"], "num_timesteps": steps}, "run_dir": None, "init_from": None}
+  return from_dict({**stage.resolved, **own}, stage.overrides)
 
 
 def _hydra(overrides: Sequence[str], roots: Sequence[Path]) -> tuple[DictConfig, dict[str, str | None]]:
@@ -127,7 +165,8 @@ def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path
   resolved = {**saved, **changed, "resume": str(run), "run_dir": str(run), "init_from": None}
   resolved["choices"] = {**saved["choices"], **{group: choices[group] for group in chosen}}
   check_limits(resolved)
-  return from_dict(resolved, canonical(parsed, resolved))
+  stages = [_compose_resumed(run / folder, parsed, roots) for folder in stage_folders(saved["curriculum"]).values()]
+  return dataclasses.replace(from_dict(resolved, canonical(parsed, resolved)), stages=tuple(stages))
 
 
 def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:

@@ -28,7 +28,8 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
   (
     "0 or more",
     lambda x: x >= 0,
-    "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient agent.min_replay_size",
+    "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient agent.min_replay_size "
+    "curriculum.scale",
   ),
   (
     "between 0 and 1",

@@ -36,6 +36,7 @@ class RunConfig:
     choices: the option of each group, None where none is chosen.
     overrides: the command line in Hydra's form, numbers in their final type, the default experiment spelt out.
     resolved: all of it as plain dicts, lists and scalars; what `config.yaml` in the run directory holds.
+    stages: of a chain, the runs it is made of, in order; empty for a single run.
   """
 
   name: str
@@ -56,6 +57,7 @@ class RunConfig:
   choices: dict[str, Any]
   overrides: tuple[str, ...]
   resolved: dict[str, Any]
+  stages: tuple["RunConfig", ...] = ()
 
 
 def from_dict(resolved: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunConfig:

@@ -93,7 +93,7 @@ class Physics:
     self.mj_model = mj_model
     self.impl = impl
     self.derived = derived
-    self.model = mjx.put_model(mj_model, impl=impl)
+    self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, impl=impl)
     self._sizes: dict[str, Any] = {} if impl == "jax" else {"naconmax": naconmax, "naccdmax": naccdmax, "njmax": njmax}
 
   def make(self, **fields: jax.Array) -> PhysicsData:
@@ -127,3 +127,18 @@ class Physics:
   def _keep(self, data: mjx.Data, derived: tuple[str, ...] | None = None) -> PhysicsData:
     derived = self.derived if derived is None else derived
     return PhysicsData(**{name: getattr(data, name) for name in (*STATE_FIELDS, *derived)})
+
+
+def _put_on_warp(mj_model: mujoco.MjModel) -> mjx.Model:
+  """The model on Warp, without its messages on loading kernels and on solvers that used up their iterations.
+
+  Few iterations are what these tasks ask for, and one line for each solve is slower than the solve. Messages about
+  buffers that are too small stay on.
+  """
+  import warp
+  from mujoco.mjx.third_party.mujoco_warp import OverflowType
+
+  warp.config.log_level = warp.LOG_WARNING
+  model = mjx.put_model(mj_model, impl="warp")
+  silent = int(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
+  return model.tree_replace({"opt._impl.warn_overflow": model.opt._impl.warn_overflow & ~silent})  # pyright: ignore[reportReturnType]

@@ -19,6 +19,7 @@ EPISODE_KEYS = ("steps", "truncation", "episode_done", "episode_metrics")
 PREFIX = "AutoResetWrapper_"
 PRESERVE_INFO = PREFIX + "preserve_info"  # what a task puts here survives a full reset (a curriculum's level, say)
 MAX_VALUE = 1e10  # MuJoCo's own limit for positions and velocities (mjMAXVAL)
+MAX_VELOCITY = 1e3  # m/s, rad/s: no robot moves so, and one such state among millions ruins a critic and its optimiser
 
 
 def where_done(done: jax.Array, new: Any, old: Any) -> Any:
@@ -62,7 +63,8 @@ class Vectorize(Wrapper):
 class FiniteGuard(Wrapper):
   """Ends an episode whose numbers went NaN, infinite or absurd, before they reach anything that learns.
 
-  Absurd is beyond `MAX_VALUE`: the step before a NaN may hold finite values that ruin observation statistics as surely.
+  Absurd is beyond `MAX_VALUE`, or `MAX_VELOCITY` in `qvel`: a simulation that comes apart holds finite values for some
+  steps, which ruin observation statistics and the critic as surely as a NaN would.
 
   Such a step gives done = 1, reward 0, the previous observation, metrics 0 and the previous info; `info["nonfinite"]`
   is 1 for it, and `info["nonfinite_state"]` holds the simulator's state as it came out of the step.
@@ -75,11 +77,11 @@ class FiniteGuard(Wrapper):
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
     after = self.env.step(state, action, model)
-    watched = (after.data.qpos, after.data.qvel, after.reward, after.obs)
     finite = jnp.ones_like(after.done, bool)
-    for leaf in jax.tree.leaves(watched):
-      if jnp.issubdtype(leaf.dtype, jnp.floating):
-        finite &= (jnp.abs(leaf) <= MAX_VALUE).all(axis=tuple(range(1, leaf.ndim)))  # false for NaN, too
+    for watched, limit in ((after.data.qvel, MAX_VELOCITY), ((after.data.qpos, after.reward, after.obs), MAX_VALUE)):
+      for leaf in jax.tree.leaves(watched):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+          finite &= (jnp.abs(leaf) <= limit).all(axis=tuple(range(1, leaf.ndim)))  # false for NaN, too
     bad = ~finite
     zeros = jax.tree.map(jnp.zeros_like, (after.reward, after.metrics))
     reward, metrics = where_done(bad, zeros, (after.reward, after.metrics))

@@ -15,6 +15,12 @@ def make_mesh(num_devices: int) -> Mesh:
   return Mesh(np.array(jax.devices()[:num_devices]), (AXIS,))
 
 
+def device_memory(mesh: Mesh) -> int | None:
+  """Bytes that a program may use on the smallest device, None where the runtime does not say (CPU)."""
+  limits = [(device.memory_stats() or {}).get("bytes_limit") for device in mesh.devices.flat]
+  return None if None in limits else min(limits)
+
+
 def jit_on_mesh(function: Callable[..., Any], mesh: Mesh, in_specs: Any, out_specs: Any, **kwargs: Any) -> Any:
   """Jits `function` to run once on every device of the mesh, each on its share of the arguments.
 

@@ -80,7 +80,7 @@ def _environment(config: Any) -> None:
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", str(bool(config.preallocate)).lower())
   if config.memory_fraction is not None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", str(config.memory_fraction))
-  if config.xla_flags:
+  if config.xla_flags and config.xla_flags not in os.environ.get("XLA_FLAGS", ""):  # a chain comes here often
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {config.xla_flags}".strip()
 
 

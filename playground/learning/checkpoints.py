@@ -2,12 +2,13 @@
 
 A checkpoint has three items: `policy` (normaliser and networks: what evaluation, export and `init_from` need), `state`
 (the rest of what training goes on from) and `meta` (step, task, config, the name and shape of every array, a checksum).
+The newest may have a fourth, `replay`: experience, which is too large to keep more than once.
 """
 
 import hashlib
 import logging
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from playground.errors import CheckpointError
 FORMAT = "playground-run/1"
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax warns of its own defaults at every save and read
 Arrays = list[np.ndarray]
+Fetch = Callable[[], np.ndarray | None]
 
 
 class CheckpointStore:
@@ -46,10 +48,18 @@ class CheckpointStore:
     self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
     self._pending: Future[None] | None = None
 
-  def save(self, step: int, policy: Any, state: Any, meta: Mapping[str, Any]) -> None:
-    """Starts saving. The trees' arrays must not be donated or deleted meanwhile; an earlier failure is raised here."""
+  def save(self, step: int, policy: Any, state: Any, meta: Mapping[str, Any], replay: Fetch | None = None) -> None:
+    """Starts saving. The trees' arrays must not be donated or deleted meanwhile; an earlier failure is raised here.
+
+    Args:
+      step: control steps trained.
+      policy: the item of that name, and
+      state: so too.
+      meta: what else to note.
+      replay: fetches that item, if there is one, on the saving thread. Older checkpoints lose theirs.
+    """
     self.wait()
-    self._pending = self._thread.submit(self._write, step, policy, state, dict(meta))
+    self._pending = self._thread.submit(self._write, step, policy, state, dict(meta), replay)
 
   def wait(self) -> None:
     """Returns when what was saved lies on disk; raises what went wrong with it."""
@@ -62,8 +72,10 @@ class CheckpointStore:
     self._thread.shutdown()
     self._manager.close()
 
-  def _write(self, step: int, policy: Any, state: Any, meta: dict[str, Any]) -> None:
+  def _write(self, step: int, policy: Any, state: Any, meta: dict[str, Any], replay: Fetch | None) -> None:
     trees = {"policy": policy, "state": state}
+    if replay and (experience := replay()) is not None:
+      trees["replay"] = experience
     arrays = {name: [np.asarray(x) for x in jax.device_get(jax.tree.leaves(tree))] for name, tree in trees.items()}
     meta |= {
       "format": FORMAT,
@@ -73,6 +85,9 @@ class CheckpointStore:
     }
     items = {name: ocp.args.StandardSave(_numbered(values)) for name, values in arrays.items()}  # pyright: ignore[reportCallIssue]
     self._manager.save(step, args=ocp.args.Composite(**items, meta=ocp.args.JsonSave(meta)), force=True)  # pyright: ignore[reportCallIssue]
+    for path in Path(self._manager.directory).glob("*/replay"):
+      if path.parent.name.isdigit() and int(path.parent.name) != step:
+        shutil.rmtree(path)
 
 
 class Checkpoint:
@@ -98,8 +113,12 @@ class Checkpoint:
   def step(self) -> int:
     return self.meta["step"]
 
+  def has(self, item: str) -> bool:
+    """Whether it holds an item."""
+    return (self.path / item).is_dir()
+
   def restore(self, item: str, template: Any) -> Any:
-    """Returns the tree of item 'policy' or 'state' as host arrays.
+    """Returns the tree of item 'policy', 'state' or 'replay' as host arrays.
 
     Args:
       item: which one.
@@ -134,6 +153,8 @@ class Checkpoint:
 def find_checkpoints(path: str | Path) -> list[Path]:
   """The checkpoints at `path`, newest first: those of a run directory, or the one that `path` itself is.
 
+  Of a chain's directory they are those of the last stage that has any.
+
   Raises:
     CheckpointError: there is none.
   """
@@ -143,6 +164,10 @@ def find_checkpoints(path: str | Path) -> list[Path]:
   if path.name.isdigit() and path.parent.name == "checkpoints":
     return [path]
   folder = path if path.name == "checkpoints" else path / "checkpoints"
+  if not folder.is_dir():
+    number = lambda folder: folder.parent.name.partition("_")[0]
+    stages = [p for p in path.glob("*_*/checkpoints/") if number(p).isdigit() and any(p.iterdir())]
+    folder = max(stages, key=lambda p: int(number(p)), default=folder)
   found = sorted((p for p in folder.glob("*") if p.name.isdigit() and p.is_dir()), key=lambda p: int(p.name))
   if not found:
     raise CheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
@@ -159,7 +184,7 @@ def checksum(leaves: Arrays) -> str:
   """SHA-256 over the bytes of all arrays."""
   digest = hashlib.sha256()
   for leaf in leaves:
-    digest.update(np.ascontiguousarray(leaf).tobytes())
+    digest.update(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8).data)
   return digest.hexdigest()
 
 

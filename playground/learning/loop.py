@@ -5,6 +5,7 @@ The device is not kept waiting: a thread of its own logs and saves what was done
 
 import dataclasses
 import gc
+import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
@@ -12,10 +13,11 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding
+from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from playground.envs.wrappers import ModelFields
+from playground.learning.learner import Learner
 
 Metrics = dict[str, float]
 COMPILER = "compiler"  # name of the threads that compile
@@ -49,37 +51,6 @@ def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_upd
   return marks
 
 
-class Learner(Protocol):
-  """What an algorithm offers the loop: jitted functions over its mesh."""
-
-  mesh: Mesh
-  steps_per_update: int
-  init: Any  # (key, model) -> state
-  train: Any  # (state, model, number of updates) -> (state, metrics); takes the state's buffers over
-  reset: Any  # (state, key, model) -> state; takes the state's buffers over
-  copy: Any  # (state) -> state in buffers of its own
-
-  def policy(self, state: Any) -> Any:
-    """The part of the state that acting needs."""
-    ...
-
-  def split(self, state: Any) -> tuple[Any, Any]:
-    """Divides a state into what acting needs and the rest."""
-    ...
-
-  def join(self, policy: Any, rest: Any) -> Any:
-    """Undoes `split`."""
-    ...
-
-  def place(self, state: Any) -> Any:
-    """Puts a state of host arrays on the devices."""
-    ...
-
-  def with_policy(self, state: Any, policy: Any) -> Any:
-    """A state that acts with `policy` (host arrays), all else unchanged."""
-    ...
-
-
 class Hooks(Protocol):
   """What a run does with what happens; called on a thread of its own while the device works on."""
 
@@ -94,8 +65,8 @@ class Hooks(Protocol):
     """
     ...
 
-  def on_save(self, update: int, step: int, state: Any) -> None:
-    """A state to keep, on the device; its buffers stay valid."""
+  def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
+    """A state to keep, on the device; its buffers stay valid. After the final one there is nothing left to train."""
     ...
 
   def should_stop(self) -> bool:
@@ -264,9 +235,7 @@ class Loop:
     recording = None
     if done.trained is not None:
       report = {k: float(v) for k, v in jax.device_get(done.trained).items()}
-      # No episode ended in this stretch: then there is no mean over episodes to log.
-      means = () if report["episodes"] else [k for k in report if k.startswith("episode_")]
-      row |= {f"training/{k}": v for k, v in report.items() if k not in means}
+      row |= {f"training/{k}": v for k, v in report.items() if not math.isnan(v)}  # NaN is a mean over nothing
       row["time/steps_per_second"] = done.steps / done.train_s
     if done.evaluated is not None:
       scores, recording = done.evaluated
@@ -274,7 +243,7 @@ class Loop:
       row["time/eval_s"] = done.eval_s
     self._hooks.on_metrics(step, row, done.capture, recording)
     if done.snapshot is not None:
-      self._hooks.on_save(done.mark.update, step, done.snapshot)
+      self._hooks.on_save(done.mark.update, step, done.snapshot, done.mark is self._marks[-1])
 
   def _key(self, key: jax.Array, mark: Mark) -> jax.Array:
     return jax.device_put(jax.random.fold_in(key, mark.update), self._replicated)

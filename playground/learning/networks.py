@@ -1,13 +1,16 @@
-"""Actor and critic on Brax's networks and distributions, with observation normalisation."""
+"""Actors and critics on Brax's networks and distributions, with observation normalisation."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import networks as brax_networks
+from brax.training.distribution import NormalTanhDistribution
 from flax import linen, struct
 
 from playground.envs.base import Observation
@@ -19,11 +22,87 @@ Normalizer = running_statistics.RunningStatisticsState
 ObservationSize = int | Mapping[str, tuple[int, ...]]
 
 
-class ActorCriticParams(struct.PyTreeNode):
-  """Parameters of the two networks."""
+class Actor:
+  """A tanh-squashed Gaussian actor, and what it shares with its critics: observation entries, normaliser, precision.
 
-  policy: Any
-  value: Any
+  Observations are dicts of arrays with any leading axes; a task's flat observation counts as {"state": obs}.
+  """
+
+  def __init__(
+    self,
+    obs_size: ObservationSize,
+    action_size: int,
+    hidden_layer_sizes: Sequence[int],
+    config: "NetworkConfig | SoftNetworkConfig",
+    precision: str | None = None,
+    layer_norm: bool = False,
+  ):
+    """Builds the actor.
+
+    Args:
+      obs_size: the task's `observation_size`.
+      action_size: length of the action vector.
+      hidden_layer_sizes: of the actor.
+      config: activation and inputs.
+      precision: matrix-product precision of the networks ('highest', 'tensorfloat32', 'bfloat16'), None for the
+        process's default.
+      layer_norm: whether the actor's hidden layers are normalised.
+
+    Raises:
+      ConfigError: unknown activation, or an observation entry the task does not have.
+    """
+    if config.activation not in ACTIVATIONS:
+      allowed = ", ".join(ACTIVATIONS) + "." + nearest(config.activation, ACTIVATIONS)
+      raise ConfigError(f"agent.network.activation={config.activation!r} must be one of {allowed}")
+    sizes = obs_size if isinstance(obs_size, Mapping) else {"state": (obs_size,)}
+    for name in ("policy_obs_key", "value_obs_key"):
+      key = getattr(config, name)
+      if key not in sizes:
+        entries = ", ".join(sizes) + "." + nearest(key, sizes)
+        raise ConfigError(f"agent.network.{name}={key!r} must be an entry of the task's observation: {entries}")
+    self.precision = precision
+    self.action_size = action_size
+    self.activation = ACTIVATIONS[config.activation]
+    self.policy_obs_key, self.value_obs_key = config.policy_obs_key, config.value_obs_key
+    self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key}))
+    self.obs_sizes = {key: sizes[key] for key in self.obs_keys}
+    self.distribution = NormalTanhDistribution(event_size=action_size)
+    self.policy_network = brax_networks.make_policy_network(
+      self.distribution.param_size,
+      dict(sizes),
+      hidden_layer_sizes=tuple(hidden_layer_sizes),
+      activation=self.activation,
+      layer_norm=layer_norm,
+      obs_key=config.policy_obs_key,
+    )
+
+  def init_normalizer(self) -> Normalizer:
+    shapes = {key: specs.Array(size, jnp.dtype("float32")) for key, size in self.obs_sizes.items()}
+    state = running_statistics.init_state(shapes)  # pyright: ignore[reportArgumentType]
+    # Python numbers are weakly typed: a loop over them would be traced, and compiled, a second time.
+    count = jax.tree.map(lambda x: jnp.asarray(x, jnp.uint32), state.count)
+    return state.replace(count=count, std_eps=jnp.asarray(state.std_eps, jnp.float32))
+
+  def select(self, obs: Observation) -> dict[str, jax.Array]:
+    """The entries of an observation that actor or critic reads."""
+    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    return {key: entries[key] for key in self.obs_keys}
+
+  def logits(self, policy_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
+    """Parameters of the action distribution, [..., 2 * action_size], for normalised observations."""
+    with self.at_precision():
+      return self.policy_network.apply(None, policy_params, obs[self.policy_obs_key])
+
+  def act(
+    self, policy: Any, normalizer: Normalizer | None, obs: Observation, key: jax.Array, deterministic: bool = False
+  ) -> jax.Array:
+    """Actions in [-1, 1], [..., action_size], sampled or (deterministic) the mode."""
+    logits = self.logits(policy, normalize(self.select(obs), normalizer))
+    return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
+
+  def at_precision(self) -> AbstractContextManager[Any]:
+    """A context in which matrix products have the networks' precision."""
+    return jax.default_matmul_precision(self.precision or jax.config.jax_default_matmul_precision)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +115,13 @@ class NetworkConfig:
   policy_obs_key: str = "state"  # entry of a dict observation that the actor sees
   value_obs_key: str = "state"  # entry that the critic sees, "privileged_state" for an asymmetric pair
   value_dtype: str = "auto"  # of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere
+
+
+class ActorCriticParams(struct.PyTreeNode):
+  """Parameters of the two networks."""
+
+  policy: Any
+  value: Any
 
 
 class Critic(linen.Module):
@@ -58,87 +144,95 @@ class Critic(linen.Module):
     return last(hidden)[..., 0]
 
 
-class ActorCritic:
-  """A tanh-squashed Gaussian actor and a value network.
-
-  Observations are dicts of arrays with any leading axes; a task's flat observation counts as {"state": obs}.
-  """
+class ActorCritic(Actor):
+  """An actor and a value network, as PPO trains them."""
 
   def __init__(self, obs_size: ObservationSize, action_size: int, config: NetworkConfig, precision: str | None = None):
-    """Builds the networks.
-
-    Args:
-      obs_size: the task's `observation_size`.
-      action_size: length of the action vector.
-      config: sizes and inputs.
-      precision: matrix-product precision of the networks ('highest', 'tensorfloat32', 'bfloat16'), None for the
-        process's default.
-
-    Raises:
-      ConfigError: unknown activation, or an observation entry the task does not have.
-    """
-    if config.activation not in ACTIVATIONS:
-      allowed = ", ".join(ACTIVATIONS) + "." + nearest(config.activation, ACTIVATIONS)
-      raise ConfigError(f"agent.network.activation={config.activation!r} must be one of {allowed}")
+    """Builds the networks; see `Actor` for the arguments and errors."""
     if config.value_dtype not in ("auto", "bfloat16", "float32"):
       raise ConfigError(f"agent.network.value_dtype={config.value_dtype!r} must be one of auto, bfloat16, float32.")
-    sizes = obs_size if isinstance(obs_size, Mapping) else {"state": (obs_size,)}
-    for name in ("policy_obs_key", "value_obs_key"):
-      key = getattr(config, name)
-      if key not in sizes:
-        entries = ", ".join(sizes) + "." + nearest(key, sizes)
-        raise ConfigError(f"agent.network.{name}={key!r} must be an entry of the task's observation: {entries}")
-    self.config = config
-    self.precision = precision
-    self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key}))
-    self._sizes = {key: sizes[key] for key in self.obs_keys}
+    super().__init__(obs_size, action_size, config.policy_hidden_layer_sizes, config, precision)
     auto = "bfloat16" if jax.default_backend() == "gpu" else "float32"
     self.value_dtype = auto if config.value_dtype == "auto" else config.value_dtype
-    self._critic = Critic(
-      tuple(config.value_hidden_layer_sizes), ACTIVATIONS[config.activation], jnp.dtype(self.value_dtype)
-    )
-    self._networks = brax_networks.make_ppo_networks(
-      dict(sizes),
-      action_size,
-      policy_hidden_layer_sizes=tuple(config.policy_hidden_layer_sizes),
-      activation=ACTIVATIONS[config.activation],
-      policy_obs_key=config.policy_obs_key,
-    )
-    self.distribution = self._networks.parametric_action_distribution
+    self._critic = Critic(tuple(config.value_hidden_layer_sizes), self.activation, jnp.dtype(self.value_dtype))
 
   def init(self, key: jax.Array) -> ActorCriticParams:
     policy, value = jax.random.split(key)
-    obs = jnp.zeros((1, *self._sizes[self.config.value_obs_key]))
-    return ActorCriticParams(self._networks.policy_network.init(policy), self._critic.init(value, obs))
-
-  def init_normalizer(self) -> Normalizer:
-    shapes = {key: specs.Array(size, jnp.dtype("float32")) for key, size in self._sizes.items()}
-    state = running_statistics.init_state(shapes)  # pyright: ignore[reportArgumentType]
-    # Python numbers are weakly typed: a loop over them would be traced, and compiled, a second time.
-    count = jax.tree.map(lambda x: jnp.asarray(x, jnp.uint32), state.count)
-    return state.replace(count=count, std_eps=jnp.asarray(state.std_eps, jnp.float32))
-
-  def select(self, obs: Observation) -> dict[str, jax.Array]:
-    """The entries of an observation that actor or critic reads."""
-    entries = obs if isinstance(obs, Mapping) else {"state": obs}
-    return {key: entries[key] for key in self.obs_keys}
-
-  def logits(self, policy_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
-    """Parameters of the action distribution, [..., 2 * action_size], for normalised observations."""
-    with jax.default_matmul_precision(self.precision or jax.config.jax_default_matmul_precision):
-      return self._networks.policy_network.apply(None, policy_params, obs[self.config.policy_obs_key])
+    obs = jnp.zeros((1, *self.obs_sizes[self.value_obs_key]))
+    return ActorCriticParams(self.policy_network.init(policy), self._critic.init(value, obs))
 
   def value(self, value_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
     """State values, [...], for normalised observations."""
-    with jax.default_matmul_precision(self.precision or jax.config.jax_default_matmul_precision):
-      return self._critic.apply(value_params, obs[self.config.value_obs_key])  # pyright: ignore[reportReturnType]
+    with self.at_precision():
+      return self._critic.apply(value_params, obs[self.value_obs_key])  # pyright: ignore[reportReturnType]
 
-  def act(
-    self, policy: Any, normalizer: Normalizer | None, obs: Observation, key: jax.Array, deterministic: bool = False
-  ) -> jax.Array:
-    """Actions in [-1, 1], [..., action_size], sampled or (deterministic) the mode."""
-    logits = self.logits(policy, normalize(self.select(obs), normalizer))
-    return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
+
+@dataclasses.dataclass(frozen=True)
+class SoftNetworkConfig:
+  """Sizes and inputs of SAC's actor and twin critics (Brax's names and defaults)."""
+
+  hidden_layer_sizes: Sequence[int] = (256, 256)  # of the actor and of each critic
+  activation: str = "relu"
+  policy_network_layer_norm: bool = False
+  q_network_layer_norm: bool = False
+  policy_obs_key: str = "state"  # entry of a dict observation that the actor sees
+  value_obs_key: str = "state"  # entry that the critics see, "privileged_state" for an asymmetric pair
+
+
+class SoftActorCriticParams(struct.PyTreeNode):
+  """What SAC's optimiser changes. The order counts: the critics come first, see `SAC._sgd_step`.
+
+  Attributes:
+    q: parameters of the twin critics, each array [2, ...].
+    policy: of the actor.
+    log_alpha: logarithm of the temperature, [].
+  """
+
+  q: Any
+  policy: Any
+  log_alpha: jax.Array
+
+
+class SoftActorCritic(Actor):
+  """An actor and two action-value networks, whose layers are one batched product each.
+
+  Attributes:
+    batched: whether several evaluations of the critics are one batched product, too. It is what a GPU wants, where a
+      step of SAC costs as many kernels as it has; elsewhere arithmetic counts, of which it does half as much again.
+  """
+
+  def __init__(
+    self, obs_size: ObservationSize, action_size: int, config: SoftNetworkConfig, precision: str | None = None
+  ):
+    """Builds the networks; see `Actor` for the arguments and errors."""
+    self.batched = jax.default_backend() == "gpu"
+    sizes, norm = tuple(config.hidden_layer_sizes), config.policy_network_layer_norm
+    super().__init__(obs_size, action_size, sizes, config, precision, norm)
+    self._critic = brax_networks.MLP([*sizes, 1], self.activation, layer_norm=config.q_network_layer_norm)
+
+  def init(self, key: jax.Array) -> SoftActorCriticParams:
+    policy, q = jax.random.split(key)
+    length = math.prod(self.obs_sizes[self.value_obs_key]) + self.action_size
+    q = jax.vmap(lambda key: self._critic.init(key, jnp.zeros((1, length))))(jax.random.split(q))
+    return SoftActorCriticParams(q, self.policy_network.init(policy), jnp.zeros(()))
+
+  def q(self, q_params: Any, obs: Mapping[str, jax.Array], action: jax.Array) -> jax.Array:
+    """Values of both critics, [2, ...], for normalised observations and actions [..., action_size]."""
+    inputs = jnp.concatenate([obs[self.value_obs_key], action], axis=-1)
+    with self.at_precision():
+      return jax.vmap(self._critic.apply, (0, None))(q_params, inputs)[..., 0]  # pyright: ignore[reportIndexIssue, reportCallIssue, reportArgumentType]
+
+  def q_each(self, *evaluations: tuple[Any, Mapping[str, jax.Array], jax.Array]) -> tuple[jax.Array, ...]:
+    """`q` of several (parameters, observations, actions), all of the same shape."""
+    if not self.batched:
+      return tuple(self.q(*evaluation) for evaluation in evaluations)
+    return tuple(jax.vmap(self.q)(*jax.tree.map(lambda *x: jnp.stack(x), *evaluations)))
+
+  def sample(self, logits: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Actions in [-1, 1] and their log-probabilities, [...]; `noise` is standard normal, [..., action_size]."""
+    normal = self.distribution.create_dist(logits)
+    raw_action = normal.loc + normal.scale * noise
+    return self.distribution.postprocess(raw_action), self.distribution.log_prob(logits, raw_action)
 
 
 def normalize(obs: Mapping[str, jax.Array], normalizer: Normalizer | None) -> dict[str, jax.Array]:

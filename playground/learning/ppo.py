@@ -12,20 +12,17 @@ import jax
 import jax.numpy as jnp
 import optax
 from brax.training.acme import running_statistics
-from flax import struct
 from jax.flatten_util import ravel_pytree
-from jax.sharding import Mesh, NamedSharding
-from jax.sharding import PartitionSpec as P
+from jax.sharding import Mesh
 
-from playground.envs.base import Env, Observation, State
-from playground.envs.wrappers import ModelFields, wrap_for_training
+from playground.envs.base import Env
+from playground.envs.wrappers import ModelFields
 from playground.errors import ConfigError
-from playground.hardware.mesh import AXIS, jit_on_mesh
+from playground.hardware.mesh import AXIS
+from playground.learning.learner import SPEC, Learner, Metrics, TrainState, check_divisible, from_config
 from playground.learning.losses import Batch, ppo_loss
 from playground.learning.networks import ActorCritic, ActorCriticParams, NetworkConfig, Normalizer, normalize
 from playground.learning.rollout import NonfiniteCapture, repeat_unroll, unroll
-
-Metrics = dict[str, jax.Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,9 +55,8 @@ class PPOConfig:
 
   @classmethod
   def from_config(cls, config: Any) -> "PPOConfig":
-    """Builds it from the `agent` config (a mapping); `name` is not a hyperparameter."""
-    values = {k: v for k, v in dict(config).items() if k not in ("name", "network")}
-    return cls(**values, network=NetworkConfig(**dict(config["network"])))
+    """Builds it from the `agent` config (a mapping)."""
+    return from_config(cls, NetworkConfig, config)
 
   def steps_per_update(self, action_repeat: int) -> int:
     """Control steps of one training step, over all devices."""
@@ -73,38 +69,13 @@ class PPOConfig:
         f"agent.batch_size * agent.num_minibatches = {self.batch_size * self.num_minibatches} must be a multiple of "
         f"agent.num_envs={self.num_envs}, so that every environment gives the same number of trajectories."
       )
-    for name in ("num_envs", "num_eval_envs", "batch_size"):
-      if getattr(self, name) % num_devices:
-        size = getattr(self, name)
-        raise ConfigError(f"agent.{name}={size} must be a multiple of the number of devices, {num_devices}.")
+    check_divisible(self, num_devices)
 
 
-class Policy(struct.PyTreeNode):
-  """What acting needs (the critic comes along for runs that start from it)."""
+class PPO(Learner):
+  """The algorithm for one task."""
 
-  params: ActorCriticParams
-  normalizer: Normalizer
-
-
-class TrainState(struct.PyTreeNode):
-  """Everything training goes on from: a run restored from it ends with the same parameters, bit for bit.
-
-  `env_state` and `capture` are divided over the devices; the rest is the same on all of them.
-  """
-
-  params: ActorCriticParams
-  opt_state: optax.OptState
-  normalizer: Normalizer
-  key: jax.Array
-  env_state: State
-  capture: NonfiniteCapture
-
-
-TRAIN_STATE_SPEC = TrainState(params=P(), opt_state=P(), normalizer=P(), key=P(), env_state=P(AXIS), capture=P(AXIS))  # pyright: ignore[reportArgumentType]
-
-
-class PPO:
-  """The algorithm for one task: what `learning.loop.Learner` asks for, each function jitted over the mesh."""
+  Config = PPOConfig
 
   def __init__(self, env: Env, config: PPOConfig, mesh: Mesh, model: ModelFields, network_precision: str | None = None):
     """Args:
@@ -118,11 +89,8 @@ class PPO:
       ConfigError: sizes that do not divide, or networks that do not fit the task.
     """
     config.check(mesh.size)
-    self.config = config
-    self.mesh = mesh
-    self.env = wrap_for_training(env)
-    self.networks = ActorCritic(env.observation_size, env.action_size, config.network, network_precision)
-    self.steps_per_update = config.steps_per_update(env.action_repeat)
+    networks = ActorCritic(env.observation_size, env.action_size, config.network, network_precision)
+    super().__init__(env, config, mesh, networks, config.steps_per_update(env.action_repeat), TrainState(**SPEC))
     clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm else optax.identity()
     self.optimizer = optax.chain(clip, optax.adam(config.learning_rate))
     self.loss = partial(
@@ -137,42 +105,6 @@ class PPO:
       normalize_advantage=config.normalize_advantage,
       vf_loss_coefficient=config.vf_loss_coefficient,
     )
-    self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS)), TRAIN_STATE_SPEC)
-    self.reset = jit_on_mesh(self._reset, mesh, (TRAIN_STATE_SPEC, P(), P(AXIS)), TRAIN_STATE_SPEC, donate_argnums=0)
-    self.train = jit_on_mesh(
-      self._train, mesh, (TRAIN_STATE_SPEC, P(AXIS), P()), (TRAIN_STATE_SPEC, P()), donate_argnums=0
-    )
-    self.copy = jit_on_mesh(partial(jax.tree.map, jnp.copy), mesh, (TRAIN_STATE_SPEC,), TRAIN_STATE_SPEC)
-
-  def policy(self, state: TrainState) -> Policy:
-    """Normaliser and networks: what acting needs, and what a new run can start from."""
-    return Policy(state.params, state.normalizer)
-
-  def split(self, state: TrainState) -> tuple[Policy, TrainState]:
-    """Divides a state into what acting needs and the rest; `join` puts it together again."""
-    return self.policy(state), state.replace(params=None, normalizer=None)
-
-  def join(self, policy: Policy, rest: TrainState) -> TrainState:
-    return rest.replace(params=policy.params, normalizer=policy.normalizer)
-
-  def place(self, state: TrainState) -> TrainState:
-    """Puts a state's host arrays on the devices, each its share."""
-    shardings = jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), TRAIN_STATE_SPEC)
-    return jax.device_put(state, shardings, may_alias=False)
-
-  def with_policy(self, state: TrainState, policy: Policy) -> TrainState:
-    """A state that acts with `policy` (host arrays), all else unchanged."""
-    return self.join(self.place_policy(policy), state)
-
-  def place_policy(self, policy: Policy) -> Policy:
-    """Puts a policy's host arrays on every device."""
-    return jax.device_put(policy, NamedSharding(self.mesh, P()), may_alias=False)
-
-  def act(self, policy: Policy, obs: Observation, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
-    """Actions in [-1, 1], [..., action_size]; deterministic as `deterministic_eval` says if not given."""
-    normalizer = policy.normalizer if self.config.normalize_observations else None
-    deterministic = self.config.deterministic_eval if deterministic is None else deterministic
-    return self.networks.act(policy.params.policy, normalizer, obs, key, deterministic)
 
   def _init(self, key: jax.Array, model: ModelFields) -> TrainState:
     key, net_key, env_key = jax.random.split(key, 3)
@@ -186,29 +118,6 @@ class PPO:
       env_state=env_state,
       capture=NonfiniteCapture.empty(env_state, self.env.action_size, model),
     )
-
-  def _reset(self, state: TrainState, key: jax.Array, model: ModelFields) -> TrainState:
-    return state.replace(env_state=self._fresh(key, model))
-
-  def _fresh(self, key: jax.Array, model: ModelFields) -> State:
-    """Freshly reset environments: this device's share, with keys no other device has."""
-    key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
-    return self.env.reset(jax.random.split(key, self.config.num_envs // self.mesh.size), model)
-
-  def _train(self, state: TrainState, model: ModelFields, num_updates: jax.Array) -> tuple[TrainState, Metrics]:
-    """`num_updates` training steps; the number is an argument, so any number of them is one compiled program."""
-
-    training_step = jax.jit(self._training_step)  # so that asking for its shapes and calling it is one trace
-
-    def body(_: int, carry: tuple[TrainState, Metrics]) -> tuple[TrainState, Metrics]:
-      state, total = carry
-      state, metrics = training_step(state, model)
-      return state, jax.tree.map(jnp.add, total, metrics)
-
-    shapes = jax.eval_shape(training_step, state, model)[1]
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    state, total = jax.lax.fori_loop(0, num_updates, body, (state, zeros))
-    return state, self._report(total, num_updates)
 
   def _training_step(self, state: TrainState, model: ModelFields) -> tuple[TrainState, Metrics]:
     config = self.config
@@ -244,6 +153,10 @@ class PPO:
     (params, opt_state), losses = jax.lax.scan(one_pass, start, passes)
 
     metrics = jax.tree.map(lambda x: jax.lax.pmean(x.mean(), AXIS), losses) | jax.lax.psum(episodes, AXIS)
+    metrics["nonfinite_updates"] *= config.num_updates_per_batch * config.num_minibatches
+    metrics["learned"] = jnp.ones(())
+    farthest = jnp.stack([jnp.abs(entry).max() for entry in jax.tree.leaves(obs)]).max()
+    metrics["obs_farthest"] = jax.lax.pmax(farthest, AXIS)  # of any number from its mean, in standard deviations
     metrics["policy_std"] = jax.lax.pmean(self._mean_std(params, obs), AXIS)
     after = TrainState(
       params=params,
@@ -288,19 +201,3 @@ class PPO:
     """Mean standard deviation of the actor, before squashing, on the first step of the data."""
     logits = self.networks.logits(params.policy, jax.tree.map(lambda x: x[0], obs))
     return self.networks.distribution.create_dist(logits).scale.mean()
-
-  def _report(self, total: Metrics, num_updates: jax.Array) -> Metrics:
-    """Means over training steps and, for what ended, over episodes; counts stay counts."""
-    episodes = jnp.maximum(total["episodes"], 1)
-    report = {}
-    for name, value in total.items():
-      if name.startswith("episode_"):
-        short = {"episode_sum_reward": "episode_reward"}.get(name, name)
-        report[short] = value / episodes
-      elif name in ("episodes", "nonfinite"):
-        report[name] = value
-      elif name == "nonfinite_updates":
-        report[name] = value * (self.config.num_updates_per_batch * self.config.num_minibatches)
-      else:
-        report[name] = value / num_updates
-    return report

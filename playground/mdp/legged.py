@@ -11,6 +11,9 @@ import numpy as np
 
 from playground.envs.physics import PhysicsData, mjx
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.mdp.lookup import lookup
+
+STILL = 0.01  # a command whose norm is not above asks to stand still
 
 
 class LeggedRobot:
@@ -21,18 +24,21 @@ class LeggedRobot:
   Attributes:
     init_qpos: configuration of the keyframe, shape [nq].
     default_pose: its joint part, rad, shape [nu].
-    joint_range: (lower, upper) limits of the joints, rad, shape [2, nu].
+    joint_range: (lower, upper) limits of the joints, or of the targets of joints that have none, rad, shape [2, nu].
     root: id of the body that is pushed.
     base_site: id of the site that carries the inertial sensors.
     feet: ids of the foot sites, shape [feet].
+    pose_weights: how much each joint's distance from the default pose counts, shape [nu].
+    torque_limits: of the joints, N m, shape [nu].
   """
 
-  def __init__(self, mj_model: mujoco.MjModel, config: Any):
+  def __init__(self, mj_model: mujoco.MjModel, config: Any, parity: bool = False):
     """Looks the names up.
 
     Args:
       mj_model: the compiled scene.
       config: `env.robot`.
+      parity: whether its `parity`, if there is one, replaces `base_site` and `sensors`.
 
     Raises:
       UnknownNameError: the model has no object of that name.
@@ -41,24 +47,73 @@ class LeggedRobot:
     joints = [mujoco.mj_id2name(mj_model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
       raise ConfigError(f"env.robot.joints must name the model's joints in their order: {', '.join(joints)}.")
-    self.init_qpos = jnp.array(mj_model.key_qpos[_find(mj_model, "key", config.keyframe)])
+    self._mj_model = mj_model
+    self.init_qpos = self.keyframe(config.keyframe)
     self.default_pose = self.init_qpos[7:]
-    self.joint_range = jnp.array(mj_model.jnt_range[1:].T)
+    limited = mj_model.jnt_limited[1:, None].astype(bool)
+    self.joint_range = jnp.array(np.where(limited, mj_model.jnt_range[1:], mj_model.actuator_ctrlrange).T)
     self.root = _find(mj_model, "body", config.root)
-    self.base_site = _find(mj_model, "site", config.base_site)
+    replaced = config.parity if parity and "parity" in config else {}
+    self.base_site = _find(mj_model, "site", replaced.get("base_site", config.base_site))
     self.feet = np.array([_find(mj_model, "site", name) for name in config.feet])
-    self._sensors = {key: _address(mj_model, config.sensors[key]) for key in config.sensors}
+    sensors = {**config.sensors, **replaced.get("sensors", {})}
+    self._sensors = {key: _address(mj_model, name) for key, name in sensors.items()}
     self._foot_linvel = np.array([_address(mj_model, name) for name in config.foot_linvel])
     self._foot_contact = [np.concatenate([_address(mj_model, name) for name in foot]) for foot in config.foot_contact]
+    self._foot_force = np.array([_address(mj_model, name) for name in config.get("foot_force", ())])
     self._subtree = _subtree(mj_model, self.root)
+    self.pose_weights = tuple(config.get("pose_weights", [1.0] * len(joints)))
+    self.torque_limits = jnp.array(_torque_limits(mj_model))
+    order = {name: i for i, name in enumerate(joints)}
+    self._groups = {
+      group: np.array([lookup(order, name, f"env.robot.{group}") for name in config.get(group, ())], int)
+      for group in ("hips", "hip_rolls", "knees")
+    }
+    self._contacts = {
+      group: [_address(mj_model, name)[0] for name in config.get(group, ())]
+      for group in ("self_contact", "fatal_contact")
+    }
+    self._gaits = dict(config.get("gaits", {}))
+
+  def keyframe(self, name: str) -> jax.Array:
+    """Returns the configuration of a keyframe, shape [nq]; raises UnknownNameError if there is none of that name."""
+    return jnp.array(self._mj_model.key_qpos[_find(self._mj_model, "key", name)])
 
   def sensor(self, data: PhysicsData, key: str) -> jax.Array:
     """Returns the reading of the sensor that the robot's configuration has under `sensors.<key>`."""
-    return data.sensordata[self._sensors[key]]
+    return data.sensordata[lookup(self._sensors, key, "env.robot.sensors")]
+
+  def joints(self, group: str) -> np.ndarray:
+    """Returns the indices of the joints under `hips`, `hip_rolls` or `knees`; raises ConfigError if there are none."""
+    return self._present(group, self._groups[group])
+
+  def gait(self, name: str) -> list[float]:
+    """Returns the feet's phases at the start of a gait, rad; raises UnknownNameError if the robot has none of the name.
+
+    Raises:
+      ConfigError: it has not one phase for each foot.
+    """
+    phases = lookup(self._gaits, name, "env.gait.modes")
+    if len(phases) != len(self.feet):
+      raise ConfigError(f"env.robot.gaits.{name} must hold {len(self.feet)} phases, one for each foot.")
+    return list(phases)
 
   def feet_velocity(self, data: PhysicsData) -> jax.Array:
     """Returns the world velocities of the foot sites, m/s, shape [feet, 3]."""
     return data.sensordata[self._foot_linvel]
+
+  def feet_force(self, data: PhysicsData) -> jax.Array:
+    """Returns the force between each foot and its leg in the foot site's frame, N, shape [feet, 3]."""
+    return data.sensordata[self._present("foot_force", self._foot_force)]
+
+  def touching(self, data: PhysicsData, group: str) -> jax.Array:
+    """Returns which of the contacts under `self_contact` or `fatal_contact` there are, bool, shape [contacts]."""
+    return data.sensordata[np.array(self._present(group, self._contacts[group]))] > 0
+
+  def _present(self, key: str, found: Any) -> Any:
+    if len(found) == 0:
+      raise ConfigError(f"env.robot.{key} is empty or missing, but a reward or termination of env needs it.")
+    return found
 
   def contact(self, data: PhysicsData) -> jax.Array:
     """Returns whether each foot touches the floor, bool, shape [feet]: any of its contact sensors is above 0."""
@@ -76,9 +131,10 @@ class Context:
   Attributes:
     robot: the robot's fixed facts.
     data: the physics.
-    info: what the task carries, as it stood during the step: `command` (m/s, m/s, rad/s), `last_act` and
-      `last_last_act` (the two actions before `action`), `last_contact`; `feet_air_time` (s, shape [feet]) and
-      `swing_peak` (m, highest z of each foot since it last touched) already count this step.
+    info: what the task carries, as it stood during the step: `last_act`, and as far as the task has them
+      `last_last_act` (the two actions before `action`), `command` (m/s, m/s, rad/s), `last_contact`, `phase` (rad);
+      `feet_air_time` (s, shape [feet]) and `swing_peak` (m, highest z of each foot since it last touched) already
+      count this step.
     action: the action just applied, shape [nu].
     contact: which feet touch the floor, bool, shape [feet].
     first_contact: which of them were in the air before, bool, shape [feet].
@@ -96,9 +152,39 @@ class Context:
   def sensor(self, key: str) -> jax.Array:
     return self.robot.sensor(self.data, key)
 
+  def kept(self, name: str) -> jax.Array:
+    """Returns an entry of `info`.
+
+    Raises:
+      ConfigError: the task keeps none of that name.
+    """
+    if name not in self.info:
+      raise ConfigError(f"Something in env.obs or env.reward needs the {name!r} that this task does not keep.")
+    return self.info[name]
+
   @property
   def command(self) -> jax.Array:
-    return self.info["command"]
+    return self.kept("command")
+
+  @property
+  def commanded_speed(self) -> jax.Array:
+    """Norm of the command, its turning included: 0 is to stand still."""
+    return jnp.linalg.norm(self.command)
+
+  @property
+  def still(self) -> jax.Array:
+    """Whether the command is to stand still, bool."""
+    return self.commanded_speed <= STILL
+
+  @property
+  def phase(self) -> jax.Array:
+    """Phases of the feet in the gait, rad, shape [feet]."""
+    return self.kept("phase")
+
+  @property
+  def pose_error(self) -> jax.Array:
+    """Joint positions relative to the default pose, rad, shape [nu]."""
+    return self.joint_pos - self.robot.default_pose
 
   @property
   def joint_pos(self) -> jax.Array:
@@ -114,6 +200,16 @@ class Context:
   def gravity(self) -> jax.Array:
     """Direction of gravity in the frame of the base site, shape [3]."""
     return -self.data.site_xmat[self.robot.base_site][2]
+
+  @property
+  def base_height(self) -> jax.Array:
+    """World z of the base site, m."""
+    return self.data.site_xpos[self.robot.base_site, 2]
+
+  @property
+  def forward(self) -> jax.Array:
+    """The base site's forward axis in the world frame, shape [3]."""
+    return self.data.site_xmat[self.robot.base_site][:, 0]
 
   @property
   def feet_height(self) -> jax.Array:
@@ -146,6 +242,13 @@ def _find(mj_model: mujoco.MjModel, kind: str, name: str) -> int:
 def _address(mj_model: mujoco.MjModel, sensor: str) -> np.ndarray:
   index = _find(mj_model, "sensor", sensor)
   return mj_model.sensor_adr[index] + np.arange(mj_model.sensor_dim[index])
+
+
+def _torque_limits(mj_model: mujoco.MjModel) -> np.ndarray:
+  """What bounds each torque: the servo's range of forces, or the joint's; infinite where nothing does."""
+  servo = np.where(mj_model.actuator_forcelimited, mj_model.actuator_forcerange[:, 1], np.inf)
+  joint = np.where(mj_model.jnt_actfrclimited[1:], mj_model.jnt_actfrcrange[1:, 1], np.inf)
+  return np.minimum(servo, joint)
 
 
 def _subtree(mj_model: mujoco.MjModel, root: int) -> np.ndarray:

@@ -3,15 +3,18 @@
 from collections.abc import Mapping
 
 import jax
+import numpy as np
+
+Amplitude = float | np.ndarray  # one for all elements of a channel, or one for each
 
 
-def uniform_noise(key: jax.Array, clean: jax.Array, amplitude: float) -> jax.Array:
+def uniform_noise(key: jax.Array, clean: jax.Array, amplitude: Amplitude) -> jax.Array:
   """Returns `clean` plus independent U[-amplitude, amplitude) on every element."""
-  return clean if amplitude == 0 else clean + amplitude * (2 * jax.random.uniform(key, clean.shape) - 1)
+  return clean if not np.any(amplitude) else clean + amplitude * (2 * jax.random.uniform(key, clean.shape) - 1)
 
 
 def add_noise(
-  rng: jax.Array, clean: Mapping[str, jax.Array], amplitudes: Mapping[str, float]
+  rng: jax.Array, clean: Mapping[str, jax.Array], amplitudes: Mapping[str, Amplitude]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   """Adds uniform noise to each channel from its own key.
 

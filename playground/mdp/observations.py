@@ -24,7 +24,12 @@ def gravity(c: Context) -> jax.Array:
 
 def joint_pos(c: Context) -> jax.Array:
   """Joint positions relative to the default pose, rad [nu]."""
-  return c.joint_pos - c.robot.default_pose
+  return c.pose_error
+
+
+def joint_angle(c: Context) -> jax.Array:
+  """Joint positions as they are, rad [nu]."""
+  return c.joint_pos
 
 
 def joint_vel(c: Context) -> jax.Array:
@@ -39,7 +44,7 @@ def linvel(c: Context) -> jax.Array:
 
 def last_act(c: Context) -> jax.Array:
   """The action before the one just applied [nu]."""
-  return c.info["last_act"]
+  return c.kept("last_act")
 
 
 def command(c: Context) -> jax.Array:
@@ -57,6 +62,31 @@ def global_angvel(c: Context) -> jax.Array:
   return c.sensor("global_angvel")
 
 
+def upvector(c: Context) -> jax.Array:
+  """The base's upward axis in the world frame [3]: unlike `gravity`, it turns with the heading."""
+  return c.sensor("upvector")
+
+
+def base_height(c: Context) -> jax.Array:
+  """World z of the base site, m [1]."""
+  return c.base_height[None]
+
+
+def root_height(c: Context) -> jax.Array:
+  """World z of the root joint, m [1]."""
+  return c.data.qpos[2:3]
+
+
+def root_pos(c: Context) -> jax.Array:
+  """World position of the root joint, m [3]."""
+  return c.data.qpos[:3]
+
+
+def root_quat(c: Context) -> jax.Array:
+  """Orientation of the root joint, a quaternion w, x, y, z [4]."""
+  return c.data.qpos[3:7]
+
+
 def actuator_force(c: Context) -> jax.Array:
   """Joint torques, N m [nu]."""
   return c.data.actuator_force
@@ -64,7 +94,12 @@ def actuator_force(c: Context) -> jax.Array:
 
 def last_contact(c: Context) -> jax.Array:
   """Which feet touched the floor in the step before, 0 or 1 [feet]."""
-  return c.info["last_contact"].astype(jnp.float32)
+  return c.kept("last_contact").astype(jnp.float32)
+
+
+def contact(c: Context) -> jax.Array:
+  """Which feet touch the floor, 0 or 1 [feet]."""
+  return c.contact.astype(jnp.float32)
 
 
 def feet_velocity(c: Context) -> jax.Array:
@@ -74,7 +109,12 @@ def feet_velocity(c: Context) -> jax.Array:
 
 def feet_air_time(c: Context) -> jax.Array:
   """How long each foot has been in the air, s [feet]."""
-  return c.info["feet_air_time"]
+  return c.kept("feet_air_time")
+
+
+def phase(c: Context) -> jax.Array:
+  """Cosines of the feet's phases in the gait, then their sines [2 * feet]."""
+  return jnp.concatenate([jnp.cos(c.phase), jnp.sin(c.phase)])
 
 
 def push_force(c: Context) -> jax.Array:
@@ -84,13 +124,16 @@ def push_force(c: Context) -> jax.Array:
 
 def pushed(c: Context) -> jax.Array:
   """Whether a push is under way, 0 or 1 [1]."""
-  return (c.info["steps_since_last_pert"] >= c.info["steps_until_next_pert"]).astype(jnp.float32)[None]
+  if "push" in c.info:
+    return c.info["push"].any().astype(jnp.float32)[None]
+  return (c.kept("steps_since_last_pert") >= c.kept("steps_until_next_pert")).astype(jnp.float32)[None]
 
 
 OBSERVATIONS: dict[str, Callable[[Context], jax.Array]] = {
   f.__name__: f
   for f in (
-    gyro, gravity, joint_pos, joint_vel, linvel, last_act, command, accelerometer, global_angvel, actuator_force,
-    last_contact, feet_velocity, feet_air_time, push_force, pushed,
+    gyro, gravity, joint_pos, joint_vel, linvel, last_act, command, accelerometer, global_angvel, upvector,
+    joint_angle, base_height, root_height, root_pos, root_quat, actuator_force, last_contact, contact, feet_velocity,
+    feet_air_time, phase, push_force, pushed,
   )
 }  # fmt: skip

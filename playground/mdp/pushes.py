@@ -1,11 +1,89 @@
-"""Pushes against a robot's body, and when they come."""
+"""Pushes against a robot's body, and when they come: forces for a while (kicks), or jumps of its velocity."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
 
+from playground.envs.physics import PhysicsData
+from playground.mdp.lookup import lookup
+
 Info = dict[str, Any]
+
+
+class Pushes(Protocol):
+  """Disturbs the physics before a step.
+
+  Attributes:
+    keys: names of the random keys that `start` needs.
+  """
+
+  keys: ClassVar[tuple[str, ...]]
+
+  def start(self, keys: Mapping[str, jax.Array], mass: jax.Array) -> Info:
+    """Returns the entries of `info` that an episode starts with; `mass` (kg) is what is pushed."""
+    ...
+
+  def act(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
+    """Returns the disturbed physics, and the entries of `info` that changed."""
+    ...
+
+
+class Kicks:
+  """Forces on the root body for a short while, from time to time (see `kick_force`)."""
+
+  keys: ClassVar[tuple[str, ...]] = ("push_interval", "push_duration", "push_velocity")
+
+  def __init__(self, config: Any, root: int, dt: float):
+    self._config, self._root, self._dt = config, root, dt
+
+  def start(self, keys: Mapping[str, jax.Array], mass: jax.Array) -> Info:
+    info = sample_kicks(jnp.stack([keys[name] for name in self.keys]), self._config, self._dt)
+    return info | ({"pert_mass": mass} if self._config.enable else {})
+
+  def act(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
+    if not self._config.enable:
+      return data, {}
+    force, changed = advance_kick(info, info["pert_mass"], self._dt)
+    return data.replace(xfrc_applied=data.xfrc_applied.at[self._root, :3].set(force)), changed
+
+
+class Jumps:
+  """Jumps of the base's horizontal velocity, at one interval in an episode, each in a direction of its own."""
+
+  keys: ClassVar[tuple[str, ...]] = ("push_interval",)
+
+  def __init__(self, config: Any, root: int, dt: float):
+    del root
+    self._config, self._dt = config, dt
+
+  def start(self, keys: Mapping[str, jax.Array], mass: jax.Array) -> Info:
+    del mass
+    low, high = self._config.interval
+    interval = jax.random.uniform(keys["push_interval"], minval=low, maxval=high)
+    return {
+      "push": jnp.zeros(2),  # direction of a jump in this step, else 0
+      "push_step": jnp.zeros((), jnp.int32),
+      "push_interval_steps": jnp.round(interval / self._dt).astype(jnp.int32),
+    }
+
+  def act(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
+    rng, angle_key, size_key = jax.random.split(info["rng"], 3)
+    angle = jax.random.uniform(angle_key, maxval=2 * jnp.pi)
+    low, high = self._config.velocity
+    size = jax.random.uniform(size_key, minval=low, maxval=high)
+    step = info["push_step"] + 1
+    due = (step % info["push_interval_steps"] == 0) & self._config.enable
+    push = jnp.array([jnp.cos(angle), jnp.sin(angle)]) * due
+    data = data.replace(qvel=data.qvel.at[:2].add(push * size))
+    return data, {"rng": rng, "push": push, "push_step": step}
+
+
+def make_pushes(config: Any, root: int, dt: float) -> Pushes:
+  """Builds the pushes that `env.pushes.kind` names; `root` is the id of the body that a kick acts on."""
+  kinds: dict[str, type[Kicks | Jumps]] = {"kick": Kicks, "jump": Jumps}
+  return lookup(kinds, config.kind, "env.pushes.kind")(config, root, dt)
 
 
 def sample_kicks(keys: jax.Array, config: Any, dt: float) -> Info:
@@ -45,7 +123,7 @@ def kick_force(time: jax.Array, mass: jax.Array, velocity: jax.Array, duration: 
   return 0.5 * jnp.sin(jnp.pi * time / duration) * mass * velocity / duration
 
 
-def advance_kick(info: Info, mass: jax.Array, dt: float) -> tuple[jax.Array, Info]:
+def advance_kick(info: Mapping[str, Any], mass: jax.Array, dt: float) -> tuple[jax.Array, Info]:
   """Moves the kicks one control step on.
 
   While the interval runs nothing happens; when it is over a horizontal direction is drawn and the kick starts with the

@@ -1,53 +1,92 @@
-"""Reward terms of legged robots, and DM Control's `tolerance` (in `tolerance.py`).
+"""Reward terms of legged robots, and how they are chosen, weighed and added up.
 
 A term is a function of a `Context` and of the keys of `env.reward` that its keyword arguments name; a new one is a
-function here and a weight in `env.reward.scales`. Formulas are those of Playground 0.2.0, on which the published
+function here (the base's motion), in `joints.py`, `feet.py` or `stances.py`, and a weight in `env.reward.scales`. A
+weight's name is the function's, unless `env.reward.functions` names another: tasks share names such as `orientation`
+(and so what is logged) and mean different things. Formulas are those of Playground 0.2.0, on which the published
 weights were tuned; where the paper (appendix "Locomotion", reward functions) writes another, the term says so.
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from playground.errors import ConfigError, nearest
+from playground.mdp.feet import FEET
+from playground.mdp.joints import JOINTS
 from playground.mdp.legged import Context
 from playground.mdp.lookup import lookup
+from playground.mdp.stances import STANCES
 
-STILL = 0.01  # a command whose norm is below asks to stand still
 Term = Callable[[Context], jax.Array]
 
+# The reward from the sums of weighted terms of positive and of negative weight; times the control step.
+TOTALS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+  "sum": lambda gain, cost: gain + cost,
+  "product": lambda gain, cost: gain * jnp.exp(0.2 * cost),
+}
 
-def bind(config: Any, functions: Mapping[str, Callable[..., jax.Array]]) -> dict[str, tuple[float, Term]]:
+
+def bind(
+  config: Any,
+  functions: Mapping[str, Callable[..., jax.Array]],
+  *,
+  parity: bool = False,
+  facts: Mapping[str, Any] | None = None,
+) -> dict[str, tuple[float, Term]]:
   """Chooses and parametrises terms.
 
   Args:
-    config: `env.reward`: `scales` (weight by name) and the terms' parameters.
-    functions: the terms to choose from, by name.
+    config: `env.reward`: `scales` (weight by name), the terms' parameters; where terms are not the functions of their
+      names `functions` and `parity_functions` (function's name by term), and where they do not always count
+      `when_moving` and `when_still` (norm of the command by term: above, or below, it the term counts, else it is 0).
+    functions: the functions to choose from, by name.
+    parity: whether `parity_functions` replace others: Playground 0.2.0's slips.
+    facts: parameters that are not in `config`, by name.
 
   Returns:
     (weight, term) by name, without those of weight 0.
 
   Raises:
-    UnknownNameError: a weight for a term that does not exist.
+    UnknownNameError: a weight for a term that does not exist, or a function that does not.
     ConfigError: a term's parameter is missing.
   """
+  facts = facts or {}
+  chosen = {name: name for name in config.scales}
+  for key, counts in (("functions", True), ("parity_functions", parity)):
+    for name, function in dict(config.get(key, {})).items():
+      lookup(chosen, name, f"env.reward.{key}")
+      lookup(functions, function, f"env.reward.{key}.{name}")
+      chosen[name] = function if counts else chosen[name]
+  gates = {key: dict(config.get(key, {})) for key in ("when_moving", "when_still")}
+  for key, gated in gates.items():
+    for name in gated:
+      lookup(chosen, name, f"env.reward.{key}")
   bound = {}
   for name in config.scales:
-    function = lookup(functions, name, "env.reward.scales")
+    function = lookup(functions, chosen[name], "env.reward.scales")
     parameters = {}
     for parameter in list(inspect.signature(function).parameters)[1:]:
-      if parameter not in config:
+      if parameter not in facts and parameter not in config:
         raise ConfigError(f"env.reward.{parameter} is missing: term {name!r} needs it.{nearest(parameter, config)}")
-      parameters[parameter] = config[parameter]
-    bound[name] = (config.scales[name], _with_parameters(function, parameters))
+      parameters[parameter] = facts[parameter] if parameter in facts else config[parameter]
+    bounds = gates["when_moving"].get(name), gates["when_still"].get(name)
+    bound[name] = (config.scales[name], _term(function, parameters, *bounds))
   return {name: (weight, term) for name, (weight, term) in bound.items() if weight != 0}
 
 
-def _with_parameters(function: Callable[..., jax.Array], parameters: dict[str, Any]) -> Term:
-  return lambda c: function(c, **parameters)
+def _term(
+  function: Callable[..., jax.Array], parameters: dict[str, Any], above: float | None, below: float | None
+) -> Term:
+  def term(c: Context) -> jax.Array:
+    value = function(c, **parameters)
+    value = value if above is None else value * (c.commanded_speed > above)
+    return value if below is None else value * (c.commanded_speed < below)
+
+  return term
 
 
 def tracking_lin_vel(c: Context, tracking_sigma: float) -> jax.Array:
@@ -61,9 +100,24 @@ def tracking_ang_vel(c: Context, tracking_sigma: float) -> jax.Array:
   return jnp.exp(-jnp.square(c.command[2] - c.sensor("gyro")[2]) / tracking_sigma)
 
 
+def tracking(c: Context, tracking_sigma: float) -> jax.Array:
+  """`tracking_lin_vel` + 0.5 `tracking_ang_vel`."""
+  return tracking_lin_vel(c, tracking_sigma) + 0.5 * tracking_ang_vel(c, tracking_sigma)
+
+
 def lin_vel_z(c: Context) -> jax.Array:
   """v_z², v the base's velocity in the world frame."""
   return jnp.square(c.sensor("global_linvel")[2])
+
+
+def lin_vel_z_local(c: Context) -> jax.Array:
+  """v_z², v the base's velocity in its own frame."""
+  return jnp.square(c.sensor("linvel")[2])
+
+
+def lin_vel_z_with_torso(c: Context) -> jax.Array:
+  """v_z² of the base plus that of the torso, in the world frame."""
+  return lin_vel_z(c) + jnp.square(c.sensor("torso_linvel")[2])
 
 
 def ang_vel_xy(c: Context) -> jax.Array:
@@ -71,36 +125,45 @@ def ang_vel_xy(c: Context) -> jax.Array:
   return jnp.square(c.sensor("global_angvel")[:2]).sum()
 
 
+def ang_vel_xy_local(c: Context) -> jax.Array:
+  """w_x² + w_y², w the gyro's reading."""
+  return jnp.square(c.sensor("gyro")[:2]).sum()
+
+
+def ang_vel_xy_of_torso(c: Context) -> jax.Array:
+  """w_x² + w_y², w the torso's angular velocity in the world frame."""
+  return jnp.square(c.sensor("torso_angvel")[:2]).sum()
+
+
 def orientation(c: Context) -> jax.Array:
   """up_x² + up_y², up the base's upward axis in the world frame."""
   return jnp.square(c.sensor("upvector")[:2]).sum()
 
 
-def dof_pos_limits(c: Context, soft_limit_factor: float) -> jax.Array:
-  """Sum over joints of how far q lies outside the soft limits: the range shrunk about its centre by the factor."""
-  lower, upper = c.robot.joint_range
-  centre, reach = (lower + upper) / 2, (upper - lower) / 2 * soft_limit_factor
-  return _outside(c.joint_pos, centre - reach, centre + reach)
+def orientation_as(c: Context, upvector_target: Sequence[float]) -> jax.Array:
+  """|up - target|², up the base's upward axis in the world frame. (Paper: `orientation`.)"""
+  return jnp.square(c.sensor("upvector") - jnp.array(upvector_target)).sum()
 
 
-def dof_pos_limits_scaled(c: Context, soft_limit_factor: float) -> jax.Array:
-  """As `dof_pos_limits`, with the limits themselves times the factor.
-
-  Playground 0.2.0's Go1 joystick. It widens a range at any limit whose sign is the inner side's: the Go1's knee may go
-  up to -0.844, where the hard limit is -0.888.
-  """
-  lower, upper = c.robot.joint_range * soft_limit_factor
-  return _outside(c.joint_pos, lower, upper)
+def base_height(c: Context, base_height_target: float) -> jax.Array:
+  """(z - target)², z the root joint's, world frame."""
+  return jnp.square(c.data.qpos[2] - base_height_target)
 
 
-def _outside(x: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
-  return (jnp.maximum(lower - x, 0) + jnp.maximum(x - upper, 0)).sum()
+def collision(c: Context) -> jax.Array:
+  """1 while the robot's parts touch each other as its `self_contact` lists."""
+  return c.robot.touching(c.data, "self_contact").any().astype(jnp.float32)
 
 
-def pose(c: Context, pose_weights: list[float] | None) -> jax.Array:
-  """exp(-sum_j weight_j (q_j - default_j)²); None weighs all joints 1. (Paper: no weights, exp(-|q - default|²).)"""
-  error = jnp.square(c.joint_pos - c.robot.default_pose)
-  return jnp.exp(-(error if pose_weights is None else error * jnp.array(pose_weights)).sum())
+def alive(c: Context) -> jax.Array:
+  """1 in every step."""
+  del c
+  return jnp.ones(())
+
+
+def alive_until_done(c: Context) -> jax.Array:
+  """1 in every step but the one that terminates the episode."""
+  return 1.0 - termination(c)
 
 
 def termination(c: Context) -> jax.Array:
@@ -108,58 +171,9 @@ def termination(c: Context) -> jax.Array:
   return c.done.astype(jnp.float32)
 
 
-def stand_still(c: Context) -> jax.Array:
-  """Sum |q - default| while the command is to stand still. (Paper: k |command_xy|.)"""
-  return jnp.abs(c.joint_pos - c.robot.default_pose).sum() * (jnp.linalg.norm(c.command) < STILL)
-
-
-def torques(c: Context) -> jax.Array:
-  """|tau|_2 + |tau|_1. (Paper: |tau|².)"""
-  return jnp.linalg.norm(c.data.actuator_force) + jnp.abs(c.data.actuator_force).sum()
-
-
-def action_rate(c: Context) -> jax.Array:
-  """|action - last action|²."""
-  return jnp.square(c.action - c.info["last_act"]).sum()
-
-
-def energy(c: Context) -> jax.Array:
-  """Sum |qd_j| |tau_j|, W. (Paper: |qd * tau|.)"""
-  return (jnp.abs(c.joint_vel) * jnp.abs(c.data.actuator_force)).sum()
-
-
-def feet_clearance(c: Context, max_foot_height: float) -> jax.Array:
-  """Sum over feet of |z - height| sqrt(|v_xy|): a moving foot should be at swing height. (Paper: (z - height)².)"""
-  speed = jnp.linalg.norm(c.feet_velocity[:, :2], axis=-1)
-  return (jnp.abs(c.feet_height - max_foot_height) * jnp.sqrt(speed)).sum()
-
-
-def feet_height(c: Context, max_foot_height: float) -> jax.Array:
-  """Sum over feet that touch down of (peak / height - 1)², peak the highest z of the swing; 0 when standing."""
-  error = jnp.square(c.info["swing_peak"] / max_foot_height - 1)
-  return (error * c.first_contact).sum() * _moving(c)
-
-
-def feet_slip(c: Context) -> jax.Array:
-  """Sum over feet in contact of |v_xy|²; 0 when standing."""
-  return (jnp.square(c.feet_velocity[:, :2]).sum(axis=-1) * c.contact).sum() * _moving(c)
-
-
-def feet_air_time(c: Context, min_air_time: float) -> jax.Array:
-  """Sum over feet that touch down of air time - min, s; 0 when standing. (Paper: clipped to [0, max - min].)"""
-  return ((c.info["feet_air_time"] - min_air_time) * c.first_contact).sum() * _moving(c)
-
-
-def _moving(c: Context) -> jax.Array:
-  return jnp.linalg.norm(c.command) > STILL
-
-
-REWARDS: dict[str, Callable[..., jax.Array]] = {
-  f.__name__: f
-  for f in (
-    tracking_lin_vel, tracking_ang_vel, lin_vel_z, ang_vel_xy, orientation, dof_pos_limits, pose, termination,
-    stand_still, torques, action_rate, energy, feet_clearance, feet_height, feet_slip, feet_air_time,
-  )
-}  # fmt: skip
-# Playground 0.2.0's slips, for `env.parity=true`.
-PARITY_REWARDS = REWARDS | {"dof_pos_limits": dof_pos_limits_scaled}
+_BASE = (
+  tracking_lin_vel, tracking_ang_vel, tracking, lin_vel_z, lin_vel_z_local, lin_vel_z_with_torso, ang_vel_xy,
+  ang_vel_xy_local, ang_vel_xy_of_torso, orientation, orientation_as, base_height, collision, alive, alive_until_done,
+  termination,
+)  # fmt: skip
+REWARDS: dict[str, Callable[..., jax.Array]] = {f.__name__: f for f in _BASE} | JOINTS | FEET | STANCES

@@ -1,8 +1,12 @@
-"""Reasons to end an episode. A new one is a function here and its name and threshold in `env.termination`."""
+"""Reasons to end an episode. A new one is a function here and its name and threshold in `env.termination`.
+
+A threshold of null switches the reason off.
+"""
 
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 
 from playground.mdp.legged import Context
 
@@ -12,4 +16,25 @@ def fall(c: Context, threshold: float) -> jax.Array:
   return c.sensor("upvector")[2] < threshold
 
 
-TERMINATIONS: dict[str, Callable[[Context, float], jax.Array]] = {"fall": fall}
+def power(c: Context, threshold: float) -> jax.Array:
+  """The motors' power, sum |tau_j qd_j|, is above `threshold` W. Paper: 400 W, then down to 200 W."""
+  return jnp.abs(c.data.actuator_force * c.joint_vel).sum() > threshold
+
+
+def joint_limits(c: Context, threshold: float) -> jax.Array:
+  """Some joint is more than `threshold` rad outside its range."""
+  lower, upper = c.robot.joint_range
+  return ((c.joint_pos < lower - threshold) | (c.joint_pos > upper + threshold)).any()
+
+
+def fatal_contact(c: Context, threshold: float) -> jax.Array:
+  """More than `threshold` of the contacts between the robot's parts that its `fatal_contact` names."""
+  return c.robot.touching(c.data, "fatal_contact").sum() > threshold
+
+
+TERMINATIONS: dict[str, Callable[[Context, float], jax.Array]] = {
+  "fall": fall,
+  "power": power,
+  "joint_limits": joint_limits,
+  "fatal_contact": fatal_contact,
+}

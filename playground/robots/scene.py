@@ -1,57 +1,95 @@
 """Scenes: one robot's MJCF, the ground it stands on, and what lights it.
 
-A robot's file (`robots/<name>/<name>.xml`) holds the robot alone, written as it stands when only its feet collide. Two
-conventions let this file work for all of them: collision geoms of default class `full` belong to the full collision
-variants only, and the robot is the first body of the world.
+A robot's file (`robots/<name>/<name>.xml`) holds the robot alone, written as it stands when only its feet collide, and
+the solver's options. A few conventions let this file work for all of them:
+
+- the robot is the first body of the world;
+- collision geoms of default class `full` belong to the full collision variants only;
+- default class `floor` says how the ground touches (friction, priority, masks; without it, as MuJoCo's geoms do), and
+  `floor_rough`, if there is one, how a height field does; contact pairs and sensors may name the geom `floor`;
+- a keyframe `<name>_rough` takes the place of `<name>` where bumps of 0.05 m may lie under the feet.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 
-from playground.errors import UnknownNameError, nearest
+from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.robots.terrain import TERRAINS, add_terrain
 
 ROBOTS = Path(__file__).parent
 
 # Contacts MJX's JAX implementation keeps with self-collision (the closest ones); C MuJoCo and Warp ignore these.
 _SELF_COLLISION_LIMITS = {"max_contact_points": 30, "max_geom_pairs": 12}
 
+# Height of the bumps that the robots' own `_rough` keyframes clear, m.
+_ROUGH = 0.05
+
+
+def configured_scene(config: Any) -> mujoco.MjSpec:
+  """Returns the scene that a task's config describes under `robot` and `scene` (and `parity`).
+
+  `scene` holds `terrain`, `collision` and, under a terrain's name, that terrain's parameters. With `parity`, rough
+  ground is white noise, as in Playground 0.2.0.
+  """
+  scene, robot = config.scene, config.robot
+  parameters = {name: dict(scene[name]) for name in TERRAINS if name in scene}
+  terrain = "white_noise" if config.parity and scene.terrain == "rough" else scene.terrain
+  return build_scene(
+    robot.name,
+    terrain=terrain,
+    parameters=parameters.get(terrain, {}),
+    collision=scene.collision,
+    floor_contacts=tuple(robot.floor_contacts),
+  )
+
 
 def build_scene(
-  robot: str, *, terrain: str = "flat", collision: str = "feet", floor_contacts: Sequence[str] = ()
+  robot: str,
+  *,
+  terrain: str = "flat",
+  parameters: Mapping[str, Any] | None = None,
+  collision: str = "feet",
+  floor_contacts: Sequence[str] = (),
 ) -> mujoco.MjSpec:
   """Puts a robot on a terrain.
 
   Args:
     robot: folder of `playground/robots`, e.g. `go1`.
     terrain: a key of `TERRAINS`. Its ground is geom 0, named `floor`.
+    parameters: of the terrain, by name.
     collision: a key of `COLLISIONS`.
     floor_contacts: geoms that get a contact sensor `<geom>_floor_found` (above 0 while the geom touches the floor),
-      in this order, after the robot's own sensors.
+      in this order, after the robot's own sensors, but before the first of contacts between its parts and what follows.
 
   Returns:
     The scene, to edit further or `compile()`.
 
   Raises:
-    UnknownNameError: no such robot, terrain, collision variant or geom.
+    UnknownNameError: no such robot, terrain, parameter, collision variant or geom.
+    ConfigError: a parameter's value that cannot be, or a collision variant that the robot has no geoms for.
   """
   known = [path.stem for path in sorted(ROBOTS.glob("*/*.xml")) if path.stem == path.parent.name]
   _check("robot", robot, known)
-  _check("terrain", terrain, TERRAINS)
   _check("collision", collision, COLLISIONS)
   spec = mujoco.MjSpec.from_file(str(ROBOTS / robot / f"{robot}.xml"))
+  if collision != "feet" and not _full_geoms(spec):
+    raise ConfigError(f"collision={collision}: robot={robot} has geoms for the feet only, choose collision=feet.")
   COLLISIONS[collision](spec)
   _add_studio(spec)
-  TERRAINS[terrain](spec)
+  _set_keyframes(spec, add_terrain(spec, terrain, parameters or {}))
+  if terrain != "flat":
+    _round_cylinders(spec)
   geoms = [geom.name for geom in spec.geoms if geom.name]
   for name in floor_contacts:
     _check("floor_contacts", name, geoms)
-    _add_floor_contact(spec, name)
+  add_floor_contacts(spec, floor_contacts)
   return spec
 
 
-def _check(key: str, name: str, known: Sequence[str] | dict[str, Callable]) -> None:
+def _check(key: str, name: str, known: Sequence[str] | Mapping[str, Any]) -> None:
   if name not in known:
     raise UnknownNameError(f"{key}={name!r} is unknown: choose from {', '.join(known)}.{nearest(name, known)}")
 
@@ -87,32 +125,51 @@ def _activate(spec: mujoco.MjSpec, contype: int) -> None:
     geom.contype, geom.conaffinity = contype, 1
 
 
-def _flat(spec: mujoco.MjSpec) -> None:
-  """An infinite plane. Priority 1: its friction and condim count, not the robot's."""
-  spec.worldbody.add_geom(
-    name="floor",
-    type=mujoco.mjtGeom.mjGEOM_PLANE,
-    size=[0, 0, 0.01],
-    contype=1,
-    conaffinity=0,
-    condim=3,
-    priority=1,
-    friction=[0.6, 0.005, 0.0001],
-    material="groundplane",
-  )
+def _set_keyframes(spec: mujoco.MjSpec, peak: float) -> None:
+  """Lifts keyframes above the ground's highest point where robots start, `peak` m."""
+  lift = {key.name: peak for key in spec.keys}
+  for key in list(spec.keys):
+    name = key.name.removesuffix("_rough")
+    if name == key.name:
+      continue
+    if peak > 0:
+      spec.key(name).qpos, lift[name] = key.qpos, max(0.0, peak - _ROUGH)
+    spec.delete(key)
+  for key in spec.keys:
+    key.qpos[2] += lift[key.name]
 
 
-def _add_floor_contact(spec: mujoco.MjSpec, geom: str) -> None:
-  """Sensor: number of contacts found (data=found, reduce=mindist, num=1, so 0 or 1) between a geom and the floor."""
-  spec.add_sensor(
-    name=f"{geom}_floor_found",
-    type=mujoco.mjtSensor.mjSENS_CONTACT,
-    objtype=mujoco.mjtObj.mjOBJ_GEOM,
-    objname=geom,
-    reftype=mujoco.mjtObj.mjOBJ_GEOM,
-    refname="floor",
-    intprm=[1, 1, 1],
-  )
+def _round_cylinders(spec: mujoco.MjSpec) -> None:
+  """Rounds off the ends of cylinders that collide: MJX on JAX knows no contact of a cylinder with a height field."""
+  for geom in spec.geoms:
+    if geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER and (geom.contype or geom.conaffinity):
+      geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
+
+
+def add_floor_contacts(spec: mujoco.MjSpec, geoms: Sequence[str]) -> None:
+  """Adds contact sensors `<geom>_floor_found` to a scene, before those that it has.
+
+  They give the number of contacts found (data=found, reduce=mindist, num=1, so 0 or 1) between each geom and the floor.
+  """
+  sensors = list(spec.sensors)
+  contacts = [i for i, sensor in enumerate(sensors) if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT]
+  after = sensors[contacts[0] :] if contacts else []
+  keys = ("name", "type", "objtype", "objname", "reftype", "refname", "intprm")
+  moved = [{key: getattr(sensor, key) for key in keys} for sensor in after]
+  for sensor in after:
+    spec.delete(sensor)
+  for geom in geoms:
+    spec.add_sensor(
+      name=f"{geom}_floor_found",
+      type=mujoco.mjtSensor.mjSENS_CONTACT,
+      objtype=mujoco.mjtObj.mjOBJ_GEOM,
+      objname=geom,
+      reftype=mujoco.mjtObj.mjOBJ_GEOM,
+      refname="floor",
+      intprm=[1, 1, 1],
+    )
+  for sensor in moved:
+    spec.add_sensor(**sensor)
 
 
 def _add_studio(spec: mujoco.MjSpec) -> None:
@@ -160,4 +217,3 @@ COLLISIONS: dict[str, Callable[[mujoco.MjSpec], None]] = {
   "full_floor": _full_floor,
   "full_self": _full_self,
 }
-TERRAINS: dict[str, Callable[[mujoco.MjSpec], None]] = {"flat": _flat}

@@ -40,6 +40,10 @@ class Interrupts:
     if self.signum is not None:
       raise Interrupted(self.signum)
 
+  def stop_saving(self) -> None:
+    """What there was is saved; a signal that was a flag until now stays one."""
+    self.saving = False
+
   def _handle(self, signum: int, frame: FrameType | None) -> None:
     again, self.signum = self.signum is not None, signum
     if not self.saving or again:

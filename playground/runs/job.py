@@ -2,6 +2,7 @@
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,8 @@ import numpy as np
 from playground.envs.base import Env
 from playground.errors import PlaygroundError
 from playground.learning.checkpoints import CheckpointStore, checksum
-from playground.learning.loop import Learner, Loop, Metrics
+from playground.learning.learner import Learner
+from playground.learning.loop import Loop, Metrics
 from playground.rendering.video import render_video
 from playground.runs.interrupts import Interrupts
 from playground.runs.nonfinite import write_dump
@@ -57,6 +59,7 @@ class Job:
     self._video: Future[Path | None] | None = None
     self._earlier_s = start.wall_clock_s
     self._began = time.perf_counter()
+    self._process_began_s = start.began_s
     self._evaluations = 0
     self._step = start.step or 0
     self._recording: Any = None
@@ -86,7 +89,7 @@ class Job:
     self._advance_trace(metrics)
     self._check_numbers(step, taken, metrics, capture)
 
-  def on_save(self, update: int, step: int, state: Any) -> None:
+  def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
     policy, rest = self._learner.split(state)
     meta = {
       "update": update,
@@ -94,7 +97,7 @@ class Job:
       "wall_clock_s": self.wall_clock_s,
       "config": self._config.resolved,
     }
-    self._store.save(step, policy, rest, meta)
+    self._store.save(step, policy, rest, meta, None if final else partial(self._learner.experience, state))
 
   def should_stop(self) -> bool:
     return self._interrupts.signum is not None
@@ -107,7 +110,7 @@ class Job:
     if wanted and self._recording is not None:
       self._progress.phase("rendering the video")
       self._start_video(self._step, self._recording)
-    policy, _ = self._learner.split(state)
+    policy = self._learner.policy(state)
     wall_clock_s = self.wall_clock_s
     if self._video:
       self._video.result()
@@ -163,7 +166,7 @@ class Job:
       return
     if not self._rates:
       after_first = (taken - self._learner.steps_per_update) / rate
-      self._start_to_first_update_s = process_age_s() - after_first
+      self._start_to_first_update_s = process_age_s() - self._process_began_s - after_first
     self._rates.append(rate)
 
   def _start_video(self, step: int, recording: Any) -> None:

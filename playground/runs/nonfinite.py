@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from playground.envs.base import Env, State
-from playground.envs.wrappers import MAX_VALUE
+from playground.envs.wrappers import MAX_VALUE, MAX_VELOCITY
 from playground.errors import CheckpointError
 from playground.learning.rollout import NonfiniteCapture
 from playground.runs.files import replacing
@@ -74,8 +74,8 @@ def nonfinite_fields(tree: Any) -> list[str]:
   """Names of the leaves that hold a NaN, infinity or value beyond the guard's limit, with how many."""
   lines = []
   for name, leaf in _named(tree):
-    values = np.asarray(leaf)
-    bad = ~(np.abs(values) <= MAX_VALUE) if np.issubdtype(values.dtype, np.floating) else np.zeros(1, bool)
+    values, limit = np.asarray(leaf), MAX_VELOCITY if name.endswith("qvel") else MAX_VALUE
+    bad = ~(np.abs(values) <= limit) if np.issubdtype(values.dtype, np.floating) else np.zeros(1, bool)
     if bad.any():
       lines.append(f"{name}: {int(bad.sum())} of {values.size}")
   return lines

@@ -1,7 +1,10 @@
-"""Learning curves of one run, drawn from its metrics.csv."""
+"""Learning curves of one run or chain, drawn from its metrics.csv."""
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from playground.runs.files import replacing
 
@@ -15,8 +18,8 @@ def plot_learning_curve(metrics_csv: str | Path, out_dir: str | Path) -> list[Pa
   """Draws the evaluation return (mean ± standard deviation over episodes) over steps and over wall-clock time.
 
   Args:
-    metrics_csv: needs columns `step` and `eval/episode_reward`; `eval/episode_reward_std` adds the band and
-      `time/wall_clock_s` (seconds) the second picture.
+    metrics_csv: needs columns `step` and `eval/episode_reward`; `eval/episode_reward_std` adds the band,
+      `time/wall_clock_s` (seconds) the second picture and `stage` (names) a line where each stage begins.
     out_dir: made if needed.
 
   Returns:
@@ -30,7 +33,7 @@ def plot_learning_curve(metrics_csv: str | Path, out_dir: str | Path) -> list[Pa
   table = pd.read_csv(metrics_csv, on_bad_lines="skip")
   if "eval/episode_reward" not in table:
     return []
-  table = table.dropna(subset=["eval/episode_reward"]).sort_values("step")
+  table = table.dropna(subset=["eval/episode_reward"]).sort_values("step", kind="stable")
   out_dir.mkdir(parents=True, exist_ok=True)
   written = []
   for name, (column, label) in _AXES.items():
@@ -52,10 +55,21 @@ def _draw(rows: Any, column: str, label: str, path: Path) -> None:
     x, label = x / seconds, f"{label} ({unit})"
   figure = Figure(figsize=(7, 4.2), layout="constrained")
   axes = figure.subplots()
-  if "eval/episode_reward_std" in rows:
-    std = rows["eval/episode_reward_std"].fillna(0).to_numpy(float)
-    axes.fill_between(x, mean - std, mean + std, color="tab:blue", alpha=0.18, linewidth=0, label="± std")
-  axes.plot(x, mean, color="tab:blue", linewidth=1.8, marker="o", markersize=3.5, label="mean")
+  std = rows["eval/episode_reward_std"].fillna(0).to_numpy(float) if "eval/episode_reward_std" in rows else None
+  names = rows["stage"].to_numpy(str) if "stage" in rows else np.full(len(rows), "")
+  begins = [0, *np.flatnonzero(names[1:] != names[:-1]) + 1, len(rows)]
+  for begin, end in pairwise(begins):  # a line each, since stages need not be paid the same way
+    part, first = slice(begin, end), begin == 0
+    if std is not None:
+      low, high = (mean - std)[part], (mean + std)[part]
+      shade = "± std" if first else None
+      axes.fill_between(x[part], low, high, color="tab:blue", alpha=0.18, linewidth=0, label=shade)
+    line = "mean" if first else None
+    axes.plot(x[part], mean[part], color="tab:blue", linewidth=1.8, marker="o", markersize=3.5, label=line)
+    if names[begin]:
+      axes.axvline(x[begin], color="0.5", linewidth=0.9, linestyle="--", zorder=1)
+      place: Any = {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points", "ha": "left", "va": "top"}
+      axes.annotate(str(names[begin]), (x[begin], 1), (3, -3), rotation=90, fontsize=8, color="0.35", **place)
   axes.set_xlabel(label)
   axes.set_ylabel("evaluation return")
   axes.set_title(f"last {mean[-1]:.1f}   best {mean.max():.1f}", loc="right", fontsize=9, color="0.35")

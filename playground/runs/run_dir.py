@@ -5,15 +5,16 @@ import datetime
 import itertools
 import os
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import yaml
 from ml_collections import ConfigDict
 
-from playground.errors import CheckpointError, nearest
+from playground.errors import CheckpointError, PlaygroundError, nearest
 from playground.runs.files import plain, read_json, write_json, write_text
+from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
 
 RunStatus = Literal["running", "finished", "failed", "preempted"]
@@ -45,19 +46,29 @@ class RunDirectory:
     Raises:
       CheckpointError: the folder already holds a run (unless numbered), or cannot be made.
     """
+    run = cls.claim(path, numbered)
+    run.write_config(config, overrides)
+    return run
+
+  @classmethod
+  def claim(cls, path: str | Path, numbered: bool = False) -> "RunDirectory":
+    """Makes the folder, as `create` does; it is a run only once `write_config` has been called."""
     run = cls(path)
     if not numbered:
       run.must_be_new()
-    try:
+    with _writing(run.path):
       if numbered:
         run = cls(_make_new(run.path))
       run.path.mkdir(parents=True, exist_ok=True)
-      write_text(run.overrides_path, yaml.safe_dump(list(overrides), sort_keys=False))
-      # Last, because this file is what makes the folder a run: a creation cut short can simply be repeated.
-      write_text(run.config_path, yaml.safe_dump(plain(config), sort_keys=False))
-    except OSError as error:
-      raise CheckpointError(f"run_dir={run.path} cannot be written: {error.strerror}.") from error
     return run
+
+  def write_config(self, config: Mapping[str, Any] | ConfigDict, overrides: Sequence[str] = ()) -> None:
+    """Writes the resolved `config` and the command line's `overrides`; raises CheckpointError if it cannot."""
+    with _writing(self.path):
+      self.path.mkdir(parents=True, exist_ok=True)
+      write_text(self.overrides_path, yaml.safe_dump(list(overrides), sort_keys=False))
+      # Last, because this file is what makes the folder a run: a creation cut short can simply be repeated.
+      write_text(self.config_path, yaml.safe_dump(plain(config), sort_keys=False))
 
   @classmethod
   def open(cls, path: str | Path) -> "RunDirectory":
@@ -161,9 +172,38 @@ class RunDirectory:
     content = {"status": status, "reason": reason, "pid": os.getpid(), "started": started, "updated": _now()}
     write_json(self.path / "status.json", content)
 
+  @contextlib.contextmanager
+  def recorded(self) -> Iterator[None]:
+    """Keeps `status.json` true, whatever ends the block; a block that ends well has written the summary."""
+    self.set_status("running")
+    try:
+      yield
+    except Interrupted as interrupt:
+      self.set_status("preempted", f"{interrupt}, without a last checkpoint; resume={self.path} continues")
+      raise
+    except PlaygroundError as error:
+      self.set_status("failed", str(error))
+      raise
+    except BaseException as error:
+      self.set_status("failed", f"{type(error).__name__}: {error}")
+      raise
+    if self.summary["status"] == "finished":
+      self.set_status("finished")
+    else:
+      self.set_status("preempted", f"interrupted and saved; resume={self.path} continues")
+
   def write_summary(self, summary: Mapping[str, Any]) -> None:
     """Writes the run's result, which sweeps and tables read."""
     write_json(self.path / "summary.json", summary)
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+  """Says in one sentence what the operating system has against a folder."""
+  try:
+    yield
+  except OSError as error:
+    raise CheckpointError(f"run_dir={path} cannot be written: {error.strerror}.") from error
 
 
 def _make_new(path: Path) -> Path:

@@ -8,7 +8,7 @@ import jax
 
 from playground.errors import CheckpointError
 from playground.learning.checkpoints import Checkpoint, find_checkpoints
-from playground.learning.loop import Learner
+from playground.learning.learner import Learner
 from playground.runs.run_dir import RunDirectory
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ class Start:
     update: training steps done in it.
     wall_clock_s: time the run had taken by then.
     policy: restored weights (host arrays) for a new run.
+    began_s: age of the process when the run's turn came.
   """
 
   run_dir: RunDirectory | None = None
@@ -39,9 +40,10 @@ class Start:
   step: int | None = None
   wall_clock_s: float = 0.0
   policy: Any = None
+  began_s: float = 0.0
 
   @classmethod
-  def find(cls, config: "RunConfig") -> Self:
+  def find(cls, config: "RunConfig", began_s: float = 0.0) -> Self:
     """Looks up what `resume`, `init_from` and `run_dir` name.
 
     Raises:
@@ -49,12 +51,14 @@ class Start:
     """
     if config.resume is not None:
       run_dir = RunDirectory.open(config.resume)
-      start = cls(run_dir=run_dir)
+      start = cls(run_dir=run_dir, began_s=began_s)
       try:
         start.checkpoints = find_checkpoints(config.resume)
       except CheckpointError:
-        start.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
-        weights = run_dir.config["init_from"]  # which `config`, being that of a resumed run, no longer says
+        if run_dir.status:  # else a chain made it, and has only now come to it
+          start.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
+        # A resumed run's `config` says this only for a chain, which may have been moved.
+        weights = config.init_from or run_dir.config["init_from"]
         start.weights = Checkpoint(find_checkpoints(weights)[0]) if weights else None
       return start
     assert config.run_dir is not None, "composing names one"
@@ -69,32 +73,33 @@ class Start:
     """Whether the resumed run has nothing left to do."""
     return self.run_dir is not None and self.run_dir.status.get("status") == "finished"
 
-  def restore(self, learner: Learner, model: Any) -> None:
-    """Reads what there is to restore, checked against the learner's shapes, before anything is compiled.
+  def restore(self, learner: Learner, name: str, model: Any) -> None:
+    """Reads what there is to restore, checked against the algorithm and its shapes, before anything is compiled.
 
     Raises:
       CheckpointError: no checkpoint is whole and fits.
     """
     if not self.checkpoints and self.weights is None:
       return
-    template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), model)
-    policy, rest = learner.split(template)
     if self.weights is not None:
-      self.policy = self.weights.restore("policy", policy)
+      theirs = self.weights.meta["config"]["agent"]["name"]
+      if theirs != name:
+        raise CheckpointError(f"{self.weights.path} was trained by {theirs}: agent={name} cannot start from it.")
+      self.policy = self.weights.restore("policy", learner.policy_shape())
       source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
       self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is fresh.")
       return
+    template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), model)
     for path in self.checkpoints:
       try:
         checkpoint = Checkpoint(path)
-        state = learner.join(checkpoint.restore("policy", policy), checkpoint.restore("state", rest))
+        self.state, notice = learner.restore(checkpoint, template)
       except CheckpointError as error:
         if path == self.checkpoints[-1]:
           raise
         self.notices.append(f"{error} Falling back to the checkpoint before it.")
         continue
-      self.state = learner.place(state)
       self.update, self.step = checkpoint.meta["update"], checkpoint.step
       self.wall_clock_s = checkpoint.meta["wall_clock_s"]
-      self.notices.append(f"Resuming the whole training state of {path} ({self.step:,} steps).")
+      self.notices.append(notice)
       return

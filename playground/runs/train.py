@@ -2,19 +2,18 @@
 
 import contextlib
 import math
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import jax
 
 from playground import registry
 from playground.envs.base import Env
-from playground.errors import PlaygroundError
 from playground.hardware.setup import setup
+from playground.learning.algorithms import algorithm
 from playground.learning.evaluation import make_evaluator
 from playground.learning.loop import Loop, compile_program, schedule
-from playground.learning.ppo import PPO, PPOConfig
 from playground.randomization import Randomizer
+from playground.runs.chain import train_chain
 from playground.runs.interrupts import Interrupted, Interrupts, exit_code
 from playground.runs.job import Job
 from playground.runs.progress import Progress
@@ -29,7 +28,7 @@ ROWS = 100  # rows of metrics.csv that a run aims at: a call to the device is ab
 
 
 def train(config: "RunConfig") -> int:
-  """Runs the training that `config` describes.
+  """Runs the training that `config` describes, a single run or a chain of them.
 
   Returns:
     The exit code: 0 when finished, 130 or 143 when interrupted (and saved).
@@ -39,31 +38,34 @@ def train(config: "RunConfig") -> int:
   """
   with Interrupts() as interrupts:
     try:
-      return _train(config, interrupts)
+      return train_chain(config, interrupts, _train) if config.stages else _train(config, interrupts)
     except Interrupted as interrupt:
       print(f"Interrupted by {interrupt}.")
       return exit_code(interrupt.signum)
 
 
-def _train(config: "RunConfig", interrupts: Interrupts) -> int:
-  start = Start.find(config)
+def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) -> int:
+  """One run; `began_s` is the age of the process by then, 0 for its first."""
+  start = Start.find(config, began_s)
   if start.finished:
     print(f"{config.resume} is finished: nothing to resume (init_from={config.resume} trains on from its weights).")
     return 0
   hardware = setup(config.hardware)
-  agent = PPOConfig.from_config(config.agent)
+  algorithm_class = algorithm(config.agent.name)
+  agent = algorithm_class.Config.from_config(config.agent)
   agent.check(hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
   model, eval_model = randomized_models(env, config, agent.num_envs, agent.num_eval_envs)
-  learner = PPO(env, agent, hardware.mesh, model, hardware.network_precision)
-  start.restore(learner, model)
+  learner = algorithm_class(env, agent, hardware.mesh, model, hardware.network_precision)
+  start.notices += learner.notices()
+  start.restore(learner, config.agent.name, model)
 
   num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
   marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
   run_dir = start.run_dir or RunDirectory.create(
     str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
   )
-  with recorded(run_dir), Progress(num_updates * learner.steps_per_update) as progress:
+  with run_dir.recorded(), Progress(num_updates * learner.steps_per_update) as progress:
     notes = [] if not env.parity else ["env.parity=true: playground 0.2.0 bug for bug"]
     run_dir.write_manifest(
       seed=config.seed, task=config.choices["env"], impl=env.impl, task_notes=notes, **hardware.facts
@@ -74,7 +76,8 @@ def _train(config: "RunConfig", interrupts: Interrupts) -> int:
     num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
     evaluate = make_evaluator(env, learner.act, agent.num_eval_envs, hardware.mesh, num_recorded)
     program = compile_program(learner, evaluate, model, eval_model)
-    timings = {"start_to_compiled_s": process_age_s(), "trace_s": program.trace_s, "compile_s": program.compile_s}
+    to_compiled_s = process_age_s() - began_s
+    timings = {"start_to_compiled_s": to_compiled_s, "trace_s": program.trace_s, "compile_s": program.compile_s}
     run_dir.update_manifest(timings=timings)
 
     job = Job(config, run_dir, env, learner, progress, interrupts, start)
@@ -100,27 +103,6 @@ def randomized_models(
   train_key, eval_key = jax.random.split(jax.random.fold_in(jax.random.PRNGKey(config.seed), 1))
   draw = jax.jit(randomizer.sample_batch)
   return draw(jax.random.split(train_key, num_envs)), draw(jax.random.split(eval_key, num_eval_envs))
-
-
-@contextlib.contextmanager
-def recorded(run_dir: RunDirectory) -> Iterator[None]:
-  """Keeps `status.json` true, whatever ends the block; a block that ends well has written the summary."""
-  run_dir.set_status("running")
-  try:
-    yield
-  except Interrupted as interrupt:
-    run_dir.set_status("preempted", f"{interrupt}, without a last checkpoint; resume={run_dir.path} continues")
-    raise
-  except PlaygroundError as error:
-    run_dir.set_status("failed", str(error))
-    raise
-  except BaseException as error:
-    run_dir.set_status("failed", f"{type(error).__name__}: {error}")
-    raise
-  if run_dir.summary["status"] == "finished":
-    run_dir.set_status("finished")
-  else:
-    run_dir.set_status("preempted", f"interrupted and saved; resume={run_dir.path} continues")
 
 
 def _say_where(run_dir: RunDirectory) -> None:

@@ -16,17 +16,9 @@ from playground.cli.main import main
 from playground.config import compose
 from playground.learning.checkpoints import find_checkpoints
 from playground.runs.train import train
-from tests.dummy import PointTask
+from tests.dummy import Point
 
 Command = Callable[..., int]
-
-
-class Point(PointTask):
-  """The task without physics, as far as a run needs more of it than its trainer does."""
-
-  mj_model: Any = None  # pyright: ignore[reportIncompatibleVariableOverride]
-  impl = "jax"
-  parity = False
 
 
 @pytest.fixture(autouse=True)

@@ -81,6 +81,7 @@ def test_resumes(command: Command, trained: list[RunConfig], tmp_path: Path, cap
     (["--cfg", "job"], ["num_envs: 256\n", "num_timesteps: 6000000\n"]),
     (["agent.num_timesteps=2e6", "--cfg", "job", "agent.num_envs=64"], ["num_envs: 64\n", "num_timesteps: 2000000\n"]),
     (["env=CartpoleBalance", "--cfg", "job", "--package", "agent"], ["num_envs: 2048\n"]),
+    (["experiment=go1_joystick_chain", "--cfg", "job"], ["stages:\n    slow_turns:\n", "    rough:\n"]),
     (["--help"], ["hardware: auto, cpu, gpu", "num_envs: 256\n"]),
     (["--info", "searchpath"], ["configs"]),
   ],

@@ -17,6 +17,7 @@ import numpy as np
 import playground
 from playground.envs.base import Env, State
 from playground.envs.dm_control.suite import SuiteTask
+from playground.envs.locomotion.joystick import Joystick
 from playground.envs.locomotion.stand import Stand
 from playground.envs.physics import STATE_FIELDS
 
@@ -27,8 +28,19 @@ _OVERRIDES = {
   "noise_config.level": "noise.level",
   "obs_noise.level": "noise.level",
   "pert_config.enable": "pushes.enable",
+  "push_config.enable": "pushes.enable",
 }
-_UNREAD_INFO = {SuiteTask: {"info/rng", "info/time_out"}, Stand: {"info/step"}}  # upstream has it, nothing reads it
+_UNREAD_INFO = {  # upstream has it, nothing reads it
+  SuiteTask: {"info/rng", "info/time_out"},
+  Stand: {"info/step"},
+  Joystick: {"info/step", "info/motor_targets", "info/filtered_linvel", "info/filtered_angvel"},
+}
+_NOT_UPSTREAM = {  # what our general classes carry, and some of upstream's tasks do not
+  Joystick: {
+    *("info/gait", "info/gait_freq", "info/last_last_act"),
+    *("info/feet_air_time", "info/swing_peak", "info/last_contact", "metrics/swing_peak"),
+  },
+}
 _PROGRAMS: dict[Any, Any] = {}  # compiled physics by structure of the model and fields that are kept
 BATCH = 8  # T of all recordings
 KEYS = jnp.stack([jax.random.PRNGKey(seed) for seed in range(BATCH)])
@@ -57,7 +69,6 @@ class Golden:
 
   Attributes:
     env: the task.
-    first: its own state after reset from PRNGKey(0).
     states: the recorded states, leading axis T + 1.
     actions: shape [T, action_size].
   """
@@ -72,16 +83,23 @@ class Golden:
     for key in self._arrays.keys() & _ROWS.keys():
       self._arrays[key] = self._our_rows(self._arrays[key], _ROWS[key], header["model"])
     self.actions = jnp.array(self._arrays.pop("action"))
-    self.first: State = jax.tree.map(lambda x: x[0], jax.vmap(self.env.reset)(KEYS))
-    self.states: State = jax.tree_util.tree_map_with_path(self._recorded, self.first)
+    self._ours = jax.eval_shape(self.env.reset, KEYS[0])
+    self.states: State = jax.tree_util.tree_map_with_path(self._recorded, self._ours)
 
-  def _recorded(self, path: tuple[Any, ...], ours: jax.Array) -> jax.Array:
+  @functools.cached_property
+  def first(self) -> State:
+    """The task's own state after reset from PRNGKey(0)."""
+    return jax.tree.map(lambda x: x[0], jax.vmap(self.env.reset)(KEYS))
+
+  def _recorded(self, path: tuple[Any, ...], ours: jax.ShapeDtypeStruct) -> jax.Array:
     name = _name(path)
+    shape = (len(self.actions) + 1, *ours.shape)
     if name in self._arrays:
-      return jnp.array(self._arrays[name])
+      return jnp.array(self._arrays[name]).reshape(shape)  # one number upstream may be a list of one
     # Recordings leave out state that is empty or all zero. Anything else that we have, upstream had.
-    assert name.startswith("data/") and name.removeprefix("data/") in STATE_FIELDS, f"{name} was not recorded"
-    return jnp.broadcast_to(ours, (len(self.actions) + 1, *ours.shape))
+    state = name.startswith("data/") and name.removeprefix("data/") in STATE_FIELDS
+    assert state or name in _of_class(_NOT_UPSTREAM, self.env), f"{name} was not recorded"
+    return jnp.zeros(shape, ours.dtype)
 
   def _our_rows(self, recorded: np.ndarray, kind: str, names: Mapping[str, list[Any]]) -> np.ndarray:
     """Sensors or sites in our model's order; NaN for those not recorded, so that reading one shows."""
@@ -98,8 +116,8 @@ class Golden:
 
   def missing(self) -> list[str]:
     """What was recorded and the task does not have, except unread data and metrics that are zero throughout."""
-    ours = {_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(self.first)[0]}
-    unread = next((names for task, names in _UNREAD_INFO.items() if isinstance(self.env, task)), set())
+    ours = {_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(self._ours)[0]}
+    unread = _of_class(_UNREAD_INFO, self.env)
     return [
       name
       for name, values in self._arrays.items()
@@ -108,17 +126,25 @@ class Golden:
       and not (name.startswith("metrics/") and not values.any())
     ]
 
+  def pairs(self, actual: State, expected: State) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """The recorded leaves of two states as (name, actual, expected), NaN where nothing was recorded.
+
+    Floats are in double precision.
+    """
+    unrecorded = {name for name in _of_class(_NOT_UPSTREAM, self.env) if name not in self._arrays}
+    leaves = jax.tree_util.tree_flatten_with_path(actual)[0]
+    for (path, a), b in zip(leaves, jax.tree.leaves(expected), strict=True):
+      if _name(path) not in unrecorded:
+        theirs = np.asarray(b, np.float64)
+        yield _name(path), np.where(np.isnan(theirs), np.nan, np.asarray(a, np.float64)), theirs
+
+
+def _of_class(table: Mapping[type, set[str]], env: Env) -> set[str]:
+  return next((names for task, names in table.items() if isinstance(env, task)), set())
+
 
 def _name(path: tuple[Any, ...]) -> str:
   return "/".join(str(getattr(key, "name", getattr(key, "key", key))) for key in path)
-
-
-def pairs(actual: State, expected: State) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-  """The leaves of two states as (name, actual, expected), floats in double precision, NaN where nothing was recorded."""
-  leaves = jax.tree_util.tree_flatten_with_path(actual)[0]
-  for (path, a), b in zip(leaves, jax.tree.leaves(expected), strict=True):
-    expected = np.asarray(b, np.float64)
-    yield _name(path), np.where(np.isnan(expected), np.nan, np.asarray(a, np.float64)), expected
 
 
 @functools.cache

@@ -95,7 +95,8 @@ def test_kick_changes_the_base_velocity(kicked: Joystick, start: State, step) ->
 
 def test_metrics_are_the_weighted_terms(start: State, kicked: Joystick) -> None:
   scales = kicked.config.reward.scales
-  assert set(start.metrics) == {f"reward/{name}" for name in scales} | {"swing_peak"}
+  in_use = {name for name in scales if scales[name] != 0}
+  assert set(start.metrics) == {f"reward/{name}" for name in in_use} | {"swing_peak"}
   default = jax.vmap(kicked.evaluate)(start.data, start.info, jnp.zeros((4, 12)))
   double = load_task(TASK, {"reward.scales.orientation": 2 * scales.orientation, "reward.clip": [-1e4, 1e4]})
   other = jax.vmap(double.evaluate)(start.data, start.info, jnp.zeros((4, 12)))
@@ -127,6 +128,9 @@ def test_any_robot_can_be_named() -> None:
   [
     ({"obs.state": ["gyros"]}, r"env\.obs\.state: 'gyros' is unknown.*Did you mean 'gyro'\?"),
     ({"command.sampler": "wlak"}, r"env\.command\.sampler: 'wlak' is unknown.*Did you mean 'walk'\?"),
+    ({"gait.modes": ["trott"]}, r"env\.gait\.modes: 'trott' is unknown.*Did you mean 'trot'\?"),
+    ({"reset.draw_order": [["yow"]]}, r"env\.reset\.draw_order: 'yow' is unknown.*Did you mean 'yaw'\?"),
+    ({"reward.total": "product_"}, r"env\.reward\.total: 'product_' is unknown.*Did you mean 'product'\?"),
     ({"scene.terrain": "flatt"}, r"'flatt' is unknown.*Did you mean 'flat'\?"),
     ({"robot.base_site": "imuu"}, r"the site 'imuu'.*Did you mean 'imu'\?"),
     ({"robot.sensors.gyro": "gyroo"}, r"the sensor 'gyroo'.*Did you mean 'gyro'\?"),
@@ -155,6 +159,19 @@ def test_unknown_entries(kicked: Joystick, section: str, entry: tuple[str, float
     node[entry[0]] = entry[1]
   with pytest.raises(UnknownNameError, match=message):
     Joystick(config)
+
+
+def test_what_is_not_kept_cannot_be_observed() -> None:
+  env = load_task(TASK, {"obs.state": ["gyro", "phase"]})
+  with pytest.raises(ConfigError, match="needs the 'phase' that this task does not keep"):
+    _ = env.observation_size
+  assert load_task(TASK, {"obs.state": ["gyro", "phase"], "gait.modes": ["trot"]}).observation_size["state"] == (11,)
+
+
+def test_rewards_need_what_they_are_about() -> None:
+  env = load_task(TASK, {"reward.scales.collision": -1.0})
+  with pytest.raises(ConfigError, match=r"env\.robot\.self_contact is empty or missing"):
+    jax.eval_shape(env.step, shapes(env), jnp.zeros(12))
 
 
 def test_joints_in_another_order(kicked: Joystick) -> None:

@@ -34,8 +34,8 @@ class Counting(PointTask):
 
 
 @cache
-def stack(full_reset: bool = False, repeat: int = 1, die_at: int | None = None, nan_at: int | None = None) -> Any:
-  env = Counting(die_at=die_at, episode_length=LENGTH, action_repeat=repeat, nan_at=nan_at)
+def stack(full_reset: bool = False, repeat: int = 1, **events: int) -> Any:
+  env = Counting(episode_length=LENGTH, action_repeat=repeat, **events)
   wrapped = wrappers.wrap_for_training(env, full_reset=full_reset)
   return jax.jit(wrapped.reset), jax.jit(wrapped.step)
 
@@ -110,3 +110,11 @@ def test_a_nan_ends_the_episode_and_goes_no_further(full_reset: bool) -> None:
   assert np.isnan(bad.info["nonfinite_state"]["qpos"]).any()
   for leaf in jax.tree.leaves((bad.obs, bad.reward, bad.metrics, bad.data.qpos, bad.info["episode_metrics"])):
     assert np.isfinite(leaf).all()
+
+
+def test_an_absurd_velocity_counts_as_not_finite() -> None:
+  states = roll(3, fast_at=2)
+  assert [int(s.info["nonfinite"].sum()) for s in states[:3]] == [0, 0, N]
+  np.testing.assert_array_equal(states[2].done, 1)
+  np.testing.assert_array_equal(states[2].reward, 0)
+  np.testing.assert_array_equal(jnp.abs(states[2].data.qvel) < wrappers.MAX_VELOCITY, True)

@@ -15,30 +15,29 @@ from playground.hardware.setup import setup
 
 TWO_DEVICES = """
 import jax, numpy as np
-from playground.hardware.mesh import make_mesh
 from playground.learning.evaluation import make_evaluator
-from playground.learning.networks import NetworkConfig
-from playground.learning.ppo import PPO, PPOConfig
-from tests.dummy import SMALL, PointTask
+from tests.dummy import SMALL_PPO, SMALL_SAC, PointTask, point_learner
 
 assert jax.device_count() == 2
-config = PPOConfig(**SMALL, network=NetworkConfig((16, 16), (16, 16)))
-mesh = make_mesh(2)
-env = PointTask()
-learner = PPO(env, config, mesh, {})
-state = learner.init(jax.random.PRNGKey(0), {})
-state, metrics = learner.train(state, {}, np.int32(30))
-for leaf in jax.tree.leaves((state.params, state.opt_state, state.normalizer)):
-  ours, theirs = (np.asarray(shard.data) for shard in leaf.addressable_shards)
-  np.testing.assert_array_equal(ours, theirs)
-first, second = (np.asarray(shard.data) for shard in state.env_state.data.qpos.addressable_shards)
-assert first.shape == second.shape == (8, 2)
-assert not np.isin(first, second).any(), "devices must not live the same lives"
-count = state.normalizer.count
-assert int(count.hi) == 0 and int(count.lo) == 30 * learner.steps_per_update
-scores, recording = make_evaluator(env, learner.act, 16, mesh, 1)(learner.policy(state), jax.random.PRNGKey(1), {})
-assert float(scores["episode_length"]) == 20 and recording["qpos"].shape == (20, 2, 2)
-assert float(scores["episode_reward"]) > -12, scores["episode_reward"]
+for config in (SMALL_PPO, SMALL_SAC):
+  learner = point_learner(config, num_devices=2)
+  state = learner.init(jax.random.PRNGKey(0), {})
+  state, metrics = learner.train(state, {}, np.int32(30))
+  for leaf in jax.tree.leaves((state.params, state.opt_state, state.normalizer)):
+    ours, theirs = (np.asarray(shard.data) for shard in leaf.addressable_shards)
+    np.testing.assert_array_equal(ours, theirs)
+  first, second = (np.asarray(shard.data) for shard in state.env_state.data.qpos.addressable_shards)
+  assert first.shape == second.shape == (8, 2)
+  assert not np.isin(first, second).any(), "devices must not live the same lives"
+  count = state.normalizer.count
+  assert int(count.hi) == 0 and int(count.lo) == 30 * learner.steps_per_update
+  evaluate = make_evaluator(PointTask(), learner.act, 16, learner.mesh, 1)
+  scores, recording = evaluate(learner.policy(state), jax.random.PRNGKey(1), {})
+  assert float(scores["episode_length"]) == 20 and recording["qpos"].shape == (20, 2, 2)
+  assert float(scores["episode_reward"]) > -12 or config is SMALL_SAC, scores["episode_reward"]
+
+first, second = (np.asarray(shard.data) for shard in state.replay.data.addressable_shards)
+assert first.shape == (31, 8, 17) and (first[:30] != 0).any() and not (first[:30, :, :2] == second[:30, :, :2]).any()
 """
 
 

@@ -1,4 +1,6 @@
-"""Statistics of the command sampler and of how long a command lasts."""
+"""Statistics of the command samplers and of how long a command lasts."""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -7,10 +9,10 @@ import pytest
 from ml_collections import ConfigDict
 
 from playground.errors import UnknownNameError
-from playground.mdp.commands import Walk, exponential_steps, make_sampler
+from playground.mdp.commands import Box, Walk, exponential_steps, make_sampler, make_timer
 
 KEYS = jax.random.split(jax.random.PRNGKey(0), 20_000)
-WALK = Walk(max=(1.5, 0.8, 1.2), nonzero_probability=(0.9, 0.25, 0.5), change_probability=0.4)
+WALK = Walk(min=(-1.5, -0.8, -1.2), max=(1.5, 0.8, 1.2), nonzero_probability=(0.9, 0.25, 0.5), change_probability=0.4)
 
 
 def test_first_command_fills_the_range() -> None:
@@ -36,8 +38,45 @@ def test_durations_are_exponential() -> None:
   np.testing.assert_allclose([steps.mean(), steps.std()], 250, rtol=0.03)
 
 
-def test_make_sampler() -> None:
-  keys = {"max": [1.0, 2.0, 3.0], "nonzero_probability": [1.0, 1.0, 1.0], "change_probability": 0.5}
-  assert make_sampler(ConfigDict({"sampler": "walk", **keys})) == Walk((1.0, 2.0, 3.0), (1.0, 1.0, 1.0), 0.5)
+def test_a_box_is_drawn_anew_or_zero() -> None:
+  box = Box(min=(-1.0, 0.0, 0.5), max=(1.0, 0.0, 2.0), zero_probability=0.3, deadband=0.2)
+  commands = np.asarray(jax.vmap(box.next, (0, None))(KEYS, jnp.full(3, 9.0)))
+  still = (commands == 0).all(1)
+  np.testing.assert_allclose(still.mean(), 0.3, atol=0.02)
+  x, y, yaw = commands[~still].T
+  assert not y.any()
+  np.testing.assert_allclose([x.min(), x.max(), yaw.min(), yaw.max()], [-1, 1, 0.5, 2], atol=1e-2)
+  np.testing.assert_allclose((x == 0).mean(), 0.2, atol=0.02)
+  assert np.abs(x[x != 0]).min() >= 0.2
+
+
+@pytest.mark.parametrize(("ending", "duration"), [(False, 3), (True, None)])
+def test_a_fixed_timer_counts_steps(ending: bool, duration: int | None) -> None:
+  timer = make_timer(ConfigDict({"timer": "fixed", "duration": 0.06}), dt=0.02)
+  info, dues = timer.start({}), []
+  for _ in range(6):
+    due, info = timer.advance(info, jnp.array(ending), {})  # an end starts the count anew
+    dues.append(bool(due))
+  assert dues == [duration is not None and step % duration == 0 for step in range(1, 7)]
+
+
+def test_an_exponential_timer_draws_when_due_or_done() -> None:
+  timer = make_timer(ConfigDict({"timer": "exponential", "duration": 5.0}), dt=0.02)
+  keys = {"command_timer": KEYS[0]}
+  fresh = timer.start(keys)["steps_until_next_cmd"]
+  for steps, done, due, left in ((2, False, False, 1), (1, False, True, fresh), (2, True, False, fresh)):
+    now, info = timer.advance({"steps_until_next_cmd": jnp.array(steps)}, jnp.array(done), keys)
+    assert (bool(now), int(info["steps_until_next_cmd"])) == (due, left)
+
+
+def test_made_from_configs() -> None:
+  keys: dict[str, Any] = {"max": [1.0, 2.0, 3.0], "min": None, "nonzero_probability": [1.0, 1.0, 1.0]}
+  keys |= {"change_probability": 0.5, "zero_probability": 0.1, "deadband": 0.0}
+  walk = make_sampler(ConfigDict({"sampler": "walk", **keys}))
+  assert walk == Walk((-1.0, -2.0, -3.0), (1.0, 2.0, 3.0), (1.0, 1.0, 1.0), 0.5)
+  box = make_sampler(ConfigDict({"sampler": "box", **keys, "min": [0.0, 0.0, 0.0]}))
+  assert box == Box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), 0.1, 0.0)
   with pytest.raises(UnknownNameError, match=r"env\.command\.sampler: 'wlk' is unknown.*Did you mean 'walk'"):
     make_sampler(ConfigDict({"sampler": "wlk", **keys}))
+  with pytest.raises(UnknownNameError, match=r"env\.command\.timer: 'fixd' is unknown.*Did you mean 'fixed'"):
+    make_timer(ConfigDict({"timer": "fixd", "duration": 1.0}), dt=0.02)

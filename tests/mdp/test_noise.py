@@ -22,3 +22,10 @@ def test_keys_do_not_depend_on_the_amplitudes() -> None:
   _, two = add_noise(jax.random.PRNGKey(0), CLEAN, {"a": 0.0, "b": 2.0})
   np.testing.assert_array_equal(quiet, loud)
   np.testing.assert_allclose(2 * (one["b"] - 1), two["b"] - 1, rtol=1e-5)
+
+
+def test_an_amplitude_for_each_element() -> None:
+  amplitudes = {"b": np.array([0.0, 1.0, 2.0])}
+  _, noisy = add_noise(jax.random.PRNGKey(0), {"b": CLEAN["b"]}, amplitudes)
+  _, one = add_noise(jax.random.PRNGKey(0), {"b": CLEAN["b"]}, {"b": 1.0})
+  np.testing.assert_allclose(noisy["b"] - 1, amplitudes["b"] * (one["b"] - 1), rtol=1e-5, atol=1e-6)

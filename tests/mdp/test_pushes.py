@@ -1,4 +1,4 @@
-"""Kicks: when they come, how long they last and what they add up to."""
+"""Kicks and jumps: when they come, how long they last and what they add up to."""
 
 from typing import Any
 
@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 from ml_collections import ConfigDict
 
-from playground.mdp.pushes import advance_kick, kick_force, sample_kicks
+from playground.errors import UnknownNameError
+from playground.mdp.pushes import Jumps, advance_kick, kick_force, make_pushes, sample_kicks
 
 MASS = jnp.array(12.0)
 CONFIG = ConfigDict({"velocity": [1.0, 3.0], "duration": [0.05, 0.2], "interval": [0.5, 0.9]})
@@ -61,3 +63,45 @@ def test_each_kick_has_its_own_direction() -> None:
   strong = forces[np.linalg.norm(forces, axis=1) > 1]
   directions = np.unique(np.round(np.arctan2(strong[:, 1], strong[:, 0]) % np.pi, 3))
   assert len(directions) > 5
+
+
+class Body(struct.PyTreeNode):
+  """The part of the physics that a jump changes."""
+
+  qvel: jax.Array
+
+
+def jumps(enable: bool) -> tuple[int, np.ndarray, np.ndarray]:
+  """The interval, the directions shown and what they add to the velocity in 100 steps."""
+  config = ConfigDict({"enable": enable, "velocity": [0.5, 1.0], "interval": [0.5, 0.9]})
+  pushes = Jumps(config, root=1, dt=0.02)
+  info = {"rng": jax.random.PRNGKey(1), **pushes.start({"push_interval": jax.random.PRNGKey(0)}, MASS)}
+
+  def step(info: dict[str, Any], _: None) -> tuple[dict[str, Any], Any]:
+    body: Any = Body(jnp.zeros(6))
+    body, changed = pushes.act(body, info)
+    return info | changed, (changed["push"], body.qvel)
+
+  directions, gained = jax.jit(lambda i: jax.lax.scan(step, i, None, 100))(info)[1]
+  return int(info["push_interval_steps"]), np.asarray(directions), np.asarray(gained)
+
+
+def test_jumps_in_time() -> None:
+  interval, directions, gained = jumps(enable=True)
+  assert 25 <= interval <= 45
+  (steps,) = np.nonzero(directions.any(1))
+  assert steps.tolist() == [i * interval - 1 for i in range(1, 100 // interval + 1)]
+  speeds = np.linalg.norm(gained[steps, :2], axis=1)
+  assert (speeds >= 0.5).all() and (speeds <= 1.0).all() and len(np.unique(speeds)) > 1
+  np.testing.assert_allclose(gained[steps, :2], speeds[:, None] * directions[steps], rtol=1e-5)
+  assert not np.delete(gained, steps, axis=0).any() and not gained[:, 2:].any()
+
+
+def test_no_jumps_unless_enabled() -> None:
+  _, directions, gained = jumps(enable=False)
+  assert not directions.any() and not gained.any()
+
+
+def test_unknown_kind() -> None:
+  with pytest.raises(UnknownNameError, match=r"env\.pushes\.kind: 'kik' is unknown.*Did you mean 'kick'"):
+    make_pushes(ConfigDict({"kind": "kik"}), root=1, dt=0.02)

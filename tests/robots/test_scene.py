@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from playground.errors import UnknownNameError
+from playground.errors import ConfigError, UnknownNameError
 from playground.robots.scene import COLLISIONS, build_scene
 
 LEG_GEOMS = ("hip", "thigh1", "thigh2", "thigh3", "calf1", "calf2")
@@ -72,6 +72,18 @@ def test_floor_contact_sensors_come_last_in_order() -> None:
   data.qpos[2] = 1.0
   mujoco.mj_forward(model, data)
   assert not data.sensordata[-2:].any()
+
+
+def test_floor_contact_sensors_come_before_those_of_the_robots_parts() -> None:
+  """So that the order is the reference's, which recorded sensor readings have."""
+  model = build_scene("t1", floor_contacts=["left_foot_1"]).compile()
+  names = [model.sensor(i).name for i in range(model.nsensor)]
+  assert names[-3:] == ["right_foot_pos", "left_foot_1_floor_found", "left_foot_right_foot_found"]
+
+
+def test_a_robot_without_geoms_for_full_collisions() -> None:
+  with pytest.raises(ConfigError, match="collision=full_self: robot=t1 has geoms for the feet only"):
+    build_scene("t1", collision="full_self")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from playground.runs.plots import plot_learning_curve
 
@@ -28,3 +29,15 @@ def test_one_evaluation_without_clock_or_std_draws_what_it_can(tmp_path: Path):
   (tmp_path / "metrics.csv").write_text("step,eval/episode_reward\n100,1.5\n")
   written = plot_learning_curve(tmp_path / "metrics.csv", tmp_path)
   assert [p.name for p in written] == ["return_over_steps.png"]
+
+
+def test_the_curve_of_a_chain_has_a_line_and_a_mark_for_each_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+  rows = "0,flat,1.0\n100,flat,5.0\n100,rough,2.0\n200,rough,6.0\n"
+  (tmp_path / "metrics.csv").write_text("step,stage,eval/episode_reward\n" + rows)
+  drawn: list[Figure] = []
+  monkeypatch.setattr(Figure, "savefig", lambda figure, path, **kwargs: drawn.append(figure))
+  plot_learning_curve(tmp_path / "metrics.csv", tmp_path)
+  (axes,) = drawn[0].axes
+  assert [text.get_text() for text in axes.texts] == ["flat", "rough"]
+  lines = [(list(line.get_xdata()), list(line.get_ydata())) for line in axes.lines]  # pyright: ignore[reportArgumentType]
+  assert lines == [([0, 100], [1, 5]), ([0, 0], [0, 1]), ([100, 200], [2, 6]), ([100, 100], [0, 1])]

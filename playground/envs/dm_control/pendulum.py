@@ -14,9 +14,10 @@ _UPRIGHT = math.cos(math.radians(8))
 
 
 class PendulumSwingup(SuiteTask):
-  """Swings a pole up with a motor too weak to lift it (action in [-1, 1]): reward 1 within 8 degrees of upright, else 0.
+  """Swings a pole up with a motor too weak to lift it (action in [-1, 1]).
 
-  Observation [3]: sine and cosine of the pole's angle, its velocity rad/s.
+  Observation [3]: sine and cosine of the pole's angle, its velocity rad/s. The reward is 1 within 8 degrees of upright,
+  else 0.
 
   An episode starts at rest, anywhere on the circle; Playground 0.2.0 starts on one half of it. There, a cosine that
   rounding took above 1 earns nothing, too. With `env.parity=true` both are so here.

@@ -29,6 +29,7 @@ class Reacher(SuiteTask):
     super().__init__(config, spec.compile())
     target, finger = self.mj_model.geom("target"), self.mj_model.geom("finger")
     self._target, self._finger = target.id, finger.id
+    self._target_height = jnp.array(self.mj_model.body("target").pos[2])
     self._reach = float(target.size[0] + finger.size[0])  # where fingertip and target touch
 
   @property
@@ -42,7 +43,7 @@ class Reacher(SuiteTask):
     wrist = jax.random.uniform(wrist_key, minval=low, maxval=high)
     angle = jax.random.uniform(angle_key, maxval=2 * jnp.pi)
     radius = jax.random.uniform(radius_key, minval=0.05, maxval=0.2)
-    target = jnp.array(self.mj_model.body("target").pos).at[:2].set(radius * jnp.stack([jnp.sin(angle), jnp.cos(angle)]))
+    target = jnp.stack([radius * jnp.sin(angle), radius * jnp.cos(angle), self._target_height])
     return {"qpos": jnp.stack([shoulder, wrist]), "mocap_pos": target[None]}
 
   def observe(self, data: PhysicsData) -> jax.Array:

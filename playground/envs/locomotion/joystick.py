@@ -1,198 +1,121 @@
 """Follow a joystick's velocity commands on legs: one task for all robots, composed by config."""
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul
 
-from playground.envs.base import Env, State
-from playground.envs.physics import PhysicsData, mjx
-from playground.mdp.commands import exponential_steps, make_sampler
-from playground.mdp.legged import Context, LeggedRobot
+from playground.envs.base import State
+from playground.envs.locomotion.legged import LeggedTask
+from playground.envs.physics import mjx
+from playground.errors import ConfigError
+from playground.mdp.commands import make_sampler, make_timer
+from playground.mdp.gait import make_gait
+from playground.mdp.keys import split_keys
+from playground.mdp.legged import Context
 from playground.mdp.lookup import lookup
-from playground.mdp.noise import add_noise
-from playground.mdp.observations import OBSERVATIONS
-from playground.mdp.pushes import advance_kick, sample_kicks
-from playground.mdp.rewards import PARITY_REWARDS, REWARDS, bind
-from playground.mdp.terminations import TERMINATIONS
-from playground.robots.scene import build_scene
+from playground.mdp.pushes import make_pushes
+from playground.robots.scene import configured_scene
 
-ACTOR = "state"  # the observation of what the robot's own sensors tell: noisy; the others are exact
+_DRAWS = ("xy", "yaw", "joint_scale", "base_vel", "gait_frequency", "gait", "foot_height", "command", "command_timer",
+          "push_interval", "push_duration", "push_velocity")  # fmt: skip
 
 
-class Joystick(Env):
+class Joystick(LeggedTask):
   """Tracks commanded forward, sideways and turning velocity (paper: appendix "Locomotion", joystick tasks).
 
-  An action moves the joints' position targets: target = default pose + action_scale * action. Which rewards,
-  observations, commands, noise, pushes and terminations there are and how they weigh is `configs/env/joystick.yaml`.
+  Which rewards, observations, commands, gait, noise, pushes and terminations there are and how they weigh is
+  `configs/env/joystick.yaml`, and what bipeds have otherwise `configs/env/biped_joystick.yaml`.
 
   The defaults differ from Playground 0.2.0 as follows; `env.parity=true` has its ways:
-  - soft joint limits shrink the range about its centre (0.2.0 scales the bounds, which lets the Go1's knees pass the
+  - soft joint limits shrink the range about its centre (0.2.0 scales the Go1's bounds, which lets the knees pass the
     hard limit);
-  - a kick is as strong as it says on the robot at hand (0.2.0 takes the mass before randomisation).
+  - a kick is as strong as it says on the robot at hand (0.2.0 takes the mass before randomisation);
+  - scaled joint angles of a start stay within the joints' limits;
+  - Apollo starts with its targets where its joints are (0.2.0: all 0);
+  - after standing still the legs take up their gait again (0.2.0's T1 and Apollo move both feet in step from then on);
+  - hips may roll while the command is sideways, and only then (0.2.0: Berkeley Humanoid's and T1's hips are free while
+    it is not; on the G1 the weights of the four joints multiply each of them).
   """
 
-  derived = ("sensordata", "actuator_force", "site_xpos", "site_xmat")
+  logged = ("swing_peak",)
 
   def __init__(self, config: Any):
-    """Builds the scene and binds everything that the config names.
-
-    Args:
-      config: the task's ConfigDict, `configs/env/joystick.yaml` with the robot under `robot`.
+    """Builds the task, as `LeggedTask`.
 
     Raises:
-      UnknownNameError: a reward, observation, sampler, termination, robot, terrain or object that does not exist.
-      ConfigError: a reward's parameter is missing.
+      UnknownNameError: also a command sampler, timer, kind of pushes, gait or random draw that does not exist.
+      ConfigError: also a gait that has not one phase for each foot.
     """
-    scene, robot = config.scene, config.robot
-    spec = build_scene(
-      robot.name, terrain=scene.terrain, collision=scene.collision, floor_contacts=tuple(robot.floor_contacts)
-    )
-    mj_model = spec.compile()
-    _set_gains(mj_model, robot.pd.kp, robot.pd.damping)
-    super().__init__(config, mj_model)
-    self.robot = LeggedRobot(mj_model, robot)
-    self._action_scale: float = config.action_scale
-    self._rewards = bind(config.reward, PARITY_REWARDS if self.parity else REWARDS)
-    self._reward_clip = tuple(config.reward.clip)
-    self._terminations = [
-      (lookup(TERMINATIONS, name, "env.termination"), config.termination[name]) for name in config.termination
-    ]
+    super().__init__(config)
     self._commands = make_sampler(config.command)
-    self._command_duration: float = config.command.mean_duration
-    self._noise = _amplitudes(config.noise)
-    self._obs = {group: tuple(config.obs[group]) for group in sorted(config.obs, key=lambda g: (g != ACTOR, g))}
-    for group, parts in self._obs.items():
-      for part in parts:
-        lookup(OBSERVATIONS if group == ACTOR else {ACTOR: None, **OBSERVATIONS}, part, f"env.obs.{group}")
-    self._pushing: bool = config.pushes.enable
+    self._timer = make_timer(config.command, self.dt)
+    self._gait = make_gait(config.gait, self.robot, self.dt, self.parity)
+    self._pushes = make_pushes(config.pushes, self.robot.root, self.dt)
+    gait_draws = self._gait.keys if self._gait else ()
+    self._draws = (*self._spread_draws, *gait_draws, "command", *self._timer.keys, *self._pushes.keys)
+    self._draw_order = [tuple(group) for group in config.reset.draw_order]
+    for group in self._draw_order:
+      for name in group:
+        lookup(dict.fromkeys(_DRAWS), name, "env.reset.draw_order")
+    self._starts_at_zero: bool = self.parity and config.reset.parity_zero_ctrl
 
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    names = {part for parts in self._obs.values() for part in parts} - {ACTOR}
-
-    def every_part(rng: jax.Array) -> dict[str, jax.Array]:
-      state = self.reset(rng)
-      now = self._context(state.data, state.info, jnp.zeros(self.action_size))
-      return {name: OBSERVATIONS[name](now) for name in names}
-
-    sizes = {name: part.size for name, part in jax.eval_shape(every_part, jax.random.PRNGKey(0)).items()}
-    sizes[ACTOR] = sum(sizes[part] for part in self._obs[ACTOR])
-    return {group: {part: sizes[part] for part in parts} for group, parts in self._obs.items()}
+  def _scene(self, config: Any) -> mujoco.MjSpec:
+    spec = configured_scene(config)
+    if config.restricted_joint_range:
+      if "restricted_range" not in config.robot:
+        raise ConfigError(f"env.restricted_joint_range: robot={config.robot.name} has no restricted_range.")
+      for name in config.robot.restricted_range:
+        spec.joint(name).range = config.robot.restricted_range[name]
+    return spec
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
     model = self.mjx_model if model is None else model
-    rng, data = self._start(rng, model)
-    rng, *kick_keys = jax.random.split(rng, 4)
-    rng, timer_key, command_key = jax.random.split(rng, 3)
+    rng, keys = split_keys(rng, self._draws, self._draw_order)
+    qpos, qvel = self._spread_start(keys, self.robot.init_qpos)
     feet = len(self.robot.feet)
     info = {
       "rng": rng,
-      "command": self._commands.first(command_key),
-      "steps_until_next_cmd": exponential_steps(timer_key, self._command_duration, self.dt),
-      "last_act": jnp.zeros(self.action_size),
+      "command": self._commands.first(keys["command"]),
       "last_last_act": jnp.zeros(self.action_size),
       "feet_air_time": jnp.zeros(feet),
       "swing_peak": jnp.zeros(feet),
       "last_contact": jnp.zeros(feet, bool),
-      **sample_kicks(jnp.stack(kick_keys), self.config.pushes, self.dt),
+      **self._timer.start(keys),
+      **self._pushes.start(keys, self.robot.mass(self.mjx_model if self.parity else model)),
+      **(self._gait.start(keys) if self._gait else {}),
     }
-    if self._pushing:
-      info["pert_mass"] = self.robot.mass(self.mjx_model if self.parity else model)
-    now = self._context(data, info, jnp.zeros(self.action_size))
-    info["rng"], obs = self._observe(now)
-    metrics = {name: jnp.zeros(()) for name in (*(f"reward/{name}" for name in self._rewards), "swing_peak")}
-    return State(data, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
+    ctrl = jnp.zeros(self.action_size) if self._starts_at_zero else None
+    return self._first_state(self._start(model, qpos, qvel, ctrl), info)
 
   def disturb(self, state: State) -> State:
-    if not self._pushing:
-      return state
-    force, info = advance_kick(state.info, state.info["pert_mass"], self.dt)
-    xfrc = state.data.xfrc_applied.at[self.robot.root, :3].set(force)
-    return state.replace(data=state.data.replace(xfrc_applied=xfrc), info=state.info | info)
+    data, changed = self._pushes.act(state.data, state.info)
+    return state.replace(data=data, info=state.info | changed)
 
-  def control(self, state: State, action: jax.Array) -> jax.Array:
-    return self.robot.default_pose + self._action_scale * action
-
-  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+  def _track(self, now: Context) -> Context:
+    """Counts this step into the feet's swings, and says which foot lands."""
+    was_in_air = now.info["feet_air_time"] > 0
     swing = {
-      "feet_air_time": info["feet_air_time"] + self.dt,
-      "swing_peak": jnp.maximum(info["swing_peak"], data.site_xpos[self.robot.feet, 2]),
+      "feet_air_time": now.info["feet_air_time"] + self.dt,
+      "swing_peak": jnp.maximum(now.info["swing_peak"], now.feet_height),
     }
-    now = self._context(data, {**info, **swing}, action, was_in_air=info["feet_air_time"] > 0)
-    rng, obs = self._observe(now)
-    rewards = {name: weight * term(now) for name, (weight, term) in self._rewards.items()}
-    reward = jnp.clip(sum(rewards.values(), jnp.zeros(())) * self.dt, *self._reward_clip)
-    after = self._next_info(now, rng)
-    metrics = {f"reward/{name}": value for name, value in rewards.items()}
-    metrics["swing_peak"] = after["swing_peak"].mean()
-    return State(data, obs, reward, now.done.astype(jnp.float32), metrics, after)
-
-  def _start(self, rng: jax.Array, model: mjx.Model) -> tuple[jax.Array, PhysicsData]:
-    """The keyframe, moved and turned on the ground, with a random base velocity."""
-    spread = self.config.reset
-    qpos, qvel = self.robot.init_qpos, jnp.zeros(self.mj_model.nv)
-    rng, key = jax.random.split(rng)
-    qpos = qpos.at[:2].add(jax.random.uniform(key, (2,), minval=-spread.xy, maxval=spread.xy))
-    rng, key = jax.random.split(rng)
-    yaw = jax.random.uniform(key, minval=-spread.yaw, maxval=spread.yaw)
-    turn = axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), yaw)
-    qpos = qpos.at[3:7].set(quat_mul(qpos[3:7], turn))
-    rng, key = jax.random.split(rng)
-    qvel = qvel.at[:6].set(jax.random.uniform(key, (6,), minval=-spread.base_vel, maxval=spread.base_vel))
-    return rng, self.physics.forward(model, self.physics.make(qpos=qpos, qvel=qvel, ctrl=qpos[7:]))
-
-  def _context(
-    self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array, was_in_air: jax.Array | bool = False
-  ) -> Context:
-    contact = self.robot.contact(data)
     # A foot that touched in the step before but left the floor since has landed, too.
-    first = was_in_air & (contact | info["last_contact"])
-    now = Context(self.robot, data, info, action, contact, first, jnp.zeros((), bool))
-    done = jnp.array([f(now, threshold) for f, threshold in self._terminations], bool).any()
-    return dataclasses.replace(now, done=done)
-
-  def _observe(self, now: Context) -> tuple[jax.Array, dict[str, jax.Array]]:
-    clean = {name: OBSERVATIONS[name](now) for name in self._noise}
-    rng, noisy = add_noise(now.info["rng"], clean, self._noise)
-    obs = {}
-    for group, parts in self._obs.items():
-      known = noisy if group == ACTOR else obs
-      obs[group] = jnp.concatenate([known[part] if part in known else OBSERVATIONS[part](now) for part in parts])
-    return rng, obs
+    first = was_in_air & (now.contact | now.info["last_contact"])
+    return dataclasses.replace(now, info={**now.info, **swing}, first_contact=first)
 
   def _next_info(self, now: Context, rng: jax.Array) -> dict[str, Any]:
-    """What the next step starts from. (A gait's phase, for bipeds, is to be advanced here.)"""
+    """Ends the swings of feet on the floor, moves the gait on and draws the next command when it is due."""
     info = now.info
-    rng, command_key, timer_key = jax.random.split(rng, 3)
-    steps = info["steps_until_next_cmd"] - 1
-    due = steps <= 0
-    timer = exponential_steps(timer_key, self._command_duration, self.dt)
+    rng, keys = split_keys(rng, self._timer.keys, [("command", *self._timer.keys)])
+    due, timer = self._timer.advance(info, now.done, keys)
     return {
-      **info,
-      "rng": rng,
-      "command": jnp.where(due, self._commands.next(command_key, info["command"]), info["command"]),
-      "steps_until_next_cmd": jnp.where(due | now.done, timer, steps),
-      "last_last_act": info["last_act"],
-      "last_act": now.action,
+      **super()._next_info(now, rng),
+      "command": jnp.where(due, self._commands.next(keys["command"], info["command"]), info["command"]),
       "feet_air_time": jnp.where(now.contact, 0.0, info["feet_air_time"]),
       "swing_peak": jnp.where(now.contact, 0.0, info["swing_peak"]),
       "last_contact": now.contact,
+      **timer,
+      **(self._gait.advance(info, now.still) if self._gait else {}),
     }
-
-
-def _amplitudes(config: Any) -> dict[str, float]:
-  for name in config.scales:
-    lookup(OBSERVATIONS, name, "env.noise.scales")
-  return {name: config.level * config.scales[name] for name in OBSERVATIONS if name in config.scales}
-
-
-def _set_gains(mj_model: mujoco.MjModel, kp: float, damping: float) -> None:
-  """Gives every position servo the gain `kp` (N m/rad) and every joint but the free one `damping` (N m s/rad)."""
-  mj_model.actuator_gainprm[:, 0] = kp
-  mj_model.actuator_biasprm[:, 1] = -kp
-  mj_model.dof_damping[6:] = damping

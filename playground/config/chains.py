@@ -1,0 +1,138 @@
+"""Chains of runs: what each stage of a `curriculum` is composed from.
+
+```yaml
+stages:
+  flat:
+    num_timesteps: 100_000_000   # null is the task's own budget
+    overrides:                   # as on the command line; they hold for the later stages, too
+      - env.command.max=[1.5, 0.8, 1.2]
+  rough: {num_timesteps: 100_000_000, overrides: [terrain=rough]}
+```
+
+A stage is composed like a run of its own: the chain's options and files, then the stage's overrides, then the values of
+the command line, which therefore hold for all stages.
+"""
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from playground.config.files import options
+from playground.config.overrides import Override, parse
+from playground.config.schema import wrong_type
+from playground.config.text import format_value
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
+
+_FIELDS = ("num_timesteps", "overrides")
+_SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # by a stage: groups and sections
+SINGLE_RUN = {"scale": 1.0, "start_at": None, "stages": {}}  # curriculum=none
+
+
+def stage_folders(curriculum: Mapping[str, Any]) -> dict[str, str]:
+  """The stages that a chain runs, from `start_at` on, and each one's folder in the chain's."""
+  names = list(curriculum["stages"])
+  start_at = curriculum.get("start_at")
+  first = 0 if start_at is None else names.index(start_at)
+  return {name: f"{number}_{name}" for number, name in enumerate(names[first:], first + 1)}
+
+
+def check_chain(resolved: Mapping[str, Any], parsed: Sequence[Override], roots: Sequence[Path]) -> None:
+  """Checks what a configuration says of its chain's stages, and what the command line says of the chain.
+
+  Raises:
+    ConfigError: a field of a stage that cannot be, or a key that does not go with the chain.
+    UnknownNameError: no such stage or field.
+  """
+  curriculum = resolved["curriculum"]
+  if missing := [key for key in SINGLE_RUN if key not in curriculum]:
+    raise ConfigError(f"curriculum.{missing[0]} is missing: let the defaults of a chain's file begin with none.")
+  stages, start_at = curriculum["stages"], curriculum["start_at"]
+  given = {override.key: override for override in parsed if not override.is_group}
+  if not stages:
+    if about := [override.text for key, override in given.items() if key.startswith("curriculum.")]:
+      chains = ", ".join(name for name in options("curriculum", roots) if name != "none")
+      raise ConfigError(f"{about[0]} needs a chain: add curriculum=<name>, one of {chains}.")
+    return
+  for name, stage in stages.items():
+    _check_stage(f"curriculum.stages.{name}", name, stage)
+  if start_at is not None and start_at not in stages:
+    near = nearest(str(start_at), stages)
+    known = ", ".join(stages)
+    raise UnknownNameError(f"curriculum.start_at={start_at} does not exist: choose from {known}.{near}")
+  if start_at not in (None, next(iter(stages))) and resolved["init_from"] is None:
+    what = "is not the first stage, so it needs weights to start from"
+    raise ConfigError(f"curriculum.start_at={start_at} {what}: add init_from=<run or checkpoint>.")
+  if curriculum["scale"] and "agent.num_timesteps" in given:
+    raise ConfigError(
+      f"{given['agent.num_timesteps'].text} is not for a chain, whose stages have budgets of their own: "
+      "curriculum.scale=0.1 shortens them all, curriculum.stages.<name>.num_timesteps=<steps> sets one."
+    )
+
+
+def stage_overrides(
+  curriculum: Mapping[str, Any], parsed: Sequence[Override], roots: Sequence[Path]
+) -> Iterator[tuple[str, list[Override]]]:
+  """Yields the name of each stage that the chain runs, and what it is composed from.
+
+  Args:
+    curriculum: the chain's resolved section, checked.
+    parsed: the command line that chose the chain.
+    roots: folders that hold groups.
+
+  Raises:
+    ConfigError: an override that a stage cannot have; the message names the stage.
+  """
+  groups = [override for override in parsed if override.is_group]
+  values = [override for override in parsed if not override.is_group]
+  folders, own = stage_folders(curriculum), []
+  for name, stage in curriculum["stages"].items():
+    with in_stage(name):
+      own = [*own, *(_parse(text, roots) for text in stage["overrides"])]
+    if name in folders:
+      yield name, [*groups, *own, *values]
+
+
+def budget(curriculum: Mapping[str, Any], stage: str, default: int) -> int:
+  """A stage's `agent.num_timesteps`: its own or, without one or with a scale of 0, the task's; times the scale."""
+  own, scale = curriculum["stages"][stage]["num_timesteps"], curriculum["scale"]
+  return max(1, round(scale * (default if own is None else own))) if scale else default
+
+
+@contextlib.contextmanager
+def in_stage(name: str) -> Iterator[None]:
+  """Names the stage in an error that the user can act on."""
+  try:
+    yield
+  except PlaygroundError as error:
+    raise type(error)(f"Stage {name} of the chain: {error}") from error
+
+
+def _check_stage(key: str, name: Any, stage: Any) -> None:
+  if not str(name).replace("_", "").replace("-", "").isalnum():
+    raise ConfigError(f"{key}: a stage's name is that of a folder, letters, digits, - and _ only.")
+  if not isinstance(stage, Mapping):
+    raise wrong_type(key, stage, f"a mapping with the keys {', '.join(_FIELDS)}")
+  for field in stage:
+    if field not in _FIELDS:
+      near = nearest(str(field), _FIELDS)
+      raise UnknownNameError(f"{key}.{field} does not exist: a stage has {', '.join(_FIELDS)}.{near}")
+  for field in _FIELDS:
+    if field not in stage:
+      raise ConfigError(f"{key}.{field} is missing.")
+  steps, overrides = stage["num_timesteps"], stage["overrides"]
+  number = isinstance(steps, int | float) and not isinstance(steps, bool)
+  if steps is not None and not (number and 0 < steps == steps // 1):
+    raise ConfigError(f"{key}.num_timesteps={format_value(steps)} must be a whole number above 0, or null.")
+  if not isinstance(overrides, list) or not all(isinstance(text, str) for text in overrides):
+    raise wrong_type(f"{key}.overrides", overrides, "a list of key=value, as on the command line")
+
+
+def _parse(text: str, roots: Sequence[Path]) -> Override:
+  """One override of a stage."""
+  override = parse(text, roots)
+  if override.key.split(".")[0] not in _SETTABLE:
+    raise ConfigError(f"{text} cannot be set by a stage, which takes only {', '.join(_SETTABLE)}.")
+  if override.key == "agent.num_timesteps":
+    raise ConfigError(f"{text}: a stage's budget is its num_timesteps.")
+  return override

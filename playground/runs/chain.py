@@ -1,0 +1,140 @@
+"""A chain of runs (fine-tuning): each stage starts from the weights of the one before it, with a fresh optimiser.
+
+Every stage is an ordinary run directory inside the chain's, `<chain>/<number>_<stage>/`. All of them are written, their
+configurations resolved, before the first is trained: what a chain still has to do lies on disk, and going on with it is
+resuming the first stage that is not finished, whether that has begun or not.
+
+The stages run one after another in this process. A child process for each would free its memory as surely, but would
+start JAX and the device again for every stage, and would need signals and terminals handed on.
+"""
+
+import gc
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from playground import registry
+from playground.config import in_stage, stage_folders
+from playground.errors import ConfigError
+from playground.hardware.setup import setup
+from playground.learning.algorithms import make_learner
+from playground.learning.checkpoints import Checkpoint, describe, find_checkpoints
+from playground.runs.chain_result import write_result
+from playground.runs.interrupts import Interrupts, exit_code
+from playground.runs.provenance import process_age_s
+from playground.runs.run_dir import RunDirectory
+from playground.runs.start import Start
+
+if TYPE_CHECKING:
+  from playground.config import RunConfig
+
+TrainRun = Callable[["RunConfig", Interrupts, float], int]
+
+
+def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun) -> int:
+  """Runs the stages of a new chain, or what is left of one that is resumed.
+
+  Args:
+    config: the chain's, with its stages.
+    interrupts: what the process has been told.
+    train_run: trains one run: (its config, interrupts, age of the process) -> exit code.
+
+  Returns:
+    The exit code, as of a run.
+
+  Raises:
+    PlaygroundError: what the user can act on, naming the stage; nothing has been trained or written if a stage cannot
+      work at all.
+  """
+  if config.resume is None:
+    _check(config)
+    chain, stages = _lay_out(config)
+  else:
+    chain, stages = RunDirectory.open(config.resume), list(config.stages)
+    if chain.status.get("status") == "finished":
+      print(f"{chain.path} is finished: nothing to resume (init_from={chain.path} trains on from its weights).")
+      return 0
+  folders = stage_folders(config.resolved["curriculum"])
+  began_s, before = 0.0, None  # what the first stage starts from is in its config
+  with chain.recorded():
+    try:
+      for stage, (name, folder) in zip(stages, folders.items(), strict=True):
+        run_dir = RunDirectory(chain.path / folder)
+        if run_dir.status.get("status") != "finished":
+          chain.set_status("running", f"stage {folder}")
+          print(f"\nStage {folder} of {chain.path}: {stage.agent.num_timesteps:,} steps of {stage.choices['env']}")
+          with in_stage(name):
+            train_run(replace(stage, init_from=before), interrupts, began_s)
+          interrupts.stop_saving()
+          began_s = process_age_s()
+          gc.collect()  # what the stage held on the device goes now, not when Python comes round to it
+        if interrupts.signum is not None:
+          break
+        before = str(run_dir.path)
+    finally:
+      write_result(chain, folders)
+  finished = chain.summary["status"] == "finished"
+  _say_where(chain)
+  return 0 if interrupts.signum is None or finished else exit_code(interrupts.signum)
+
+
+def _check(config: "RunConfig") -> None:
+  """Builds every stage, so that what cannot work ends the chain before its first stage is trained.
+
+  This traces each task's reset for the sizes of its observation: seconds, where a stage takes minutes.
+  """
+  if config.resolved["run_dir"] is not None:
+    RunDirectory(str(config.run_dir)).must_be_new()
+  print(f"Checking {len(config.stages)} stages: {', '.join(stage_folders(config.resolved['curriculum']))}")
+  hardware = setup(config.hardware)
+  before: tuple[str, dict[str, Any]] | None = None
+  for stage, name in zip(config.stages, stage_folders(config.resolved["curriculum"]), strict=True):
+    with in_stage(name):
+      env = registry.load(stage.choices["env"], config=stage.env)
+      learner = make_learner(env, stage.agent, hardware.mesh, hardware.network_precision)
+      size = env.observation_size
+      facts: dict[str, Any] = {"agent.name": stage.agent.name, "size of the action": env.action_size}
+      facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
+      facts |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(learner.policy_shape())}
+      if before is None and config.init_from is not None:
+        start = Start(weights=Checkpoint(find_checkpoints(config.init_from)[0]))
+        start.restore(learner, stage.agent.name, {})
+      if before is not None:
+        _compare(f"env={stage.choices['env']}", facts, *before)
+      before = name, facts
+
+
+def _compare(env: str, facts: dict[str, Any], before: str, theirs: dict[str, Any]) -> None:
+  """Raises ConfigError where a stage's networks are not those of the stage before it."""
+  for key in {**facts, **theirs}:
+    if facts.get(key) != theirs.get(key):
+      here, there = (side.get(key, "not there") for side in (facts, theirs))
+      raise ConfigError(f"{env} cannot start from the weights of stage {before}: {key} is {here}, and {there} there.")
+
+
+def _lay_out(config: "RunConfig") -> "tuple[RunDirectory, list[RunConfig]]":
+  """Makes the chain's directory and those of its stages; returns the stages' configurations as of runs to resume."""
+  chain = RunDirectory.claim(str(config.run_dir), numbered=config.resolved["run_dir"] is None)
+  before, stages = config.init_from, []
+  for stage, folder in zip(config.stages, stage_folders(config.resolved["curriculum"]).values(), strict=True):
+    path = str(chain.path / folder)
+    tracking = stage.resolved["tracking"]
+    wandb = {**tracking["wandb"], "group": tracking["wandb"]["group"] or chain.path.resolve().name}
+    resolved = {**stage.resolved, "tracking": {**tracking, "wandb": wandb}, "run_dir": path, "init_from": before}
+    RunDirectory(path).write_config(resolved, stage.overrides)
+    going_on = {**resolved, "resume": path, "init_from": None}
+    stages.append(replace(stage, resolved=going_on, run_dir=path, resume=path, init_from=None))
+    before = path
+  chain.write_config(config.resolved, config.overrides)  # last: from here on it is a chain that can be resumed
+  return chain, stages
+
+
+def _say_where(chain: RunDirectory) -> None:
+  """The last lines of a chain: how its stages ended, and what lies where."""
+  summary = chain.summary
+  print(f"\n{summary['status']}: {summary['steps']:,} steps in all")
+  for stage in summary["stages"]:
+    result = f"return {stage['final_return']}, {stage['steps']:,} steps" if stage["steps"] is not None else ""
+    print(f"  {stage['folder']:20}{stage['status']:12}{result}")
+  for name, path in {"metrics": chain.metrics_csv, "plots": chain.plots}.items():
+    print(f"  {name:20}{path}")

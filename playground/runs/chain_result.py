@@ -1,0 +1,66 @@
+"""What a chain's directory says of all its stages: one metrics.csv, one curve, one summary."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from playground.runs.files import write_text
+from playground.runs.plots import plot_learning_curve
+from playground.runs.run_dir import RunDirectory
+
+_OF_A_RUN = ("env", "final_return", "best_return", "steps", "steps_per_second", "wall_clock_s", "params_sha256")
+
+
+def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
+  """Writes metrics.csv, plots and summary.json of a chain from what its stages have so far.
+
+  Args:
+    chain: its directory.
+    folders: of the stages, by name.
+  """
+  runs = {name: RunDirectory(chain.path / folder) for name, folder in folders.items()}
+  _write_metrics(chain, runs)
+  plot_learning_curve(chain.metrics_csv, chain.plots)
+  stages = [_stage(name, run) for name, run in runs.items()]
+  begun = [stage for stage in stages if stage["steps"] is not None]
+  open_ = [stage["status"] for stage in stages if stage["status"] != "finished"]
+  last: Mapping[str, Any] = begun[-1] if begun else {}
+  steps, rates = sum(stage["steps"] for stage in begun), [stage["steps_per_second"] for stage in begun]
+  seconds = sum(stage["steps"] / rate for stage, rate in zip(begun, rates, strict=True) if rate)
+  status = "finished" if not open_ else "failed" if "failed" in open_ else "preempted"
+  chain.write_summary(
+    {
+      "status": status,
+      # Stages need not be paid the same way, so these are of the last one.
+      **{key: last.get(key) for key in ("env", "final_return", "best_return", "params_sha256")},
+      "steps": steps,
+      "steps_per_second": steps / seconds if seconds else None,
+      "wall_clock_s": sum(stage["wall_clock_s"] for stage in begun),
+      "stages": stages,
+    }
+  )
+
+
+def _stage(name: str, run: RunDirectory) -> dict[str, Any]:
+  """A stage's result; None where it has none yet."""
+  status, summary = run.status.get("status", "not begun"), run.summary
+  return {"name": name, "folder": run.path.name, "status": status, **{key: summary.get(key) for key in _OF_A_RUN}}
+
+
+def _write_metrics(chain: RunDirectory, runs: Mapping[str, RunDirectory]) -> None:
+  """One table of all stages: steps and wall-clock time run on, `stage` says which it is."""
+  import pandas as pd
+
+  tables, steps, seconds = [], 0, 0.0
+  for name, run in runs.items():
+    if not run.metrics_csv.is_file():
+      break
+    table = pd.read_csv(run.metrics_csv, float_precision="round_trip", on_bad_lines="skip")
+    if table.empty:
+      break
+    table.insert(1, "stage", name)
+    table["step"] += steps
+    table["time/wall_clock_s"] += seconds
+    steps, seconds = int(table["step"].iloc[-1]), float(table["time/wall_clock_s"].iloc[-1])
+    tables.append(table)
+  if tables:
+    write_text(chain.metrics_csv, pd.concat(tables, ignore_index=True).to_csv(index=False))

@@ -1,0 +1,116 @@
+"""The joystick task on two legs: gait, pushes, starts and endings, on recorded states and without compiling physics."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from playground import registry
+from playground.config import compose
+from playground.envs.base import State
+from playground.errors import ConfigError
+from playground.mdp.gait import AT_REST
+from tests.envs.golden import golden, load_task
+
+G1, T1, APOLLO = "G1JoystickFlatTerrain", "T1JoystickFlatTerrain", "ApolloJoystickFlatTerrain"
+
+
+@pytest.fixture(scope="module")
+def g1() -> Any:
+  return load_task(G1)
+
+
+@pytest.fixture(scope="module")
+def t1() -> Any:
+  return load_task(T1)
+
+
+def recorded(task: str, **info: jax.Array) -> State:
+  state = jax.tree.map(lambda x: x[4], golden(task).states)
+  return state.replace(info=state.info | info)
+
+
+def evaluate(env: Any, state: State, **data: Any) -> State:
+  return env.evaluate(state.data.replace(**data), state.info, jnp.zeros(env.action_size))
+
+
+def test_the_phase_is_observed_and_goes_on(t1: Any) -> None:
+  state = recorded(T1)
+  after = evaluate(t1, state)
+  seen = after.obs["state"][-4:]  # pyright: ignore[reportArgumentType, reportCallIssue]
+  phase = state.info["phase"]
+  np.testing.assert_allclose(seen, jnp.concatenate([jnp.cos(phase), jnp.sin(phase)]), atol=1e-6)
+  np.testing.assert_allclose(after.info["phase"] - phase, state.info["phase_dt"], rtol=1e-5)
+
+
+def test_feet_rest_when_told_to_stand_still(t1: Any) -> None:
+  after = evaluate(t1, recorded(T1, command=jnp.zeros(3)))
+  assert (after.info["phase"] == np.float32(AT_REST)).all()
+  walking = evaluate(t1, after.replace(info=after.info | {"command": jnp.ones(3)}))
+  np.testing.assert_allclose(jnp.diff(walking.info["phase"]) % (2 * np.pi), np.pi, rtol=1e-5)
+
+
+def test_a_push_changes_the_velocity_at_once(g1: Any) -> None:
+  due = recorded(G1, push_step=jnp.array(9), push_interval_steps=jnp.array(10))
+  after = g1.disturb(due)
+  gained = after.data.qvel - due.data.qvel
+  assert 0.1 <= jnp.linalg.norm(gained) <= 2.0 and not gained[2:].any()
+  np.testing.assert_allclose(gained[:2] / jnp.linalg.norm(gained), after.info["push"], rtol=1e-4)
+  early = recorded(G1, push_step=jnp.array(8), push_interval_steps=jnp.array(10))
+  np.testing.assert_array_equal(g1.disturb(early).data.qvel, early.data.qvel)
+
+
+def test_feet_that_touch_each_other_end_the_episode(g1: Any) -> None:
+  state = recorded(G1)
+  assert evaluate(g1, state).done == 0
+  address = g1.mj_model.sensor("right_foot_left_foot_found").adr[0]
+  after = evaluate(g1, state, sensordata=state.data.sensordata.at[address].set(1.0))
+  assert after.done == 1
+  assert after.metrics["reward/termination"] == -100
+  np.testing.assert_allclose(after.reward, -2, atol=0.2)  # not clipped
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_starts_stay_within_the_joints_limits(parity: bool) -> None:
+  env = load_task(T1, {"parity": parity})
+  keys = jax.vmap(lambda key: dict.fromkeys(env._spread_draws, key))(jax.random.split(jax.random.PRNGKey(0), 200))
+  qpos, _ = jax.vmap(env._spread_start, (0, None))(keys, env.robot.init_qpos)
+  lower, upper = env.robot.joint_range
+  beyond = (qpos[:, 7:] < lower) | (qpos[:, 7:] > upper)
+  assert beyond.any() == parity
+  assert len(np.unique(qpos[:, 10])) > 100
+
+
+@pytest.mark.parametrize("parity", [False, True])
+def test_apollo_starts_with_its_targets_where_its_joints_are(parity: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+  env = load_task(APOLLO, {"parity": parity})
+  monkeypatch.setattr(env.physics, "forward", lambda model, data: data)
+  data = env.reset(jax.random.PRNGKey(0)).data
+  np.testing.assert_array_equal(data.ctrl, np.zeros(32) if parity else data.qpos[7:])
+
+
+def test_noise_has_an_amplitude_for_each_joint() -> None:
+  env = load_task("BerkeleyHumanoidJoystickFlatTerrain")
+  state = recorded("BerkeleyHumanoidJoystickFlatTerrain")
+  draws = jax.vmap(lambda key: env.evaluate(state.data, state.info | {"rng": key}, jnp.zeros(12)).obs)
+  obs = draws(jax.random.split(jax.random.PRNGKey(0), 500))
+  joints = slice(12, 24)  # after velocity, gyro, gravity and command
+  error = jnp.abs(obs["state"][:, joints] - (state.data.qpos[7:] - env.robot.default_pose)).max(0)
+  np.testing.assert_allclose(error, 2 * [0.03, 0.03, 0.03, 0.05, 0.08, 0.03], rtol=0.03)
+
+
+def test_restricted_joint_range() -> None:
+  model = load_task(G1, {"restricted_joint_range": True}).mj_model
+  np.testing.assert_allclose(model.joint("left_hip_yaw_joint").range, [-0.7, 0.7])
+  np.testing.assert_allclose(model.actuator("left_hip_yaw_joint").ctrlrange, [-0.7, 0.7])
+  with pytest.raises(ConfigError, match="robot=t1 has no restricted_range"):
+    load_task(T1, {"restricted_joint_range": True})
+
+
+@pytest.mark.parametrize(("env", "size"), [("joystick", 81), ("biped_joystick", 85)])
+def test_any_biped_can_be_named(env: str, size: int) -> None:
+  task = registry.build(compose([f"env={env}", "robot=t1"]).env)
+  assert isinstance(task.observation_size, dict)
+  assert task.observation_size["state"] == (size,)

@@ -1,0 +1,110 @@
+"""Training as a whole, with every algorithm, on a task that compiles in seconds."""
+
+from functools import cache
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from playground.learning.evaluation import make_evaluator
+from playground.learning.learner import Learner
+from playground.learning.loop import Loop, Program, compile_program, schedule
+from playground.learning.ppo import PPOConfig
+from playground.learning.sac import SACConfig
+from tests.dummy import SMALL_PPO, SMALL_SAC, Recorder, numbers, point_learner
+
+Config = PPOConfig | SACConfig
+every_algorithm = pytest.mark.parametrize("config", [SMALL_PPO, SMALL_SAC], ids=["ppo", "sac"])
+
+
+@cache
+def built(config: Config, nan_at: int | None = None) -> tuple[Learner, Program]:
+  learner = point_learner(config, nan_at=nan_at)
+  evaluate = make_evaluator(learner.env.unwrapped, learner.act, config.num_eval_envs, learner.mesh, 1)
+  return learner, compile_program(learner, evaluate, {}, {})
+
+
+def run(
+  config: Config,
+  hooks: Recorder,
+  updates: int = 12,
+  resumed: tuple[Any, int] | None = None,
+  nan_at: int | None = None,
+) -> tuple[Any, bool]:
+  learner, program = built(config, nan_at)
+  marks = schedule(updates, 3, 1, max(5, updates // 20))
+  loop = Loop(learner, program, marks, seed=3, hooks=hooks, model={}, eval_model={})
+  return loop.run(*(resumed or (loop.init(), None)))
+
+
+@pytest.mark.parametrize(
+  ("config", "updates", "names"),
+  [
+    (SMALL_PPO, 150, ("training/total_loss", "training/approx_kl")),
+    (SMALL_SAC, 1500, ("training/critic_loss", "training/entropy")),
+  ],
+  ids=["ppo", "sac"],
+)
+def test_it_learns_and_reports(config: Config, updates: int, names: tuple[str, ...]) -> None:
+  hooks = Recorder()
+  _, completed = run(config, hooks, updates=updates)
+  assert completed
+  scores = [row["eval/episode_reward"] for _, row in hooks.rows if "eval/episode_reward" in row]
+  assert len(scores) == 3
+  assert scores[-1] > 0.5 * scores[0], "the return is negative: half the distance is a clear gain"
+  steps, last = hooks.rows[-1]
+  assert steps == updates * built(config)[0].steps_per_update
+  for name in (*names, "training/episode_reward", "training/grad_norm", "eval/episode_distance"):
+    assert np.isfinite(last[name]), name
+  assert last["eval/episode_length"] == 20
+
+
+@every_algorithm
+def test_an_interrupted_run_goes_on_bit_for_bit(config: Config) -> None:
+  whole, first, second = Recorder(), Recorder(stop_after=2), Recorder()
+  expected, _ = run(config, whole)
+  expected = numbers(expected)
+  _, completed = run(config, first)
+  assert not completed
+  update, saved = first.saved[-1]
+  learner, _ = built(config)
+  got, completed = run(config, second, resumed=(learner.place(saved), update))
+  assert completed
+  for a, b in zip(expected, numbers(got), strict=True):
+    np.testing.assert_array_equal(a, b)
+  kept = [row for row in first.rows if row[0] <= update * learner.steps_per_update]
+  np.testing.assert_equal([*kept, *second.rows], whole.rows)
+
+
+@every_algorithm
+def test_a_training_call_of_any_length_is_one_program(config: Config) -> None:
+  learner, _ = built(config)
+  model: dict[str, Any] = {}
+  state = learner.init(jax.random.PRNGKey(0), model)
+  for updates in (1, 3, 2):
+    state, _ = learner.train(state, model, np.int32(updates))
+  assert learner.train._cache_size() == 1
+
+
+@every_algorithm
+def test_nan_is_counted_captured_and_kept_from_the_parameters(config: Config) -> None:
+  hooks = Recorder()
+  state, _ = run(config, hooks, updates=8, nan_at=3)
+  assert sum(row.get("training/nonfinite", 0) for _, row in hooks.rows) > 0
+  for leaf in numbers(state.replace(capture=None, env_state=None)):
+    assert np.isfinite(leaf).all()
+  capture = jax.device_get(state.capture)
+  assert capture.found.all()
+  assert np.isfinite(capture.state.data.qpos).all()
+  assert np.isnan(capture.after["qpos"]).any()
+
+
+@every_algorithm
+def test_a_mean_over_nothing_is_left_out(config: Config) -> None:
+  hooks = Recorder()
+  run(config, hooks, updates=1)
+  _, row = hooks.rows[-1]
+  assert row["training/episodes"] == 0
+  assert not [name for name in row if name.startswith("training/episode_")]
+  assert not any(np.isnan(value) for value in row.values())

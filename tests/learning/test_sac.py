@@ -1,0 +1,215 @@
+"""What is SAC's own; what it shares with the other algorithms is in test_learner.py."""
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from jax.sharding import PartitionSpec as P
+
+from playground.errors import CheckpointError, ConfigError
+from playground.hardware.mesh import jit_on_mesh
+from playground.learning import sac
+from playground.learning.checkpoints import Checkpoint, CheckpointStore, find_checkpoints
+from playground.learning.learner import Learner
+from playground.learning.sac import SAC
+from tests.dummy import SMALL_SAC, numbers, point_learner
+
+PREFILL = 4  # steps of 16 environments that make up min_replay_size
+MODEL: dict[str, Any] = {}
+
+
+@cache
+def built() -> SAC:
+  learner = point_learner(SMALL_SAC)
+  assert isinstance(learner, SAC)
+  return learner
+
+
+@cache
+def other() -> Learner:
+  """A second set of hyperparameters, shared because compiling it takes seconds."""
+  return point_learner(
+    dataclasses.replace(SMALL_SAC, alpha_learning_rate=1e-5, grad_updates_per_step=1, checkpoint_replay=False)
+  )
+
+
+def trained(updates: int, learner: Learner | None = None) -> Any:
+  learner = learner or built()
+  state, _ = learner.train(learner.init(jax.random.PRNGKey(0), MODEL), MODEL, np.int32(updates))
+  return state
+
+
+def test_nothing_is_learned_before_there_is_enough_to_learn_from() -> None:
+  start, filled, later = trained(0), trained(PREFILL), trained(PREFILL + 1)
+  for a, b in zip(numbers(start.params), numbers(filled.params), strict=True):
+    np.testing.assert_array_equal(a, b)
+  assert all((a != b).any() for a, b in zip(numbers(filled.params), numbers(later.params), strict=True))
+  assert int(later.opt_state.count) == SMALL_SAC.grad_updates_per_step
+  moved = ravel_pytree(later.params.q)[0] - ravel_pytree(filled.params.q)[0]
+  followed = ravel_pytree(later.target_q)[0] - ravel_pytree(filled.target_q)[0]
+  assert 0 < jnp.abs(followed).max() < 3 * SMALL_SAC.tau * jnp.abs(moved).max()
+
+
+def test_transitions_are_what_the_environments_did() -> None:
+  state = trained(25)  # the 20th step of the point is cut by the time limit
+  rows = jax.device_get(state.replay.data)[:25]
+  example = built().buffer.sample(state.replay, jax.random.PRNGKey(0), (1,))
+  _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], example))
+  steps = jax.vmap(jax.vmap(unravel))(rows)
+  position, after = steps.obs["state"], steps.next_obs["state"]
+  np.testing.assert_array_equal(position[1:], after[:-1])
+  cut = np.arange(25) == 19
+  np.testing.assert_array_equal(steps.truncation, np.broadcast_to(cut[:, None], (25, 16)))
+  np.testing.assert_array_equal(steps.discount, 1 - steps.truncation)
+  moved = position + 0.1 * steps.action
+  np.testing.assert_allclose(after[~cut], moved[~cut], atol=1e-6)
+  np.testing.assert_array_equal(after[19], position[0])
+  np.testing.assert_allclose(steps.reward, -np.linalg.norm(moved, axis=-1), atol=1e-6)
+
+
+def test_a_step_that_went_nan_teaches_the_critics_nothing() -> None:
+  state = trained(3, point_learner(SMALL_SAC, nan_at=3))
+  assert np.isfinite(state.replay.data).all()
+  reward, discount, truncation = np.moveaxis(np.asarray(state.replay.data)[2, :, -3:], -1, 0)
+  assert (reward == 0).all()
+  assert (discount == 0).all()
+  assert (truncation == 1).all()
+
+
+def test_a_bad_gradient_is_left_out() -> None:
+  learner, state = built(), trained(PREFILL + 1)
+  batch = learner.buffer.sample(state.replay, jax.random.PRNGKey(0), (32,))
+  batch = batch.replace(reward=batch.reward * np.nan)
+  flat, unravel = ravel_pytree(state.params)
+  target, unravel_target = ravel_pytree(state.target_q)
+  step = lambda carry, x: learner._sgd_step(unravel, unravel_target, jnp.ones_like(flat), carry, x)
+  carry = (flat, target, state.opt_state)
+  new, parts = jit_on_mesh(step, learner.mesh, (P(), P()), P())(carry, (batch, jnp.zeros((2, 32, 2))))
+  assert parts[-1] == 1
+  assert np.isfinite(parts).all()
+  for a, b in zip(numbers(carry), numbers(new), strict=True):
+    np.testing.assert_array_equal(a, b)
+
+
+def test_each_learns_at_its_own_rate() -> None:
+  before, after = trained(PREFILL, other()), trained(PREFILL + 1, other())
+  step = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), after.params, before.params)
+  np.testing.assert_allclose(step.log_alpha, 1e-5, rtol=1e-3)  # Adam's first step is the rate
+  for change in jax.tree.leaves((step.q, step.policy)):
+    np.testing.assert_allclose(change, SMALL_SAC.learning_rate, rtol=0.05)
+
+
+# Checkpoints
+
+
+def save(folder: Path, learner: Learner, *states: Any) -> list[Path]:
+  """Saves states as a run does, at steps 10, 20, ...; returns the checkpoints, newest first."""
+  store = CheckpointStore(folder / "checkpoints")
+  for i, state in enumerate(states):
+    policy, rest = learner.split(state)
+    store.save(10 * (i + 1), policy, rest, {"update": i}, lambda state=state: learner.experience(state))
+  store.close()
+  return find_checkpoints(folder)
+
+
+@pytest.mark.parametrize("updates", [7, 40], ids=["half full", "full"])
+def test_the_newest_checkpoint_restores_everything(tmp_path: Path, updates: int) -> None:
+  learner, state = built(), trained(updates)
+  newest, older = save(tmp_path, learner, trained(3), state)
+  assert Checkpoint(newest).has("replay")
+  assert not Checkpoint(older).has("replay")
+  template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), MODEL)
+  restored, said = learner.restore(Checkpoint(newest), template)
+  assert said == f"Resuming the whole training state of {newest} (20 steps)."
+  assert jax.tree.structure(restored) == jax.tree.structure(state)
+  for a, b in zip(numbers(state), numbers(restored), strict=True):
+    np.testing.assert_array_equal(a, b)
+
+
+def test_without_the_buffer_it_is_filled_again(tmp_path: Path) -> None:
+  learner = built()
+  _, older = save(tmp_path, learner, trained(30), trained(31))
+  template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), MODEL)
+  state, said = learner.restore(Checkpoint(older), template)
+  assert "without its replay buffer (64 transitions are collected before it learns on)" in said
+  before = numbers(state.params)
+  state, _ = learner.train(state, MODEL, np.int32(PREFILL))
+  for a, b in zip(before, numbers(state.params), strict=True):
+    np.testing.assert_array_equal(a, b)
+  state, metrics = learner.train(state, MODEL, np.int32(1))
+  assert int(state.replay.inserted) == PREFILL + 1
+  assert all((a != b).any() for a, b in zip(before, numbers(state.params), strict=True))
+  assert np.isfinite(metrics["critic_loss"])
+
+
+def test_a_buffer_that_is_not_to_be_saved_is_not_even_copied(tmp_path: Path) -> None:
+  learner = other()
+  state = trained(6, learner)
+  copy = learner.copy(state)
+  assert copy.replay.data is None
+  for kept in (copy, state):
+    assert learner.experience(kept) is None
+  (path,) = save(tmp_path, learner, copy)
+  restored, _ = learner.restore(Checkpoint(path), jax.eval_shape(lambda: state))
+  assert not restored.replay.inserted
+  for a, b in zip(numbers(state.opt_state), numbers(restored.opt_state), strict=True):
+    np.testing.assert_array_equal(a, b)
+
+
+def test_new_weights_come_with_their_target() -> None:
+  learner = built()
+  policy = jax.device_get(learner.policy(trained(20)))
+  state = learner.with_policy(trained(0), policy)
+  for ours, theirs in ((state.params, policy.params), (state.target_q, policy.params.q)):
+    for a, b in zip(numbers(ours), numbers(theirs), strict=True):
+      np.testing.assert_array_equal(a, b)
+
+
+def test_another_buffer_is_refused(tmp_path: Path) -> None:
+  learner = built()
+  (path,) = save(tmp_path, learner, trained(7))
+  (path / "replay").rename(path / "elsewhere")
+  (path / "replay").mkdir()
+  with pytest.raises(CheckpointError, match="damaged: its 'replay' cannot be read"):
+    learner.restore(Checkpoint(path), jax.eval_shape(learner.init, jax.random.PRNGKey(0), MODEL))
+
+
+# What is refused
+
+
+def test_memory_is_stated_and_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+  (said,) = point_learner(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
+  assert said.startswith("Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device, and as much ")
+  monkeypatch.setattr(sac, "device_memory", lambda mesh: 10 * 10**9)
+  with pytest.raises(ConfigError, match=r"agent.max_replay_size=100000000 is .* but a device has 10.00 GB: lower it"):
+    point_learner(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
+  config = dataclasses.replace(SMALL_SAC, max_replay_size=10**8, checkpoint_replay=False)
+  assert point_learner(config).notices() == [
+    "Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device."
+  ]
+
+
+@pytest.mark.parametrize(
+  ("change", "words"),
+  [
+    ({"num_eval_envs": 15}, ["agent.num_eval_envs=15", "devices, 2"]),
+    ({"batch_size": 15}, ["agent.batch_size=15", "devices, 2"]),
+    ({"max_replay_size": 60}, ["agent.max_replay_size=60", "agent.min_replay_size=64"]),
+    ({"max_replay_size": 8, "min_replay_size": 0}, ["agent.max_replay_size=8", "agent.num_envs=16"]),
+  ],
+)
+def test_sizes_that_do_not_go_together_are_refused(change: dict[str, Any], words: list[str]) -> None:
+  with pytest.raises(ConfigError) as error:
+    dataclasses.replace(SMALL_SAC, **change).check(num_devices=2)
+  assert all(word in str(error.value) for word in words)
+
+
+def test_a_budget_that_only_fills_the_buffer_is_refused() -> None:
+  with pytest.raises(ConfigError, match=r"agent.num_timesteps=64 is over before agent.min_replay_size=64"):
+    point_learner(dataclasses.replace(SMALL_SAC, num_timesteps=64))
