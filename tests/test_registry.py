@@ -20,6 +20,7 @@ from playground.errors import ConfigError, UnknownNameError
 GENERIC = [
   ["env=joystick", "robot=go1"],
   ["env=getup", "robot=go1"],
+  ["env=gait_tracking", "robot=spot"],
   ["env=stand", "robot=go1", "env.support=[FR,FL]"],
 ]
 
@@ -158,13 +159,15 @@ def _leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 
 @pytest.mark.parametrize("overrides", [*([f"env={name}"] for name in registry.names()), *GENERIC], ids=" ".join)
-def test_every_key_is_read(overrides: list[str]):
+def test_every_key_is_read_and_a_step_keeps_the_states_structure(overrides: list[str]):
   config = compose([*overrides, "tuned=null"]).resolved["env"]
   read: set[str] = set()
   env: Any = registry.task_class(config["task"])
   env = env(Recorder(config, read))
   state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-  jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+  after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+  assert jax.tree.structure(after) == jax.tree.structure(state)
+  assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
   # The robot's description serves many tasks, none of which needs all of it.
   unread = [key for key in _leaves(config) if key not in read and key != "task" and not key.startswith("robot.")]
   assert not unread

@@ -62,15 +62,17 @@ class Box:
     max: largest.
     zero_probability: of standing still.
     deadband: a component whose size is below becomes 0.
+    unused_keys: how many random keys are split off and left unused first. (Playground 0.2.0's order of draws.)
   """
 
   min: Sequence[float]
   max: Sequence[float]
   zero_probability: float
   deadband: float
+  unused_keys: int = 0
 
   def first(self, key: jax.Array) -> jax.Array:
-    *keys, zero_key = jax.random.split(key, 4)
+    *keys, zero_key = jax.random.split(key, 4 + self.unused_keys)[self.unused_keys :]
     bounds = zip(keys, self.min, self.max, strict=True)
     command = jnp.stack([jax.random.uniform(k, minval=low, maxval=high) for k, low, high in bounds])
     command = jnp.where(jax.random.bernoulli(zero_key, self.zero_probability), 0.0, command)
@@ -87,7 +89,7 @@ def make_sampler(config: Any) -> CommandSampler:
   low = tuple(-x for x in high) if config.min is None else tuple(config.min)
   samplers: dict[str, CommandSampler] = {
     "walk": Walk(low, high, tuple(config.nonzero_probability), config.change_probability),
-    "box": Box(low, high, config.zero_probability, config.deadband),
+    "box": Box(low, high, config.zero_probability, config.deadband, config.unused_keys),
   }
   return lookup(samplers, config.sampler, "env.command.sampler")
 

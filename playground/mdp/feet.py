@@ -36,6 +36,11 @@ def feet_air_time(c: Context, min_air_time: float) -> jax.Array:
   return ((c.kept("feet_air_time") - min_air_time) * c.first_contact).sum()
 
 
+def feet_air_time_unless_turning(c: Context, min_air_time: float) -> jax.Array:
+  """As `feet_air_time`, while |command_xy| > 0.05 m/s: 0 when asked to turn on the spot. (0.2.0's Barkour.)"""
+  return feet_air_time(c, min_air_time) * (jnp.linalg.norm(c.command[:2]) > 0.05)
+
+
 def feet_air_time_capped(c: Context, min_air_time: float, max_air_time: float) -> jax.Array:
   """Sum over feet that touch down of min(air time - min, max - min), s. (Paper: not below 0 either.)"""
   time = (c.kept("feet_air_time") - min_air_time) * c.first_contact
@@ -76,7 +81,7 @@ def contact_force(c: Context, max_contact_force: float) -> jax.Array:
 FEET: dict[str, Callable[..., jax.Array]] = {
   f.__name__: f
   for f in (
-    feet_clearance, feet_height, feet_slip, feet_slip_of_base, feet_air_time, feet_air_time_capped, feet_phase,
-    feet_phase_unless_at_rest, feet_distance, contact_force,
+    feet_clearance, feet_height, feet_slip, feet_slip_of_base, feet_air_time, feet_air_time_unless_turning,
+    feet_air_time_capped, feet_phase, feet_phase_unless_at_rest, feet_distance, contact_force,
   )
 }  # fmt: skip

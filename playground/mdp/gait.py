@@ -87,6 +87,8 @@ def make_gait(config: Any, robot: LeggedRobot, dt: float, parity: bool) -> Gait 
   if not config.modes:
     return None
   modes = [robot.gait(name) for name in config.modes]
+  if not parity:  # else a foot may start outside the range of phases, where its height is another (Playground 0.2.0)
+    modes = [[phase - 2 * np.pi if phase > np.pi else phase for phase in phases] for phases in modes]
   return Gait(modes, frequency, height and tuple(height), rest, dt, parity)
 
 

@@ -51,9 +51,27 @@ def pose_deviation_by_command(c: Context, pose_weights: Sequence[float]) -> jax.
   return (jnp.square(c.pose_error) * weights).sum()
 
 
+def pose_when_still(c: Context, pose_sharpness: float) -> jax.Array:
+  """exp(-sharpness |q - default|²) while told to stand still, else 1."""
+  return jnp.exp(-pose_sharpness * jnp.square(c.pose_error).sum() * c.still)
+
+
+def hip_splay(c: Context) -> jax.Array:
+  """Sum (q - default)² over the hips."""
+  return jnp.square(c.pose_error[c.robot.joints("hips")]).sum()
+
+
 def stand_still(c: Context) -> jax.Array:
   """Sum |q - default|, to be weighed while the command is to stand still. (Paper: k |command_xy|.)"""
   return jnp.abs(c.pose_error).sum()
+
+
+def stand_still_unless_left(c: Context) -> jax.Array:
+  """As `stand_still`, whenever command_y / |command_xy| < 0.1, however large the command is.
+
+  A slip of Playground 0.2.0's Barkour: of (direction, norm) it takes the direction's second component for the norm.
+  """
+  return stand_still(c) * (c.command[1] / jnp.linalg.norm(c.command[:2]) < 0.1)
 
 
 def joint_deviation_knee(c: Context) -> jax.Array:
@@ -120,6 +138,17 @@ def action_rate_and_change(c: Context) -> jax.Array:
   return jnp.square(c.action - last).sum() + jnp.square(c.action - 2 * last + before).sum()
 
 
+def action_rate_and_change_lagged(c: Context) -> jax.Array:
+  """|a1 - a2|² + |a1 - 2 a2 + a|²: a slip of Playground 0.2.0's H1, which mixes up the order of the actions."""
+  last, before = c.kept("last_act"), c.kept("last_last_act")
+  return jnp.square(last - before).sum() + jnp.square(last - 2 * before + c.action).sum()
+
+
+def action_size(c: Context) -> jax.Array:
+  """|action|²."""
+  return jnp.square(c.action).sum()
+
+
 def dof_acc(c: Context) -> jax.Array:
   """|qdd|², of the joints."""
   return jnp.square(c.data.qacc[6:]).sum()
@@ -138,9 +167,9 @@ def dof_vel_excess(c: Context, max_joint_vel: float) -> jax.Array:
 JOINTS: dict[str, Callable[..., jax.Array]] = {
   f.__name__: f
   for f in (
-    dof_pos_limits, dof_pos_limits_scaled, pose, pose_deviation, pose_deviation_by_command, stand_still,
-    joint_deviation_knee, joint_deviation_hip, joint_deviation_hip_sideways, joint_deviation_hip_crossed, torques,
-    torques_sum, torques_squared, energy, energy_share, action_rate, action_rate_and_change, dof_acc, dof_vel,
-    dof_vel_excess,
+    dof_pos_limits, dof_pos_limits_scaled, pose, pose_deviation, pose_deviation_by_command, pose_when_still, hip_splay,
+    stand_still, stand_still_unless_left, joint_deviation_knee, joint_deviation_hip, joint_deviation_hip_sideways,
+    joint_deviation_hip_crossed, torques, torques_sum, torques_squared, energy, energy_share, action_rate,
+    action_rate_and_change, action_rate_and_change_lagged, action_size, dof_acc, dof_vel, dof_vel_excess,
   )
 }  # fmt: skip

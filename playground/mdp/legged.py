@@ -25,9 +25,11 @@ class LeggedRobot:
     init_qpos: configuration of the keyframe, shape [nq].
     default_pose: its joint part, rad, shape [nu].
     joint_range: (lower, upper) limits of the joints, or of the targets of joints that have none, rad, shape [2, nu].
+    target_range: (lower, upper) limits of the joints' targets: the robot's own, or those of the servos, rad, [2, nu].
     root: id of the body that is pushed.
     base_site: id of the site that carries the inertial sensors.
     feet: ids of the foot sites, shape [feet].
+    misreads_contact: whether tasks should read `misread_contact` in their steps.
     pose_weights: how much each joint's distance from the default pose counts, shape [nu].
     torque_limits: of the joints, N m, shape [nu].
   """
@@ -38,7 +40,7 @@ class LeggedRobot:
     Args:
       mj_model: the compiled scene.
       config: `env.robot`.
-      parity: whether its `parity`, if there is one, replaces `base_site` and `sensors`.
+      parity: whether its `parity`, if there is one, counts: `sensors` replace others, `misread_contact` is as it says.
 
     Raises:
       UnknownNameError: the model has no object of that name.
@@ -52,14 +54,20 @@ class LeggedRobot:
     self.default_pose = self.init_qpos[7:]
     limited = mj_model.jnt_limited[1:, None].astype(bool)
     self.joint_range = jnp.array(np.where(limited, mj_model.jnt_range[1:], mj_model.actuator_ctrlrange).T)
+    own = config.get("target_range")
+    self.target_range = jnp.array([own.lower, own.upper] if own else mj_model.actuator_ctrlrange.T)
     self.root = _find(mj_model, "body", config.root)
     replaced = config.parity if parity and "parity" in config else {}
-    self.base_site = _find(mj_model, "site", replaced.get("base_site", config.base_site))
+    self.base_site = _find(mj_model, "site", config.base_site)
     self.feet = np.array([_find(mj_model, "site", name) for name in config.feet])
+    self.misreads_contact: bool = replaced.get("misread_contact", False)
     sensors = {**config.sensors, **replaced.get("sensors", {})}
     self._sensors = {key: _address(mj_model, name) for key, name in sensors.items()}
     self._foot_linvel = np.array([_address(mj_model, name) for name in config.foot_linvel])
-    self._foot_contact = [np.concatenate([_address(mj_model, name) for name in foot]) for foot in config.foot_contact]
+    contact_sensors = [[_find(mj_model, "sensor", name) for name in foot] for foot in config.foot_contact]
+    self._foot_contact = [mj_model.sensor_adr[ids] for ids in contact_sensors]
+    self._foot_contact_misread = contact_sensors
+    self._foot_pos = np.array([_address(mj_model, name) for name in config.get("foot_pos", ())])
     self._foot_force = np.array([_address(mj_model, name) for name in config.get("foot_force", ())])
     self._subtree = _subtree(mj_model, self.root)
     self.pose_weights = tuple(config.get("pose_weights", [1.0] * len(joints)))
@@ -102,6 +110,10 @@ class LeggedRobot:
     """Returns the world velocities of the foot sites, m/s, shape [feet, 3]."""
     return data.sensordata[self._foot_linvel]
 
+  def feet_pos(self, data: PhysicsData) -> jax.Array:
+    """Returns the positions of the feet in the frame of the base site, m, shape [feet, 3]."""
+    return data.sensordata[self._present("foot_pos", self._foot_pos)]
+
   def feet_force(self, data: PhysicsData) -> jax.Array:
     """Returns the force between each foot and its leg in the foot site's frame, N, shape [feet, 3]."""
     return data.sensordata[self._present("foot_force", self._foot_force)]
@@ -118,6 +130,13 @@ class LeggedRobot:
   def contact(self, data: PhysicsData) -> jax.Array:
     """Returns whether each foot touches the floor, bool, shape [feet]: any of its contact sensors is above 0."""
     return jnp.stack([(data.sensordata[address] > 0).any() for address in self._foot_contact])
+
+  def misread_contact(self, data: PhysicsData) -> jax.Array:
+    """As `contact`, but takes the sensors' ids for the addresses of their readings: a slip of Playground 0.2.0's H1.
+
+    What it reads are the base's height and the directions of its axes.
+    """
+    return jnp.stack([(data.sensordata[np.array(ids)] > 0).any() for ids in self._foot_contact_misread])
 
   def mass(self, model: mjx.Model) -> jax.Array:
     """Returns the mass that a push on `root` moves, kg: the root's and that of all it carries."""

@@ -17,6 +17,11 @@ def gyro(c: Context) -> jax.Array:
   return c.sensor("gyro")
 
 
+def gyro_yaw(c: Context) -> jax.Array:
+  """Angular velocity of the base about its own z, rad/s [1]."""
+  return c.sensor("gyro")[2:]
+
+
 def gravity(c: Context) -> jax.Array:
   """Direction of gravity in the base frame [3]."""
   return c.gravity
@@ -30,6 +35,11 @@ def joint_pos(c: Context) -> jax.Array:
 def joint_angle(c: Context) -> jax.Array:
   """Joint positions as they are, rad [nu]."""
   return c.joint_pos
+
+
+def target_error(c: Context) -> jax.Array:
+  """Joint positions relative to their targets, rad [nu]."""
+  return c.joint_pos - c.data.ctrl
 
 
 def joint_vel(c: Context) -> jax.Array:
@@ -107,6 +117,11 @@ def feet_velocity(c: Context) -> jax.Array:
   return c.feet_velocity.ravel()
 
 
+def feet_pos(c: Context) -> jax.Array:
+  """Positions of the feet in the base frame, m [3 * feet]."""
+  return c.robot.feet_pos(c.data).ravel()
+
+
 def feet_air_time(c: Context) -> jax.Array:
   """How long each foot has been in the air, s [feet]."""
   return c.kept("feet_air_time")
@@ -115,6 +130,21 @@ def feet_air_time(c: Context) -> jax.Array:
 def phase(c: Context) -> jax.Array:
   """Cosines of the feet's phases in the gait, then their sines [2 * feet]."""
   return jnp.concatenate([jnp.cos(c.phase), jnp.sin(c.phase)])
+
+
+def gait(c: Context) -> jax.Array:
+  """Which of `env.gait.modes` the episode is walked in, its index [1]."""
+  return c.kept("gait").astype(jnp.float32)[None]
+
+
+def gait_frequency(c: Context) -> jax.Array:
+  """Frequency of the gait's steps, Hz [1]."""
+  return c.kept("gait_freq")[None]
+
+
+def foot_height(c: Context) -> jax.Array:
+  """How high the feet should swing in this episode's gait, m [1]."""
+  return c.kept("foot_height")[None]
 
 
 def push_force(c: Context) -> jax.Array:
@@ -134,6 +164,6 @@ OBSERVATIONS: dict[str, Callable[[Context], jax.Array]] = {
   for f in (
     gyro, gravity, joint_pos, joint_vel, linvel, last_act, command, accelerometer, global_angvel, upvector,
     joint_angle, base_height, root_height, root_pos, root_quat, actuator_force, last_contact, contact, feet_velocity,
-    feet_air_time, phase, push_force, pushed,
+    feet_air_time, phase, push_force, pushed, gyro_yaw, target_error, feet_pos, gait, gait_frequency, foot_height,
   )
 }  # fmt: skip

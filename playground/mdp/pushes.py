@@ -1,6 +1,7 @@
 """Pushes against a robot's body, and when they come: forces for a while (kicks), or jumps of its velocity."""
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import jax
@@ -30,51 +31,104 @@ class Pushes(Protocol):
     ...
 
 
+@dataclasses.dataclass(frozen=True)
 class Kicks:
-  """Forces on the root body for a short while, from time to time (see `kick_force`)."""
+  """Forces on the root body for a short while, from time to time.
+
+  Attributes:
+    enable: whether there are any.
+    velocity: range of their strength, m/s (see `kick_force`).
+    duration: range, s.
+    interval: range of the time between them, s.
+    root: id of the body.
+    dt: control step, s.
+  """
 
   keys: ClassVar[tuple[str, ...]] = ("push_interval", "push_duration", "push_velocity")
-
-  def __init__(self, config: Any, root: int, dt: float):
-    self._config, self._root, self._dt = config, root, dt
+  enable: bool
+  velocity: Sequence[float]
+  duration: Sequence[float]
+  interval: Sequence[float]
+  root: int
+  dt: float
 
   def start(self, keys: Mapping[str, jax.Array], mass: jax.Array) -> Info:
-    info = sample_kicks(jnp.stack([keys[name] for name in self.keys]), self._config, self._dt)
-    return info | ({"pert_mass": mass} if self._config.enable else {})
+    info = sample_kicks(jnp.stack([keys[name] for name in self.keys]), self, self.dt)
+    return info | ({"pert_mass": mass} if self.enable else {})
 
   def act(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
-    if not self._config.enable:
+    if not self.enable:
       return data, {}
-    force, changed = advance_kick(info, info["pert_mass"], self._dt)
-    return data.replace(xfrc_applied=data.xfrc_applied.at[self._root, :3].set(force)), changed
+    force, changed = advance_kick(info, info["pert_mass"], self.dt)
+    return data.replace(xfrc_applied=data.xfrc_applied.at[self.root, :3].set(force)), changed
 
 
+@dataclasses.dataclass(frozen=True)
+class RegularKicks(Kicks):
+  """As `Kicks`, but in whole control steps, and the interval is that from the start of one to the start of the next.
+
+  (Playground 0.2.0, Barkour.)
+  """
+
+  def start(self, keys: Mapping[str, jax.Array], mass: jax.Array) -> Info:
+    steps = lambda key, reach: jax.random.randint(keys[key], (), *(round(time / self.dt) for time in reach))
+    low, high = self.velocity
+    return {
+      "push_step": jnp.zeros((), jnp.int32),
+      "pert_interval": steps("push_interval", self.interval),
+      "pert_duration": steps("push_duration", self.duration),
+      "pert_mag": jax.random.uniform(keys["push_velocity"], minval=low, maxval=high),
+      "pert_dir": jnp.zeros(3),  # until the first kick
+      "pert_mass": mass,
+    }
+
+  def act(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
+    if not self.enable:
+      return data, {}
+    since = info["push_step"] % info["pert_interval"]
+    starting = (since == 0) & (info["push_step"] > 0)
+    rng, key = jax.random.split(info["rng"])
+    direction = jnp.where(starting, _horizontal(key), info["pert_dir"])
+    force = kick_force(since * self.dt, info["pert_mass"], info["pert_mag"], info["pert_duration"] * self.dt)
+    force = jnp.where(since < info["pert_duration"], force, 0.0) * direction
+    changed = {"rng": jnp.where(starting, rng, info["rng"]), "push_step": info["push_step"] + 1, "pert_dir": direction}
+    return data.replace(xfrc_applied=data.xfrc_applied.at[self.root, :3].set(force)), changed
+
+
+@dataclasses.dataclass(frozen=True)
 class Jumps:
-  """Jumps of the base's horizontal velocity, at one interval in an episode, each in a direction of its own."""
+  """Jumps of the base's horizontal velocity, at one interval in an episode, each in a direction of its own.
+
+  Attributes:
+    enable: whether there are any.
+    velocity: range of the change, m/s.
+    interval: range of the time between them, s.
+    dt: control step, s.
+  """
 
   keys: ClassVar[tuple[str, ...]] = ("push_interval",)
-
-  def __init__(self, config: Any, root: int, dt: float):
-    del root
-    self._config, self._dt = config, dt
+  enable: bool
+  velocity: Sequence[float]
+  interval: Sequence[float]
+  dt: float
 
   def start(self, keys: Mapping[str, jax.Array], mass: jax.Array) -> Info:
     del mass
-    low, high = self._config.interval
+    low, high = self.interval
     interval = jax.random.uniform(keys["push_interval"], minval=low, maxval=high)
     return {
       "push": jnp.zeros(2),  # direction of a jump in this step, else 0
       "push_step": jnp.zeros((), jnp.int32),
-      "push_interval_steps": jnp.round(interval / self._dt).astype(jnp.int32),
+      "push_interval_steps": jnp.round(interval / self.dt).astype(jnp.int32),
     }
 
   def act(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
     rng, angle_key, size_key = jax.random.split(info["rng"], 3)
     angle = jax.random.uniform(angle_key, maxval=2 * jnp.pi)
-    low, high = self._config.velocity
+    low, high = self.velocity
     size = jax.random.uniform(size_key, minval=low, maxval=high)
     step = info["push_step"] + 1
-    due = (step % info["push_interval_steps"] == 0) & self._config.enable
+    due = (step % info["push_interval_steps"] == 0) & self.enable
     push = jnp.array([jnp.cos(angle), jnp.sin(angle)]) * due
     data = data.replace(qvel=data.qvel.at[:2].add(push * size))
     return data, {"rng": rng, "push": push, "push_step": step}
@@ -82,8 +136,13 @@ class Jumps:
 
 def make_pushes(config: Any, root: int, dt: float) -> Pushes:
   """Builds the pushes that `env.pushes.kind` names; `root` is the id of the body that a kick acts on."""
-  kinds: dict[str, type[Kicks | Jumps]] = {"kick": Kicks, "jump": Jumps}
-  return lookup(kinds, config.kind, "env.pushes.kind")(config, root, dt)
+  velocity, duration, interval = (tuple(config[key]) for key in ("velocity", "duration", "interval"))
+  kinds: dict[str, Pushes] = {
+    "kick": Kicks(config.enable, velocity, duration, interval, root, dt),
+    "regular_kick": RegularKicks(config.enable, velocity, duration, interval, root, dt),
+    "jump": Jumps(config.enable, velocity, interval, dt),
+  }
+  return lookup(kinds, config.kind, "env.pushes.kind")
 
 
 def sample_kicks(keys: jax.Array, config: Any, dt: float) -> Info:
@@ -91,7 +150,7 @@ def sample_kicks(keys: jax.Array, config: Any, dt: float) -> Info:
 
   Args:
     keys: three random keys: interval, duration, strength.
-    config: `interval` and `duration` (ranges, s), `velocity` (range, m/s, see `kick_force`).
+    config: has `interval` and `duration` (ranges, s) and `velocity` (range, m/s, see `kick_force`).
     dt: control step, s.
 
   Returns:
@@ -142,13 +201,17 @@ def advance_kick(info: Mapping[str, Any], mass: jax.Array, dt: float) -> tuple[j
   over = kicking & (info["pert_steps"] >= info["pert_duration"])
 
   rng, key = jax.random.split(info["rng"])
-  angle = jax.random.uniform(key, maxval=2 * jnp.pi)
-  direction = jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
   waited = jnp.where(kicking, info["steps_since_last_pert"], info["steps_since_last_pert"] + 1)
   starting = ~kicking & (waited >= info["steps_until_next_pert"])
   return jnp.where(kicking, force * info["pert_dir"], 0.0), {
     "rng": jnp.where(kicking, info["rng"], rng),
     "steps_since_last_pert": jnp.where(over, 0, waited),
     "pert_steps": jnp.where(starting, 0, info["pert_steps"] + kicking),
-    "pert_dir": jnp.where(starting, direction, info["pert_dir"]),
+    "pert_dir": jnp.where(starting, _horizontal(key), info["pert_dir"]),
   }
+
+
+def _horizontal(key: jax.Array) -> jax.Array:
+  """A horizontal unit vector, shape [3]."""
+  angle = jax.random.uniform(key, maxval=2 * jnp.pi)
+  return jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])

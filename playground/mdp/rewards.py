@@ -44,7 +44,7 @@ def bind(
       names `functions` and `parity_functions` (function's name by term), and where they do not always count
       `when_moving` and `when_still` (norm of the command by term: above, or below, it the term counts, else it is 0).
     functions: the functions to choose from, by name.
-    parity: whether `parity_functions` replace others: Playground 0.2.0's slips.
+    parity: whether `parity_functions` replace others and their conditions: Playground 0.2.0's slips.
     facts: parameters that are not in `config`, by name.
 
   Returns:
@@ -61,6 +61,7 @@ def bind(
       lookup(chosen, name, f"env.reward.{key}")
       lookup(functions, function, f"env.reward.{key}.{name}")
       chosen[name] = function if counts else chosen[name]
+  slips = set(config.get("parity_functions", {})) if parity else set()  # bring conditions of their own
   gates = {key: dict(config.get(key, {})) for key in ("when_moving", "when_still")}
   for key, gated in gates.items():
     for name in gated:
@@ -73,7 +74,7 @@ def bind(
       if parameter not in facts and parameter not in config:
         raise ConfigError(f"env.reward.{parameter} is missing: term {name!r} needs it.{nearest(parameter, config)}")
       parameters[parameter] = facts[parameter] if parameter in facts else config[parameter]
-    bounds = gates["when_moving"].get(name), gates["when_still"].get(name)
+    bounds = (None if name in slips else gates[key].get(name) for key in ("when_moving", "when_still"))
     bound[name] = (config.scales[name], _term(function, parameters, *bounds))
   return {name: (weight, term) for name, (weight, term) in bound.items() if weight != 0}
 
@@ -118,6 +119,27 @@ def lin_vel_z_local(c: Context) -> jax.Array:
 def lin_vel_z_with_torso(c: Context) -> jax.Array:
   """v_z² of the base plus that of the torso, in the world frame."""
   return lin_vel_z(c) + jnp.square(c.sensor("torso_linvel")[2])
+
+
+def lin_vel_z_in_level_gaits(c: Context, level_gaits: Sequence[str], gait_modes: Sequence[str]) -> jax.Array:
+  """As `lin_vel_z`, in the gaits whose base should stay level; 0 in those in which it flies."""
+  level = jnp.array([mode in level_gaits for mode in gait_modes])
+  return lin_vel_z(c) * level[c.kept("gait")]
+
+
+def lin_vel_z_in_other_gaits(c: Context, level_gaits: Sequence[str], gait_modes: Sequence[str]) -> jax.Array:
+  """As `lin_vel_z`, in the other gaits only: a slip of Playground 0.2.0's Spot."""
+  return lin_vel_z(c) - lin_vel_z_in_level_gaits(c, level_gaits, gait_modes)
+
+
+def lin_vel_xy(c: Context) -> jax.Array:
+  """v_x² + v_y², v the base's velocity in the world frame."""
+  return jnp.square(c.sensor("global_linvel")[:2]).sum()
+
+
+def ang_vel(c: Context) -> jax.Array:
+  """|w|², w the base's angular velocity."""
+  return jnp.square(c.sensor("global_angvel")).sum()
 
 
 def ang_vel_xy(c: Context) -> jax.Array:
@@ -171,9 +193,15 @@ def termination(c: Context) -> jax.Array:
   return c.done.astype(jnp.float32)
 
 
+def termination_early(c: Context) -> jax.Array:
+  """As `termination`, in the first 500 steps of a command (not of an episode): a slip of 0.2.0's Barkour and OP3."""
+  return termination(c) * (c.kept("step") < 500)
+
+
 _BASE = (
-  tracking_lin_vel, tracking_ang_vel, tracking, lin_vel_z, lin_vel_z_local, lin_vel_z_with_torso, ang_vel_xy,
-  ang_vel_xy_local, ang_vel_xy_of_torso, orientation, orientation_as, base_height, collision, alive, alive_until_done,
-  termination,
+  tracking_lin_vel, tracking_ang_vel, tracking, lin_vel_z, lin_vel_z_local, lin_vel_z_with_torso,
+  lin_vel_z_in_level_gaits, lin_vel_z_in_other_gaits, lin_vel_xy, ang_vel, ang_vel_xy, ang_vel_xy_local,
+  ang_vel_xy_of_torso, orientation, orientation_as, base_height, collision, alive, alive_until_done, termination,
+  termination_early,
 )  # fmt: skip
 REWARDS: dict[str, Callable[..., jax.Array]] = {f.__name__: f for f in _BASE} | JOINTS | FEET | STANCES

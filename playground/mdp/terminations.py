@@ -27,6 +27,17 @@ def joint_limits(c: Context, threshold: float) -> jax.Array:
   return ((c.joint_pos < lower - threshold) | (c.joint_pos > upper + threshold)).any()
 
 
+def target_limits(c: Context, threshold: float) -> jax.Array:
+  """Some joint is more than `threshold` rad outside the range of its targets."""
+  lower, upper = c.robot.target_range
+  return ((c.joint_pos < lower - threshold) | (c.joint_pos > upper + threshold)).any()
+
+
+def low(c: Context, threshold: float) -> jax.Array:
+  """The base site is less than `threshold` m above the world's z = 0."""
+  return c.base_height < threshold
+
+
 def fatal_contact(c: Context, threshold: float) -> jax.Array:
   """More than `threshold` of the contacts between the robot's parts that its `fatal_contact` names."""
   return c.robot.touching(c.data, "fatal_contact").sum() > threshold
@@ -36,5 +47,7 @@ TERMINATIONS: dict[str, Callable[[Context, float], jax.Array]] = {
   "fall": fall,
   "power": power,
   "joint_limits": joint_limits,
+  "target_limits": target_limits,
+  "low": low,
   "fatal_contact": fatal_contact,
 }

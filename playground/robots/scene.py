@@ -78,7 +78,7 @@ def build_scene(
   if collision != "feet" and not _full_geoms(spec):
     raise ConfigError(f"collision={collision}: robot={robot} has geoms for the feet only, choose collision=feet.")
   COLLISIONS[collision](spec)
-  _add_studio(spec)
+  add_studio(spec)
   _set_keyframes(spec, add_terrain(spec, terrain, parameters or {}))
   if terrain != "flat":
     _round_cylinders(spec)
@@ -172,7 +172,7 @@ def add_floor_contacts(spec: mujoco.MjSpec, geoms: Sequence[str]) -> None:
     spec.add_sensor(**sensor)
 
 
-def _add_studio(spec: mujoco.MjSpec) -> None:
+def add_studio(spec: mujoco.MjSpec) -> None:
   """Sky, checkered ground material and a spotlight that follows the robot."""
   spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
   spec.visual.headlight.diffuse = [0.5, 0.5, 0.5]

@@ -27,18 +27,33 @@ _OVERRIDES = {
   "impl": "impl",
   "noise_config.level": "noise.level",
   "obs_noise.level": "noise.level",
+  "obs_noise": "noise.level",
   "pert_config.enable": "pushes.enable",
+  "velocity_kick": "pushes.velocity",
   "push_config.enable": "pushes.enable",
 }
 _UNREAD_INFO = {  # upstream has it, nothing reads it
   SuiteTask: {"info/rng", "info/time_out"},
   Stand: {"info/step"},
-  Joystick: {"info/step", "info/motor_targets", "info/filtered_linvel", "info/filtered_angvel"},
+  Joystick: {
+    *("info/step", "info/motor_targets", "info/filtered_linvel", "info/filtered_angvel", "info/lin_vel"),
+    *("info/ang_vel", "info/qpos_error_history", "info/qvel_history", "info/last_vel", "info/last_kick_step"),
+    *("info/left_contact", "info/right_contact"),
+  },
+}
+_RENAMED = {  # upstream's names for what others of its tasks call otherwise
+  "info/vel_kick": "info/pert_mag",
+  "info/direction": "info/pert_dir",
+  "info/kick_dir": "info/pert_dir",
+  "info/kick_duration_steps": "info/pert_duration",
+  "info/kick_wait_steps": "info/pert_interval",
 }
 _NOT_UPSTREAM = {  # what our general classes carry, and some of upstream's tasks do not
   Joystick: {
     *("info/gait", "info/gait_freq", "info/last_last_act"),
-    *("info/feet_air_time", "info/swing_peak", "info/last_contact", "metrics/swing_peak"),
+    *("info/feet_air_time", "info/swing_peak", "info/last_contact", "metrics/swing_peak", "info/command", "info/step"),
+    *("info/steps_until_next_pert", "info/steps_since_last_pert", "info/pert_steps", "info/pert_duration"),
+    *("info/pert_duration_seconds", "info/pert_mag", "info/pert_dir", "info/pert_mass", "info/push_step"),
   },
 }
 _PROGRAMS: dict[Any, Any] = {}  # compiled physics by structure of the model and fields that are kept
@@ -75,9 +90,11 @@ class Golden:
 
   def __init__(self, name: str):
     with np.load(GOLDEN / f"{name}.npz") as file:
-      self._arrays = {key: file[key] for key in file.files}
+      self._arrays = {_RENAMED.get(key, key): file[key] for key in file.files}
     header = json.loads(str(self._arrays.pop("header")))
-    overrides = {_OVERRIDES[key]: value for key, value in header["overrides"].items()}
+    silent = [key for key in header["overrides"] if key.startswith("obs_noise.scales.")]  # all of them are 0
+    overrides = {_OVERRIDES[key]: value for key, value in header["overrides"].items() if key not in silent}
+    overrides |= {"noise.level": 0.0} if silent else {}
     self.name = name
     self.env: Env = compiled_task(name, {**overrides, "parity": True})
     for key in self._arrays.keys() & _ROWS.keys():

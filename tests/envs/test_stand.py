@@ -124,15 +124,6 @@ def test_crouched_start() -> None:
   assert len(np.unique(start.data.qpos[:, 0])) == 4
 
 
-def test_a_step_keeps_the_structure(hand: Stand) -> None:
-  before = jax.eval_shape(hand.reset, jax.random.PRNGKey(0))
-  after = jax.eval_shape(hand.step, before, jax.ShapeDtypeStruct((12,), jnp.float32))
-  assert jax.tree.structure(after) == jax.tree.structure(before)
-  assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), before)
-  sizes = {group: value.shape[-1] for group, value in dict(before.obs).items()}
-  assert {group: sum(parts.values()) for group, parts in hand.observation_parts.items()} == sizes
-
-
 @pytest.mark.parametrize(
   ("overrides", "message"),
   [

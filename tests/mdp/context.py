@@ -37,8 +37,10 @@ PARAMETERS = {
   "height_tolerance": 0.11,
   "upright_tolerance": 0.01,
   "forward": [0.0, 0.0, -1.0],
+  "pose_sharpness": 2.0,
+  "level_gaits": ["trot"],
 }
-FACTS = {"lifted_feet": np.array([1]), "pose_weights": (1.0, 0.5)}
+FACTS = {"lifted_feet": np.array([1]), "pose_weights": (1.0, 0.5), "gait_modes": ("bound", "trot")}
 JOINTS = {"hips": np.array([0, 1]), "hip_rolls": np.array([1]), "knees": np.array([1])}
 
 
@@ -71,6 +73,8 @@ def context(command: tuple[float, float, float] = (1.0, 0.1, 0.3), sensors: Any 
     "feet_air_time": jnp.array([0.3, 0.06]),
     "swing_peak": jnp.array([0.12, 0.2]),
     "phase": jnp.array([0.0, -jnp.pi / 2]),
+    "gait": jnp.array(1),
+    "step": jnp.array(499),
   }
   fields = {
     "robot": robot,

@@ -39,6 +39,16 @@ def test_terms_may_count_only_when_moving_or_still() -> None:
   assert values(command=(0.0, 0.0, 0.09), **config) == {"torques": 0.0, "energy": 10.0, "dof_vel": 5.0}
 
 
+def test_a_slip_brings_its_own_condition() -> None:
+  config = {
+    "scales": {"stand_still": 1.0},
+    "parity_functions": {"stand_still": "stand_still_unless_left"},
+    "when_still": {"stand_still": 0.1},
+  }
+  for parity, value in ((False, 0.0), (True, 0.44)):
+    np.testing.assert_allclose(values(parity=parity, **config)["stand_still"], value, rtol=1e-5)
+
+
 def test_terms_of_weight_zero_are_left_out() -> None:
   assert set(bind(ConfigDict({"scales": {"energy": 0, "torques": -1.0}}), REWARDS)) == {"torques"}
 

@@ -50,6 +50,12 @@ def test_a_box_is_drawn_anew_or_zero() -> None:
   assert np.abs(x[x != 0]).min() >= 0.2
 
 
+def test_random_keys_may_be_left_unused() -> None:
+  box = Box(min=(0.0, 0.0, 0.0), max=(1.0, 1.0, 1.0), zero_probability=0.0, deadband=0.0, unused_keys=2)
+  keys = jax.random.split(KEYS[0], 6)[2:5]
+  np.testing.assert_array_equal(box.first(KEYS[0]), [jax.random.uniform(key) for key in keys])
+
+
 @pytest.mark.parametrize(("ending", "duration"), [(False, 3), (True, None)])
 def test_a_fixed_timer_counts_steps(ending: bool, duration: int | None) -> None:
   timer = make_timer(ConfigDict({"timer": "fixed", "duration": 0.06}), dt=0.02)
@@ -71,7 +77,7 @@ def test_an_exponential_timer_draws_when_due_or_done() -> None:
 
 def test_made_from_configs() -> None:
   keys: dict[str, Any] = {"max": [1.0, 2.0, 3.0], "min": None, "nonzero_probability": [1.0, 1.0, 1.0]}
-  keys |= {"change_probability": 0.5, "zero_probability": 0.1, "deadband": 0.0}
+  keys |= {"change_probability": 0.5, "zero_probability": 0.1, "deadband": 0.0, "unused_keys": 0}
   walk = make_sampler(ConfigDict({"sampler": "walk", **keys}))
   assert walk == Walk((-1.0, -2.0, -3.0), (1.0, 2.0, 3.0), (1.0, 1.0, 1.0), 0.5)
   box = make_sampler(ConfigDict({"sampler": "box", **keys, "min": [0.0, 0.0, 0.0]}))

@@ -77,6 +77,10 @@ def test_gaits_are_the_robots() -> None:
   robot._gaits, robot.feet = {"walk": WALK, "trot": (0.0, 1.0, 2.0)}, np.array([3, 4])
   config = ConfigDict({"modes": ["walk"], "frequency": [1.0, 2.0], "foot_height": None, "rest_when_still": False})
   assert make_gait(config, robot, 0.02, False) == Gait([list(WALK)], (1.0, 2.0), None, False, 0.02)
+  robot._gaits["late"] = (0.0, 1.5 * np.pi)
+  for parity, second in ((False, -0.5 * np.pi), (True, 1.5 * np.pi)):  # parity: beyond the range of phases
+    late = make_gait(ConfigDict({**config, "modes": ["late"]}), robot, 0.02, parity)
+    np.testing.assert_allclose(late.modes, [[0.0, second]])  # pyright: ignore[reportOptionalMemberAccess]
   assert make_gait(ConfigDict({**config, "modes": []}), SimpleNamespace(), 0.02, False) is None  # pyright: ignore
   with pytest.raises(UnknownNameError, match=r"env\.gait\.modes: 'wlk' is unknown.*Did you mean 'walk'"):
     make_gait(ConfigDict({**config, "modes": ["wlk"]}), robot, 0.02, False)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from playground.mdp.noise import add_noise
+from playground.mdp.noise import add_noise, uniform_noise
 
 CLEAN = {"a": jnp.zeros(5000), "b": jnp.ones(3)}
 
@@ -29,3 +29,13 @@ def test_an_amplitude_for_each_element() -> None:
   _, noisy = add_noise(jax.random.PRNGKey(0), {"b": CLEAN["b"]}, amplitudes)
   _, one = add_noise(jax.random.PRNGKey(0), {"b": CLEAN["b"]}, {"b": 1.0})
   np.testing.assert_allclose(noisy["b"] - 1, amplitudes["b"] * (one["b"] - 1), rtol=1e-5, atol=1e-6)
+
+
+def test_amplitudes_repeat_and_their_runs_may_share_draws() -> None:
+  clean, amplitude = jnp.zeros(6000), np.array([0.1, 0.2, 0.0])
+  free, shared = (np.asarray(uniform_noise(jax.random.PRNGKey(0), clean, amplitude, s)) for s in (False, True))
+  for noise in (free, shared):
+    x, y, z = noise.reshape(-1, 3).T
+    np.testing.assert_allclose([x.max(), y.min()], [0.1, -0.2], rtol=1e-2)
+    assert not z.any()
+    assert np.allclose(y, 2 * x, atol=1e-6) == (noise is shared)

@@ -65,6 +65,12 @@ def test_each_kick_has_its_own_direction() -> None:
   assert len(directions) > 5
 
 
+class Pushed(struct.PyTreeNode):
+  """The part of the physics that a kick changes."""
+
+  xfrc_applied: jax.Array
+
+
 class Body(struct.PyTreeNode):
   """The part of the physics that a jump changes."""
 
@@ -73,8 +79,7 @@ class Body(struct.PyTreeNode):
 
 def jumps(enable: bool) -> tuple[int, np.ndarray, np.ndarray]:
   """The interval, the directions shown and what they add to the velocity in 100 steps."""
-  config = ConfigDict({"enable": enable, "velocity": [0.5, 1.0], "interval": [0.5, 0.9]})
-  pushes = Jumps(config, root=1, dt=0.02)
+  pushes = Jumps(enable, velocity=(0.5, 1.0), interval=(0.5, 0.9), dt=0.02)
   info = {"rng": jax.random.PRNGKey(1), **pushes.start({"push_interval": jax.random.PRNGKey(0)}, MASS)}
 
   def step(info: dict[str, Any], _: None) -> tuple[dict[str, Any], Any]:
@@ -102,6 +107,29 @@ def test_no_jumps_unless_enabled() -> None:
   assert not directions.any() and not gained.any()
 
 
+def test_regular_kicks_in_time() -> None:
+  config = {"enable": True, "velocity": [2.0, 2.0], "duration": [0.08, 0.1], "interval": [0.4, 0.6]}
+  pushes = make_pushes(ConfigDict({"kind": "regular_kick", **config}), root=1, dt=0.02)
+  keys = dict(zip(pushes.keys, jax.random.split(jax.random.PRNGKey(0), 3), strict=True))
+  info = {"rng": jax.random.PRNGKey(1), **pushes.start(keys, MASS)}
+
+  def step(info: dict[str, Any], _: None) -> tuple[dict[str, Any], Any]:
+    body: Any = Pushed(jnp.zeros((2, 6)))
+    body, changed = pushes.act(body, info)
+    return info | changed, body.xfrc_applied
+
+  forces = np.asarray(jax.jit(lambda i: jax.lax.scan(step, i, None, 100))(info)[1])
+  interval, duration = int(info["pert_interval"]), int(info["pert_duration"])
+  assert 20 <= interval < 30 and duration == 4
+  assert not forces[:, 0].any() and not forces[:, 1, 2:].any()
+  since = np.arange(100) % interval
+  kicked = (np.arange(100) >= interval) & (since < duration)
+  expected = np.where(kicked, 0.5 * np.sin(np.pi * since / duration) * 12.0 * 2.0 / (duration * 0.02), 0.0)
+  np.testing.assert_allclose(np.linalg.norm(forces[:, 1], axis=1), expected, rtol=1e-4, atol=1e-3)
+  angles = [np.arctan2(*forces[i * interval + 1, 1, :2]) for i in (1, 2, 3)]
+  assert len(np.unique(np.round(angles, 3))) == 3
+
+
 def test_unknown_kind() -> None:
   with pytest.raises(UnknownNameError, match=r"env\.pushes\.kind: 'kik' is unknown.*Did you mean 'kick'"):
-    make_pushes(ConfigDict({"kind": "kik"}), root=1, dt=0.02)
+    make_pushes(ConfigDict({"kind": "kik", "enable": True, **CONFIG}), root=1, dt=0.02)

@@ -14,6 +14,10 @@ CASES = {
   "lin_vel_z": 0.04,
   "lin_vel_z_local": 0.0,
   "lin_vel_z_with_torso": 0.04 + 0.01,
+  "lin_vel_z_in_level_gaits": 0.04,
+  "lin_vel_z_in_other_gaits": 0.0,
+  "lin_vel_xy": 0.0,
+  "ang_vel": 25.25,
   "ang_vel_xy": 0.25,
   "ang_vel_xy_local": 0.0,
   "ang_vel_xy_of_torso": 0.05,
@@ -28,17 +32,23 @@ CASES = {
   "pose": np.exp(-(0.2**2 + 0.5 * 0.24**2)),
   "pose_deviation": 0.2**2 + 0.5 * 0.24**2,
   "pose_deviation_by_command": 0.2**2 + 0.24**2,
+  "pose_when_still": 1.0,
+  "hip_splay": 0.2**2 + 0.24**2,
   "joint_deviation_knee": 0.24,
   "joint_deviation_hip": 0.44,
   "joint_deviation_hip_sideways": 0.0,
   "joint_deviation_hip_crossed": 4 * 0.44,
   "termination": 1.0,
+  "termination_early": 1.0,
   "stand_still": 0.44,
+  "stand_still_unless_left": 0.44,  # 0.1 / |(1, 0.1)| is just below 0.1
   "torques": 5.0 + 7.0,
   "torques_sum": 7.0,
   "torques_squared": 25.0,
   "action_rate": 0.16 + 0.09,
   "action_rate_and_change": 0.16 + 0.09 + 0.5**2 + 0.1**2,
+  "action_rate_and_change_lagged": 0.1**2 + 0.2**2 + 0.2**2 + 0.7**2,
+  "action_size": 0.1**2 + 0.3**2,
   "energy": 2 * 3 + 1 * 4,
   "energy_share": 2 * 3 / 6 + 1 * 4 / 8,
   "dof_acc": 13.0,
@@ -49,6 +59,7 @@ CASES = {
   "feet_slip": 0.25,
   "feet_slip_of_base": 0.0,
   "feet_air_time": 0.2,
+  "feet_air_time_unless_turning": 0.2,
   "feet_air_time_capped": 0.15,
   "feet_phase": np.exp(-(0.05**2 + 0.03**2) / 0.01),  # they should be at 0.1 and 0.05
   "feet_phase_unless_at_rest": np.exp(-(0.05**2 + 0.03**2) / 0.01),
@@ -90,6 +101,11 @@ STILL = (0.0, 0.005, 0.0)
     ("joint_deviation_hip_crossed", LEFT, 2 * 0.44),
     ("pose_deviation_by_command", SIDEWAYS, 0.2**2 + 0.01 * 0.24**2),
     ("pose_deviation_by_command", STILL, 0.2**2 + 0.24**2),
+    ("pose_when_still", STILL, np.exp(-2 * (0.2**2 + 0.24**2))),
+    ("stand_still_unless_left", LEFT, 0.0),
+    ("stand_still_unless_left", SIDEWAYS, 0.44),
+    ("stand_still_unless_left", (0.0, 0.0, 0.5), 0.0),
+    ("feet_air_time_unless_turning", (0.0, 0.04, 0.5), 0.0),
   ],
 )
 def test_terms_that_depend_on_the_command(name: str, command: tuple[float, float, float], value: float) -> None:
@@ -102,6 +118,18 @@ def test_the_phase_is_free_at_rest_only() -> None:
   name = "feet_phase_unless_at_rest"
   assert evaluate(name, context(STILL, at_rest)) == 0
   assert evaluate(name, context(STILL, turning)) > 0 and evaluate(name, context(sensors=at_rest)) > 0
+
+
+def test_gaits_that_fly_may_go_up_and_down() -> None:
+  c = context()
+  flying = context(info={**c.info, "gait": jnp.array(0)})
+  assert evaluate("lin_vel_z_in_level_gaits", flying) == 0
+  np.testing.assert_allclose(evaluate("lin_vel_z_in_other_gaits", flying), 0.04, rtol=1e-5)
+
+
+def test_late_terminations_cost_nothing() -> None:
+  c = context()
+  assert evaluate("termination_early", context(info={**c.info, "step": jnp.array(500)})) == 0
 
 
 def test_the_gaits_own_swing_height() -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ class Scene:
     no_sensors: sensors of the reference that nothing reads.
     more_sensors: sensors that we have besides.
     no_geom_fields: fields of collision geoms that act nowhere.
+    spec: builds the scene, where it is another than a robot on a terrain (which has the figures' sensors in order).
   """
 
   robot: str
@@ -37,6 +38,7 @@ class Scene:
   no_sensors: tuple[str, ...] = ()
   more_sensors: tuple[str, ...] = ()
   no_geom_fields: tuple[str, ...] = ()
+  spec: Callable[[], mujoco.MjSpec] | None = None
 
 
 def robot_config(robot: str) -> dict[str, Any]:
@@ -56,6 +58,8 @@ def floor_contacts(facts: dict[str, Any]) -> list[str]:
 
 def build(scene: Scene, facts: dict[str, Any]) -> mujoco.MjModel:
   """Compiles our scene, with the contact sensors of the figures."""
+  if scene.spec:
+    return scene.spec().compile()
   spec = build_scene(
     scene.robot, terrain=scene.terrain, collision=scene.collision, floor_contacts=floor_contacts(facts)
   )
@@ -94,6 +98,7 @@ def rebuild(facts: dict[str, Any], hfield_data: np.ndarray | None = None) -> muj
   bodies = {"world": spec.worldbody}
   for b in facts["bodies"][1:]:
     body = bodies[b["name"]] = bodies[b["parent"]].add_body(name=b["name"], pos=b["pos"], quat=b["quat"])
+    body.mocap = "mocapid" in b
     if b["mass"]:  # else the body is fixed to its parent and weighs nothing
       body.explicitinertial = True
       body.mass, body.ipos, body.iquat, body.inertia = (b[key] for key in ("mass", "ipos", "iquat", "inertia"))
@@ -115,9 +120,10 @@ def rebuild(facts: dict[str, Any], hfield_data: np.ndarray | None = None) -> muj
       **{k: g[k] for k in ("name", "size", "pos", "quat", "contype", "conaffinity", "condim", "friction", "solref")},
       **{k: g[k] for k in ("solimp", "solmix", "margin", "gap", "priority")},
     )  # fmt: skip
-  sensed = {s["obj"] for s in facts["sensors"]} | {s.get("ref") for s in facts["sensors"]}
+  used = {s["obj"] for s in facts["sensors"]} | {s.get("ref") for s in facts["sensors"]}
+  used |= {w["obj"] for t in facts["tendons"] for w in t["path"]}
   for g in facts["other_geoms"]:
-    if g["name"] in sensed:
+    if g["name"] in used:
       shape = {key: g[key] for key in ("name", "size", "pos", "quat")}
       bodies[g["body"]].add_geom(type=enum(mujoco.mjtGeom, g["type"]), contype=0, conaffinity=0, **shape)
   for p in facts["contact_pairs"]:
@@ -127,6 +133,18 @@ def rebuild(facts: dict[str, Any], hfield_data: np.ndarray | None = None) -> muj
     spec.add_exclude(bodyname1=e["body1"], bodyname2=e["body2"])
   for s in facts["sites"]:
     bodies[s["body"]].add_site(name=s["name"], pos=s["pos"], quat=s["quat"])
+  for t in facts["tendons"]:
+    tendon = spec.add_tendon(name=t["name"], stiffness=[t.get("stiffness", 0), 0, 0], springlength=t["springlength"])
+    for w in t["path"]:
+      if w["wrap"] == "site":
+        tendon.wrap_site(w["obj"])
+      else:
+        tendon.wrap_geom(w["obj"], w.get("sidesite", ""))
+  for e in facts["equality"]:
+    spec.add_equality(
+      type=enum(mujoco.mjtEq, e["type"]), objtype=enum(mujoco.mjtObj, e["objtype"]), name1=e["obj1"], name2=e["obj2"],
+      active=e["active"], data=padded(e["data"], mujoco.mjNEQDATA), solref=e["solref"], solimp=e["solimp"],
+    )  # fmt: skip
   for s in facts["sensors"]:
     ref = {"reftype": enum(mujoco.mjtObj, s["reftype"]), "refname": s["ref"]} if "ref" in s else {}
     spec.add_sensor(
@@ -135,13 +153,13 @@ def rebuild(facts: dict[str, Any], hfield_data: np.ndarray | None = None) -> muj
     )  # fmt: skip
   for a in facts["actuators"]:
     spec.add_actuator(
-      name=a["name"], target=a["target"], trntype=mujoco.mjtTrn.mjTRN_JOINT, gainprm=padded(a["gainprm"]),
+      name=a["name"], target=a["target"], trntype=enum(mujoco.mjtTrn, a["trntype"]), gainprm=padded(a["gainprm"]),
       biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=padded(a["biasprm"]), ctrllimited=a["ctrllimited"],
       ctrlrange=a["ctrlrange"], forcelimited=a["forcelimited"], forcerange=a["forcerange"],
     )  # fmt: skip
   return spec.compile()
 
 
-def padded(parameters: list[float]) -> list[float]:
-  """Actuator parameters with the trailing zeros that the figures leave out."""
-  return parameters + [0.0] * (10 - len(parameters))
+def padded(parameters: list[float], size: int = 10) -> list[float]:
+  """Parameters, of actuators unless `size` says otherwise, with the trailing zeros that the figures leave out."""
+  return parameters + [0.0] * (size - len(parameters))

@@ -1,6 +1,7 @@
 """Follow a joystick's velocity commands on legs: one task for all robots, composed by config."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -20,7 +21,7 @@ from playground.mdp.pushes import make_pushes
 from playground.robots.scene import configured_scene
 
 _DRAWS = ("xy", "yaw", "joint_scale", "base_vel", "gait_frequency", "gait", "foot_height", "command", "command_timer",
-          "push_interval", "push_duration", "push_velocity")  # fmt: skip
+          "push_interval", "push_duration", "push_velocity", "noise")  # fmt: skip
 
 
 class Joystick(LeggedTask):
@@ -55,12 +56,13 @@ class Joystick(LeggedTask):
     self._gait = make_gait(config.gait, self.robot, self.dt, self.parity)
     self._pushes = make_pushes(config.pushes, self.robot.root, self.dt)
     gait_draws = self._gait.keys if self._gait else ()
-    self._draws = (*self._spread_draws, *gait_draws, "command", *self._timer.keys, *self._pushes.keys)
+    noise = ("noise",) if self._own_noise_key else ()
+    self._draws = (*self._spread_draws, *gait_draws, "command", *self._timer.keys, *self._pushes.keys, *noise)
     self._draw_order = [tuple(group) for group in config.reset.draw_order]
     for group in self._draw_order:
       for name in group:
         lookup(dict.fromkeys(_DRAWS), name, "env.reset.draw_order")
-    self._starts_at_zero: bool = self.parity and config.reset.parity_zero_ctrl
+    self._starts_at_zero: bool = config.reset.parity_zero_ctrl and self.parity
 
   def _scene(self, config: Any) -> mujoco.MjSpec:
     spec = configured_scene(config)
@@ -70,6 +72,13 @@ class Joystick(LeggedTask):
       for name in config.robot.restricted_range:
         spec.joint(name).range = config.robot.restricted_range[name]
     return spec
+
+  def _reward_facts(self) -> dict[str, Any]:
+    return super()._reward_facts() | {"gait_modes": tuple(self.config.gait.modes)}
+
+  @property
+  def _step_draws(self) -> tuple[str, ...]:
+    return ("command", "noise", *self._timer.keys)
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
     model = self.mjx_model if model is None else model
@@ -88,14 +97,17 @@ class Joystick(LeggedTask):
       **(self._gait.start(keys) if self._gait else {}),
     }
     ctrl = jnp.zeros(self.action_size) if self._starts_at_zero else None
-    return self._first_state(self._start(model, qpos, qvel, ctrl), info)
+    return self._first_state(self._start(model, qpos, qvel, ctrl), info, keys.get("noise"))
 
   def disturb(self, state: State) -> State:
+    state = super().disturb(state)
     data, changed = self._pushes.act(state.data, state.info)
     return state.replace(data=data, info=state.info | changed)
 
   def _track(self, now: Context) -> Context:
     """Counts this step into the feet's swings, and says which foot lands."""
+    if self.robot.misreads_contact:
+      now = dataclasses.replace(now, contact=self.robot.misread_contact(now.data))
     was_in_air = now.info["feet_air_time"] > 0
     swing = {
       "feet_air_time": now.info["feet_air_time"] + self.dt,
@@ -105,13 +117,14 @@ class Joystick(LeggedTask):
     first = was_in_air & (now.contact | now.info["last_contact"])
     return dataclasses.replace(now, info={**now.info, **swing}, first_contact=first)
 
-  def _next_info(self, now: Context, rng: jax.Array) -> dict[str, Any]:
+  def _next_info(self, now: Context, rng: jax.Array, keys: Mapping[str, jax.Array]) -> dict[str, Any]:
     """Ends the swings of feet on the floor, moves the gait on and draws the next command when it is due."""
     info = now.info
-    rng, keys = split_keys(rng, self._timer.keys, [("command", *self._timer.keys)])
+    if not keys:
+      rng, keys = split_keys(rng, (), [("command", *self._timer.keys)])
     due, timer = self._timer.advance(info, now.done, keys)
     return {
-      **super()._next_info(now, rng),
+      **super()._next_info(now, rng, keys),
       "command": jnp.where(due, self._commands.next(keys["command"], info["command"]), info["command"]),
       "feet_air_time": jnp.where(now.contact, 0.0, info["feet_air_time"]),
       "swing_peak": jnp.where(now.contact, 0.0, info["swing_peak"]),

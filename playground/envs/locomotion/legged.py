@@ -7,21 +7,20 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul
 
 from playground.envs.base import Env, Observation, State
 from playground.envs.physics import PhysicsData, mjx
+from playground.mdp.keys import split_keys
 from playground.mdp.legged import Context, LeggedRobot
 from playground.mdp.lookup import lookup
-from playground.mdp.noise import add_noise
-from playground.mdp.observations import OBSERVATIONS
+from playground.mdp.observer import Observer
 from playground.mdp.rewards import REWARDS, TOTALS, bind
 from playground.mdp.terminations import TERMINATIONS
 from playground.robots.gains import set_gains
 from playground.robots.scene import configured_scene
 
-ACTOR = "state"  # the observation of what the robot's own sensors tell: noisy; the others are exact
+_LAST_OBS = "last_obs"  # entry of `info` during a step only
 
 # What an action is added to: the joints' default pose, their position, or their target in the step before.
 _ACTION_BASES: dict[str, Callable[[LeggedRobot, PhysicsData], jax.Array]] = {
@@ -60,14 +59,15 @@ class LeggedTask(Env):
     self.robot = LeggedRobot(mj_model, config.robot, self.parity)
     self._action_base = lookup(_ACTION_BASES, config.action_base, "env.action_base")
     self._action_scale: float = config.action_scale
-    self._target_range = mj_model.actuator_ctrlrange.T if config.clip_targets else None
+    self._target_range = self.robot.target_range if config.clip_targets else None
     self._rewards = bind(config.reward, REWARDS, parity=self.parity, facts=self._reward_facts())
     self._total = lookup(TOTALS, config.reward.total, "env.reward.total")
     self._reward_clip = config.reward.clip and tuple(config.reward.clip)
     thresholds = {name: config.termination[name] for name in config.termination}
     functions = {name: lookup(TERMINATIONS, name, "env.termination") for name in thresholds}
     self._terminations = [(functions[name], value) for name, value in thresholds.items() if value is not None]
-    self._bind_observations(config)
+    self._observer = Observer(config, self.parity)
+    self._own_noise_key: bool = config.noise.own_key
 
   def _scene(self, config: Any) -> mujoco.MjSpec:
     """The scene to compile; called first of all."""
@@ -77,46 +77,35 @@ class LeggedTask(Env):
     """Parameters of reward terms that come from the robot, beside those in `env.reward`."""
     return {"pose_weights": self.robot.pose_weights}
 
-  def _bind_observations(self, config: Any) -> None:
-    slips = {name: config.parity_obs[name] for name in config.parity_obs}
-    slips = {name: lookup(OBSERVATIONS, other, "env.parity_obs") for name, other in slips.items()}
-    self._parts = OBSERVATIONS | (slips if self.parity else {})
-    self._own_noise_key: bool = config.noise.own_key
-    for name in config.noise.scales:
-      lookup(self._parts, name, "env.noise.scales")
-    level, scales = config.noise.level, config.noise.scales
-    self._noise = {name: level * np.asarray(scales[name]) for name in self._parts if name in scales}
-    groups = sorted(config.obs, key=lambda group: (group != ACTOR, group))
-    self._obs = {group: tuple(config.obs[group]) for group in groups if config.obs[group]}
-    for group, parts in self._obs.items():
-      for part in parts:
-        lookup(self._parts if group == ACTOR else {ACTOR: None, **self._parts}, part, f"env.obs.{group}")
-
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:
-    names = {part for parts in self._obs.values() for part in parts} - {ACTOR}
+    found: dict[str, dict[str, int]] = {}
 
-    def every_part(rng: jax.Array) -> dict[str, jax.Array]:
+    def look(rng: jax.Array) -> None:
       state = self.reset(rng)
-      now = self._context(state.data, state.info, jnp.zeros(self.action_size))
-      return {name: self._parts[name](now) for name in names}
+      found.update(self._observer.sizes(self._context(state.data, state.info, jnp.zeros(self.action_size))))
 
-    sizes = {name: part.size for name, part in jax.eval_shape(every_part, jax.random.PRNGKey(0)).items()}
-    sizes[ACTOR] = sum(sizes[part] for part in self._obs[ACTOR])
-    return {group: {part: sizes[part] for part in parts} for group, parts in self._obs.items()}
+    jax.eval_shape(look, jax.random.PRNGKey(0))
+    return found
 
   def control(self, state: State, action: jax.Array) -> jax.Array:
     target = self._action_base(self.robot, state.data) + self._action_scale * action
     return target if self._target_range is None else jnp.clip(target, *self._target_range)
 
+  def disturb(self, state: State) -> State:
+    """Hands the last observation on to `evaluate`, where that of this step takes the past from."""
+    return state.replace(info=state.info | {_LAST_OBS: state.obs}) if self._observer.looks_back else state
+
   def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
-    rng, noise_key = jax.random.split(info["rng"]) if self._own_noise_key else (info["rng"], None)
-    now = self._track(self._context(data, {**info, "rng": rng}, action))
+    info = dict(info)
+    last = info.pop(_LAST_OBS) if self._observer.looks_back else None
+    rng, keys = split_keys(info["rng"], (), [self._step_draws]) if self._own_noise_key else (info["rng"], {})
+    now = self._track(self._context(data, info, action))
     now = dataclasses.replace(now, done=self._terminated(now))
-    rng, obs = self._observe(now, noise_key)
+    rng, obs = self._observe(now, rng, keys.get("noise"), last)
     rewards = {name: weight * term(now) for name, (weight, term) in self._rewards.items()}
     reward = self._sum_up(rewards)
-    after = self._next_info(now, rng)
+    after = self._next_info(now, rng, keys)
     metrics = {f"reward/{name}": value for name, value in rewards.items()}
     metrics |= {name: after[name].mean() for name in self.logged}
     return State(data, obs, reward, now.done.astype(jnp.float32), metrics, after)
@@ -137,9 +126,14 @@ class LeggedTask(Env):
       noise_key: key of the observation noise, for a task whose `env.noise.own_key` is true.
     """
     info = {**info, "last_act": jnp.zeros(self.action_size)}
-    info["rng"], obs = self._observe(self._context(data, info, info["last_act"]), noise_key)
+    info["rng"], obs = self._observe(self._context(data, info, info["last_act"]), info["rng"], noise_key)
     metrics = {name: jnp.zeros(()) for name in (*(f"reward/{name}" for name in self._rewards), *self.logged)}
     return State(data, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
+
+  @property
+  def _step_draws(self) -> tuple[str, ...]:
+    """Names of a step's random keys, in order, where the noise has one of its own (`env.noise.own_key`)."""
+    return ("noise",)
 
   @property
   def _spread_draws(self) -> tuple[str, ...]:
@@ -193,20 +187,15 @@ class LeggedTask(Env):
     """Whether the episode ends here, bool: any of `env.termination`."""
     return jnp.array([function(now, threshold) for function, threshold in self._terminations], bool).any()
 
-  def _observe(self, now: Context, noise_key: jax.Array | None) -> tuple[jax.Array, Observation]:
-    """The next `rng`, and the observation: one vector where there is only `state`.
+  def _observe(
+    self, now: Context, rng: jax.Array, noise_key: jax.Array | None, last: Observation | None = None
+  ) -> tuple[jax.Array, Observation]:
+    """The next `rng`, and the observation. The noise's keys come from `noise_key`; without one, from `rng`."""
+    after, obs = self._observer.observe(now, rng if noise_key is None else noise_key, last)
+    return after if noise_key is None else rng, obs
 
-    The noise's keys come from `noise_key`; without one, from `rng`.
-    """
-    clean = {name: self._parts[name](now) for name in self._noise}
-    rng, noisy = add_noise(now.info["rng"] if noise_key is None else noise_key, clean, self._noise)
-    obs: dict[str, jax.Array] = {}
-    for group, parts in self._obs.items():
-      known = noisy if group == ACTOR else obs
-      obs[group] = jnp.concatenate([known[part] if part in known else self._parts[part](now) for part in parts])
-    return rng if noise_key is None else now.info["rng"], obs[ACTOR] if len(obs) == 1 else obs
-
-  def _next_info(self, now: Context, rng: jax.Array) -> dict[str, Any]:
-    """What the next step starts from."""
+  def _next_info(self, now: Context, rng: jax.Array, keys: Mapping[str, jax.Array]) -> dict[str, Any]:
+    """What the next step starts from; `keys` are those of `_step_draws`, none without a key for noise."""
+    del keys
     info = {**now.info, "rng": rng, "last_act": now.action}
     return info | ({"last_last_act": now.info["last_act"]} if "last_last_act" in info else {})
