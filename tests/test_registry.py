@@ -29,7 +29,7 @@ def test_names():
   names = registry.names()
   assert names == sorted(names)
   assert {"CartpoleBalance", "Go1JoystickFlatTerrain"} <= set(names)
-  assert not {"joystick", "getup", "stand", "_cartpole"} & set(names)
+  assert not {"joystick", "getup", "gait_tracking", "stand", "_cartpole"} & set(names)
   assert registry.names("GO1") == [name for name in names if name.startswith("Go1")]
   assert registry.names("nothing") == []
   assert tuple(names) == registry.ALL_ENVS

@@ -1,6 +1,7 @@
 """Multiruns: what a sweep file and a glob stand for, and what is refused in which words."""
 
 import csv
+import re
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,14 @@ def test_the_suite_is_25_tasks_with_5_seeds(agent: str):
   expected = {(f"env={task}", f"agent={agent}", f"seed={seed}") for task in suite for seed in range(5)}
   found = jobs(expand([f"sweep=dm_control_{agent}"]))
   assert len(found) == 125
+  assert set(map(tuple, found)) == expected
+
+
+def test_locomotion_is_19_tasks_with_5_seeds():
+  legged = {name for name in task_names() if re.search("Joystick|Getup|Handstand|Footstand|Gait", name)}
+  expected = {(f"env={task}", "agent=ppo", f"seed={seed}") for task in legged for seed in range(5)}
+  found = jobs(expand(["sweep=locomotion_ppo"]))
+  assert len(found) == 19 * 5
   assert set(map(tuple, found)) == expected
 
 

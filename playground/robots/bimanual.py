@@ -3,7 +3,8 @@
 import mujoco
 
 from playground.errors import UnknownNameError, nearest
-from playground.robots.scene import ROBOTS, add_studio
+from playground.robots.scene import add_studio
+from playground.robots.tabletop import load
 
 # Files of `robots/aloha`, one for each task, and how far its left gripper closes, m: a gap left open while it holds the
 # box of the handover lets a policy that explores grasp it, as in Playground 0.2.0.
@@ -24,7 +25,7 @@ def build_aloha_scene(task: str) -> mujoco.MjSpec:
   """
   if task not in _CLOSED:
     raise UnknownNameError(f"task={task!r} is unknown: choose from {', '.join(_CLOSED)}.{nearest(task, _CLOSED)}")
-  spec = mujoco.MjSpec.from_file(str(ROBOTS / "aloha" / f"{task}.xml"))
+  spec = load(f"aloha/{task}")
   add_studio(spec)
   spec.worldbody.add_geom(
     name="floor",

@@ -5,7 +5,8 @@ import dataclasses
 import mujoco
 
 from playground.errors import UnknownNameError, nearest
-from playground.robots.scene import ROBOTS, add_studio
+from playground.robots.scene import add_studio
+from playground.robots.tabletop import load
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +47,9 @@ _FACES = (
 def build_in_hand_scene(hand: str) -> mujoco.MjSpec:
   """Puts a cube in a hand, a goal (a mocap body) beside it and a floor 0.25 m below, which only the cube meets.
 
-  The hand's keyframe `home` is completed with where cube and goal are. Sensors of the hand come first, then those of
-  `cube` (position, orientation, velocities, angular acceleration, up) and of `goal` (orientation, up).
+  The hand's keyframe `home` is completed with where cube and goal are. After the hand's own sensors come those of the
+  `cube` (position, orientation, velocities, angular acceleration, up), `palm_position` and each `<finger>_tip_position`
+  as seen from the palm (thumb first), and those of the `goal` (orientation, up).
 
   Args:
     hand: a key of `CUBES`.
@@ -60,7 +62,7 @@ def build_in_hand_scene(hand: str) -> mujoco.MjSpec:
   """
   if hand not in CUBES:
     raise UnknownNameError(f"hand={hand!r} is unknown: choose from {', '.join(CUBES)}.{nearest(hand, CUBES)}")
-  spec = mujoco.MjSpec.from_file(str(ROBOTS / hand / "right_hand.xml"))
+  spec = load(f"{hand}/right_hand")
   add_studio(spec)
   spec.worldbody.add_geom(
     name="floor",
@@ -72,6 +74,7 @@ def build_in_hand_scene(hand: str) -> mujoco.MjSpec:
     material="groundplane",
   )
   _add_cube(spec, CUBES[hand])
+  _add_position_sensors(spec)
   _add_goal(spec)
   home = spec.key("home")
   home.qpos = [*home.qpos, *CUBES[hand].start, *_CUBE_ORIENTATION]
@@ -95,6 +98,16 @@ def _add_cube(spec: mujoco.MjSpec, cube: Cube) -> None:
   }
   for name, kind in types.items():
     spec.add_sensor(name=f"cube_{name}", type=kind, objtype=mujoco.mjtObj.mjOBJ_BODY, objname="cube")
+
+
+def _add_position_sensors(spec: mujoco.MjSpec) -> None:
+  """Where palm and fingertips are, the sites `grasp_site` and `<finger>_tip`."""
+  site, kind = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtSensor.mjSENS_FRAMEPOS
+  spec.add_sensor(name="palm_position", type=kind, objtype=site, objname="grasp_site")
+  palm = {"reftype": site, "refname": "grasp_site"}
+  tips = [each.name for each in spec.sites if each.name.endswith("_tip")]
+  for tip in sorted(tips, key=lambda name: name != "th_tip"):
+    spec.add_sensor(name=f"{tip}_position", type=kind, objtype=site, objname=tip, **palm)
 
 
 def _add_goal(spec: mujoco.MjSpec) -> None:

@@ -101,7 +101,9 @@ class Golden:
       self._arrays[key] = self._our_rows(self._arrays[key], _ROWS[key], header["model"])
     self.actions = jnp.array(self._arrays.pop("action"))
     self._ours = jax.eval_shape(self.env.reset, KEYS[0])
-    self.states: State = jax.tree_util.tree_map_with_path(self._recorded, self._ours)
+    states: State = jax.tree_util.tree_map_with_path(self._recorded, self._ours)
+    # Tied to a device as what the task computes is, else its program would be compiled again.
+    self.states = jax.device_put(states, jax.devices()[0])
 
   @functools.cached_property
   def first(self) -> State:
@@ -154,6 +156,12 @@ class Golden:
       if _name(path) not in unrecorded:
         theirs = np.asarray(b, np.float64)
         yield _name(path), np.where(np.isnan(theirs), np.nan, np.asarray(a, np.float64)), theirs
+
+
+def recorded(name: str, **info: jax.Array) -> State:
+  """A recorded state amid an episode, with some of its `info` replaced: any variant of the task may go on from it."""
+  state = jax.tree.map(lambda x: x[4], golden(name).states)
+  return state.replace(info=state.info | info)
 
 
 def _of_class(table: Mapping[type, set[str]], env: Env) -> set[str]:

@@ -12,7 +12,7 @@ from playground.config import compose
 from playground.envs.base import State
 from playground.errors import ConfigError
 from playground.mdp.gait import AT_REST
-from tests.envs.golden import golden, load_task
+from tests.envs.golden import load_task, recorded
 
 G1, T1, APOLLO = "G1JoystickFlatTerrain", "T1JoystickFlatTerrain", "ApolloJoystickFlatTerrain"
 
@@ -25,11 +25,6 @@ def g1() -> Any:
 @pytest.fixture(scope="module")
 def t1() -> Any:
   return load_task(T1)
-
-
-def recorded(task: str, **info: jax.Array) -> State:
-  state = jax.tree.map(lambda x: x[4], golden(task).states)
-  return state.replace(info=state.info | info)
 
 
 def evaluate(env: Any, state: State, **data: Any) -> State:

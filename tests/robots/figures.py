@@ -15,6 +15,9 @@ from playground.robots.scene import build_scene
 
 TESTS = Path(__file__).parents[1]
 
+# Solver fields of a joint, by name in the figures, where they have them, and in MuJoCo's specifications.
+SOLVER_FIELDS = {"solreflimit": "solref_limit", "solimplimit": "solimp_limit"}
+
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
@@ -28,7 +31,10 @@ class Scene:
     no_sensors: sensors of the reference that nothing reads.
     more_sensors: sensors that we have besides.
     no_geom_fields: fields of collision geoms that act nowhere.
-    spec: builds the scene, where it is another than a robot on a terrain (which has the figures' sensors in order).
+    no_excludes: pairs of bodies, excluded from contact in the reference, that have nothing which collides.
+    no_keyframes: keyframes of the reference that nothing starts from.
+    no_tendon_lengths: tendons that touch a pulley at a point, so that rounding adds a turn around it or not.
+    spec: builds the scene, where it is another than a robot on a terrain.
   """
 
   robot: str
@@ -38,6 +44,9 @@ class Scene:
   no_sensors: tuple[str, ...] = ()
   more_sensors: tuple[str, ...] = ()
   no_geom_fields: tuple[str, ...] = ()
+  no_excludes: tuple[tuple[str, str], ...] = ()
+  no_keyframes: tuple[str, ...] = ()
+  no_tendon_lengths: tuple[str, ...] = ()
   spec: Callable[[], mujoco.MjSpec] | None = None
 
 
@@ -98,7 +107,7 @@ def rebuild(facts: dict[str, Any], hfield_data: np.ndarray | None = None) -> muj
   bodies = {"world": spec.worldbody}
   for b in facts["bodies"][1:]:
     body = bodies[b["name"]] = bodies[b["parent"]].add_body(name=b["name"], pos=b["pos"], quat=b["quat"])
-    body.mocap = "mocapid" in b
+    body.mocap, body.gravcomp = "mocapid" in b, b.get("gravcomp", 0)
     if b["mass"]:  # else the body is fixed to its parent and weighs nothing
       body.explicitinertial = True
       body.mass, body.ipos, body.iquat, body.inertia = (b[key] for key in ("mass", "ipos", "iquat", "inertia"))
@@ -109,6 +118,8 @@ def rebuild(facts: dict[str, Any], hfield_data: np.ndarray | None = None) -> muj
     bodies[j["body"]].add_joint(
       name=j["name"], type=enum(mujoco.mjtJoint, j["type"]), pos=j["pos"], axis=j["axis"], range=j["range"],
       damping=[j["damping"], 0, 0], armature=j["armature"], frictionloss=j["frictionloss"], limited=j["limited"],
+      stiffness=[j["stiffness"], 0, 0], springref=j["springref"], ref=j["ref"],
+      **{to: j[key] for key, to in SOLVER_FIELDS.items() if key in j},
       actfrcrange=j.get("actfrcrange", [0, 0]), actfrclimited="actfrcrange" in j,
     )  # fmt: skip
   for h in facts["hfields"]:
@@ -154,8 +165,9 @@ def rebuild(facts: dict[str, Any], hfield_data: np.ndarray | None = None) -> muj
   for a in facts["actuators"]:
     spec.add_actuator(
       name=a["name"], target=a["target"], trntype=enum(mujoco.mjtTrn, a["trntype"]), gainprm=padded(a["gainprm"]),
-      biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=padded(a["biasprm"]), ctrllimited=a["ctrllimited"],
-      ctrlrange=a["ctrlrange"], forcelimited=a["forcelimited"], forcerange=a["forcerange"],
+      biastype=enum(mujoco.mjtBias, a["biastype"]), biasprm=padded(a["biasprm"]), gear=a["gear"],
+      ctrllimited=a["ctrllimited"], ctrlrange=a["ctrlrange"], forcelimited=a["forcelimited"],
+      forcerange=a["forcerange"],
     )  # fmt: skip
   return spec.compile()
 

@@ -10,6 +10,7 @@ import pytest
 from playground.robots.bimanual import build_aloha_scene
 from playground.robots.gains import set_gains
 from playground.robots.in_hand import build_in_hand_scene
+from playground.robots.tabletop import build_tabletop
 from tests.robots.figures import Scene, build, close, enum, figures, flags, floor_contacts, named, padded, rebuild
 from tests.robots.figures import robot_config as config_of
 
@@ -44,7 +45,26 @@ SCENES = {
     more_sensors=("l_foot_global_linvel", "r_foot_global_linvel"),
     no_geom_fields=("solref", "margin"),  # contact pairs have their own
   ),
+  "aero_hand_cube": Scene(
+    "aero_hand",
+    spec=functools.partial(build_in_hand_scene, "aero_hand"),
+    no_tendon_lengths=("if_tendon1", "mf_tendon1", "rf_tendon1", "pf_tendon1"),  # which have no spring and no servo
+  ),
   "leap_cube": Scene("leap_hand", spec=functools.partial(build_in_hand_scene, "leap_hand")),
+  **{
+    name: Scene(
+      "panda",
+      spec=functools.partial(build_tabletop, name),
+      no_excludes=(("link0", "link1"),) if name != "panda_robotiq_cube" else (),
+      no_keyframes=unused,
+    )
+    for name, unused in (
+      ("panda_single_cube", ("pickup", "pickup1")),
+      ("panda_single_cube_camera", ()),
+      ("panda_cabinet", ("home",)),
+      ("panda_robotiq_cube", ()),
+    )
+  },
   "aloha_peg": Scene("aloha", spec=functools.partial(build_aloha_scene, "peg_insertion")),
   "aloha_handover": Scene("aloha", spec=functools.partial(build_aloha_scene, "handover")),
 }
@@ -53,6 +73,13 @@ GEOM_FIELDS = (
   "pos", "contype", "conaffinity", "condim", "friction", "solref", "solimp", "solmix", "margin", "gap", "priority",
   "group",
 )  # fmt: skip
+
+
+# A joint's solver fields in the figures, in the model, and what they are where the figures do not have them.
+JOINT_SOLVER = (
+  ("solreflimit", "jnt_solref", (0.02, 1)),
+  ("solimplimit", "jnt_solimp", (0.9, 0.95, 0.001, 0.5, 2)),
+)
 
 
 class Subject:
@@ -76,10 +103,14 @@ def subject(request: pytest.FixtureRequest) -> Subject:
 
 def test_counts(subject: Subject) -> None:
   model, facts = subject.model, subject.facts
-  ours = {"ngeom", "nmesh", "nsensor", "nsensordata"}  # we draw otherwise; sensors have a test of their own
+  ours = {"ngeom", "nmesh", "nlight"}  # we draw otherwise
+  ours |= {"nsensor", "nsensordata"}  # have a test of their own
   if subject.scene.terrain != "flat":
     ours |= {"nkey"}  # one file serves all terrains
   counts = {key: count for key, count in facts["counts"].items() if key not in ours}
+  counts["nexclude"] -= len(subject.scene.no_excludes)
+  if "nkey" in counts:
+    counts["nkey"] -= len(subject.scene.no_keyframes)
   assert {key: getattr(model, key) for key in counts} == counts
   close(model.body_mass.sum(), facts["total_mass"])
   close(model.qpos0, facts["qpos0"])
@@ -113,8 +144,9 @@ def test_bodies(subject: Subject) -> None:
     assert body.name == named(figure["name"])
     if figure["parent"]:
       assert subject.model.body(int(body.parentid[0])).name == named(figure["parent"])
-    for key in ("pos", "quat", "mass", "inertia", "ipos", "iquat"):
+    for key in ("pos", "quat", "mass", "inertia", "ipos", "iquat") if figure["mass"] else ("pos", "quat", "mass"):
       close(getattr(body, key), figure[key], (body.name, key))
+    close(subject.model.body_gravcomp[figure["id"]], figure.get("gravcomp", 0), (body.name, "gravcomp"))
 
 
 def test_joints(subject: Subject) -> None:
@@ -132,6 +164,9 @@ def test_joints(subject: Subject) -> None:
     assert bool(joint.limited[0]) == figure["limited"]
     for key in ("pos", "axis", "range", "stiffness"):
       close(getattr(joint, key), figure[key], (joint.name, key))
+    close(model.qpos_spring[figure["qposadr"]], figure["springref"], (joint.name, "springref"))
+    for key, field, default in JOINT_SOLVER:
+      close(getattr(model, field)[figure["id"]], figure.get(key, default), (joint.name, key))
     assert bool(model.jnt_actfrclimited[figure["id"]]) == ("actfrcrange" in figure)
     if "actfrcrange" in figure:
       close(model.jnt_actfrcrange[figure["id"]], figure["actfrcrange"], (joint.name, "actfrcrange"))
@@ -167,13 +202,14 @@ def test_sensors(subject: Subject) -> None:
   model, scene = subject.model, subject.scene
   ours = subject.names(mujoco.mjtObj.mjOBJ_SENSOR, model.nsensor)
   assert sorted(ours) == sorted([*(figure["name"] for figure in subject.sensors), *scene.more_sensors])
-  if scene.collision in ("feet", "pairs") and not scene.spec:
+  in_order = scene.collision == "feet"
+  if in_order:
     assert [name for name in ours if name not in scene.more_sensors] == [figure["name"] for figure in subject.sensors]
   for figure in subject.sensors:
     sensor = model.sensor(figure["name"])
     assert sensor.type[0] == enum(mujoco.mjtSensor, figure["type"])
     assert (sensor.dim[0], sensor.cutoff[0]) == (figure["dim"], figure["cutoff"])
-    if scene.collision == "feet" and not scene.more_sensors and not scene.spec:
+    if in_order and not scene.more_sensors:
       assert sensor.adr[0] == figure["adr"]
     objtype = enum(mujoco.mjtObj, figure["objtype"])
     assert sensor.objtype[0] == objtype
@@ -202,7 +238,7 @@ def test_collision_geoms(subject: Subject) -> None:
       if key not in subject.scene.no_geom_fields:
         close(getattr(geom, key), figure[key], (geom.name, key))
     if figure["type"] != "plane":  # whose size is how it is drawn
-      used = 1 if figure["type"] == "sphere" else 3
+      used = {"sphere": 1, "capsule": 2, "cylinder": 2}.get(figure["type"], 3)
       close(geom.size[:used], figure["size"][:used], (geom.name, "size"))
 
 
@@ -224,11 +260,12 @@ def test_pairs_and_excludes(subject: Subject) -> None:
     for key in ("friction", "solref", "solreffriction", "solimp", "margin", "gap"):
       close(getattr(model, f"pair_{key}")[figure["id"]], figure[key], (pair.name, key))
   bodies = [(model.body(int(s) >> 16).name, model.body(int(s) & 0xFFFF).name) for s in model.exclude_signature]
-  assert sorted(bodies) == sorted((e["body1"], e["body2"]) for e in subject.facts["contact_excludes"])
+  excludes = [(e["body1"], e["body2"]) for e in subject.facts["contact_excludes"]]
+  assert sorted([*bodies, *subject.scene.no_excludes]) == sorted(excludes)
 
 
 def test_keyframes(subject: Subject) -> None:
-  for figure in subject.facts["keyframes"]:
+  for figure in (k for k in subject.facts["keyframes"] if k["name"] not in subject.scene.no_keyframes):
     key = subject.model.key(figure["name"])
     np.testing.assert_allclose(key.qpos, figure["qpos"], rtol=1e-8, atol=1e-9, err_msg=key.name)
     close(key.ctrl, figure["ctrl"], key.name)
@@ -251,7 +288,9 @@ def test_equality(subject: Subject) -> None:
   model = subject.model
   for figure in subject.facts["equality"]:
     i, objtype = figure["id"], enum(mujoco.mjtObj, figure["objtype"])
-    assert (model.eq_type[i], model.eq_objtype[i]) == (enum(mujoco.mjtEq, figure["type"]), objtype)
+    assert model.eq_type[i] == enum(mujoco.mjtEq, figure["type"])
+    if figure["type"] != "joint":  # which says what its objects are
+      assert model.eq_objtype[i] == objtype
     assert model.eq_active0[i] == figure["active"]
     objects = [mujoco.mj_id2name(model, objtype, int(obj)) for obj in (model.eq_obj1id[i], model.eq_obj2id[i])]
     assert objects == [figure["obj1"], figure["obj2"]]
@@ -266,12 +305,14 @@ def test_tendons(subject: Subject) -> None:
   for figure in subject.facts["tendons"]:
     tendon = model.tendon(figure["id"])
     assert tendon.name == figure["name"]
-    for key in ("range", "damping", "frictionloss", "armature", "length0", "width"):
-      close(getattr(tendon, key), figure[key], (tendon.name, key))
-    close(tendon.stiffness, figure.get("stiffness", 0), tendon.name)
-    close(tendon.lengthspring, figure["springlength"], tendon.name)
-    first = int(tendon.adr[0])
-    for i, wrap in zip(range(first, first + int(tendon.num[0])), figure["path"], strict=True):
+    for key in ("limited", "range", "damping", "frictionloss", "armature", "width"):
+      close(getattr(model, f"tendon_{key}")[tendon.id], figure[key], (tendon.name, key))
+    close(model.tendon_stiffness[tendon.id], figure.get("stiffness", 0), (tendon.name, "stiffness"))
+    if tendon.name not in subject.scene.no_tendon_lengths:
+      close(model.tendon_length0[tendon.id], figure["length0"], (tendon.name, "length0"))
+      close(model.tendon_lengthspring[tendon.id], figure["springlength"], (tendon.name, "springlength"))
+    first = model.tendon_adr[tendon.id]
+    for i, wrap in zip(range(first, first + model.tendon_num[tendon.id]), figure["path"], strict=True):
       kind = mujoco.mjtWrap(model.wrap_type[i])
       assert kind == enum(mujoco.mjtWrap, wrap["wrap"])
       assert kinds[kind](int(model.wrap_objid[i])).name == wrap["obj"]
@@ -280,23 +321,22 @@ def test_tendons(subject: Subject) -> None:
         assert (model.site(side).name if side >= 0 else None) == wrap.get("sidesite")
 
 
-def reaching(model: mujoco.MjModel) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-  """Random velocities, targets and poses near the keyframe `home`; every second turns loose bodies any way up."""
+def reaching(model: mujoco.MjModel, home: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+  """Random velocities, targets and poses near a keyframe's; every second turns loose bodies any way up."""
   rng = np.random.default_rng(0)
-  home = model.key("home")
   result = []
   for i in range(16):
-    qpos = home.qpos.copy()
+    qpos = np.array(home["qpos"], float)
     for kind, start, limits in zip(model.jnt_type, model.jnt_qposadr, model.jnt_range, strict=True):
       if kind != mujoco.mjtJoint.mjJNT_FREE:
         qpos[start] += rng.normal(0, 0.1) * (limits[1] - limits[0])
         continue
-      qpos[start : start + 3] += rng.normal(0, 0.02, 3)
+      qpos[start : start + 3] += rng.normal([0, 0, -0.02], 0.02)
       if i % 2:
         qpos[start + 3 : start + 7] = rng.normal(size=4)
       qpos[start + 3 : start + 7] /= np.linalg.norm(qpos[start + 3 : start + 7])
     spread = np.diff(model.actuator_ctrlrange).ravel()
-    result.append((qpos, rng.normal(0, 1, model.nv), home.ctrl + rng.normal(0, 0.1, model.nu) * spread))
+    result.append((qpos, rng.normal(0, 1, model.nv), home["ctrl"] + rng.normal(0, 0.1, model.nu) * spread))
   return result
 
 
@@ -327,9 +367,10 @@ def forward(model: mujoco.MjModel, state: tuple[np.ndarray, ...]) -> tuple[mujoc
 
 def test_dynamics(subject: Subject) -> None:
   """Mass matrix, forces, contacts, accelerations and sensors equal those of a model rebuilt from the figures."""
-  model, scene = subject.model, subject.scene
+  model, scene, keyframes = subject.model, subject.scene, subject.facts["keyframes"]
   touching = 0
-  for state in reaching(model) if scene.spec else states(model, config_of(scene.robot)["keyframe"]):
+  poses = states(model, config_of(scene.robot)["keyframe"]) if not scene.spec else reaching(model, keyframes[0])
+  for state in poses:
     (ours, mass), (theirs, mass_there) = forward(subject.model, state), forward(subject.reference, state)
     touching += ours.ncon > 0
     assert (ours.ncon, ours.nefc) == (theirs.ncon, theirs.nefc)
@@ -345,7 +386,10 @@ def test_dynamics(subject: Subject) -> None:
   assert touching >= 8
 
 
-@pytest.mark.parametrize("name", [name for name, scene in SCENES.items() if scene.collision == "feet" and not scene.spec])
+ON_LEGS = [name for name, scene in SCENES.items() if scene.collision == "feet" and not scene.spec]
+
+
+@pytest.mark.parametrize("name", ON_LEGS)
 def test_robot_yaml(name: str) -> None:
   """Every name in configs/robot/<robot>.yaml is in the model, and lists over feet follow `feet`."""
   facts, robot = figures(name), config_of(SCENES[name].robot)

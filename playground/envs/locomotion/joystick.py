@@ -28,15 +28,25 @@ class Joystick(LeggedTask):
   """Tracks commanded forward, sideways and turning velocity (paper: appendix "Locomotion", joystick tasks).
 
   Which rewards, observations, commands, gait, noise, pushes and terminations there are and how they weigh is
-  `configs/env/joystick.yaml`, and what bipeds have otherwise `configs/env/biped_joystick.yaml`.
+  `configs/env/joystick.yaml`; what bipeds have otherwise is `configs/env/biped_joystick.yaml`, and what tracking a gait
+  asks for besides (paper: gait tracking, with a joystick and in place) `configs/env/gait_tracking.yaml`.
 
   The defaults differ from Playground 0.2.0 as follows; `env.parity=true` has its ways:
   - soft joint limits shrink the range about its centre (0.2.0 scales the Go1's bounds, which lets the knees pass the
     hard limit);
   - a kick is as strong as it says on the robot at hand (0.2.0 takes the mass before randomisation);
   - scaled joint angles of a start stay within the joints' limits;
-  - Apollo starts with its targets where its joints are (0.2.0: all 0);
+  - Apollo, Barkour, H1, OP3 and Spot start with their targets where their joints are (0.2.0: all 0);
   - after standing still the legs take up their gait again (0.2.0's T1 and Apollo move both feet in step from then on);
+  - Barkour, H1, OP3 and Spot observe the direction of gravity in their own frame (0.2.0: the upward axis in the world
+    frame, which depends on the heading);
+  - Spot observes the command that it should follow in a gait, and only gaits that should keep the base level punish its
+    going up and down (0.2.0: only the others); a foot's phase starts within +- pi (0.2.0: one of Spot's walk does not);
+  - the H1's contacts are those of its feet (0.2.0 reads other sensors), and its change of action is that of the actions
+    in their order;
+  - Barkour's joints may leave their default pose while it moves (0.2.0: only if the command is to the left);
+  - every fall of Barkour and OP3 costs (0.2.0: not those in the last step of a command);
+  - noise on the position of Spot's feet is independent in x, y and z (0.2.0: the same draw);
   - hips may roll while the command is sideways, and only then (0.2.0: Berkeley Humanoid's and T1's hips are free while
     it is not; on the G1 the weights of the four joints multiply each of them).
   """

@@ -1,0 +1,214 @@
+"""Scenes on a table or floor: an arm, the gripper on it and what it handles, each described once and put together here.
+
+A part's file (`robots/<name>/*.xml`, `robots/props/*.xml`) holds that part alone, with default classes of its own. The
+arm's file also holds the solver's options and a frame `flange` for the gripper. Bodies come in the order in which parts
+are attached, the world's own geoms before all; keyframes and sensors speak of the whole scene and are added last.
+"""
+
+from collections.abc import Callable
+
+import mujoco
+
+from playground.errors import UnknownNameError, nearest
+from playground.robots.scene import ROBOTS, add_studio
+
+# Pose from which the Panda picks things up: joints (rad), fingers (m).
+_ARM_HOME = (0, 0.3, 0, -1.57079, 0, 2, -0.7853)
+_FINGERS_OPEN = (0.04, 0.04)
+
+# Parts of the gripper that should not touch the floor, a wall or a cabinet.
+_GUARDED = ("left_finger_pad", "right_finger_pad", "hand_capsule")
+
+
+def build_tabletop(name: str) -> mujoco.MjSpec:
+  """Builds a scene.
+
+  Args:
+    name: a key of `TABLETOPS`.
+
+  Returns:
+    The scene, to edit further or `compile()`. The ground is geom 0, named `floor`; targets are mocap bodies.
+
+  Raises:
+    UnknownNameError: no such scene.
+  """
+  if name not in TABLETOPS:
+    raise UnknownNameError(f"scene={name!r} is unknown: choose from {', '.join(TABLETOPS)}.{nearest(name, TABLETOPS)}")
+  return TABLETOPS[name]().copy()  # a copy does not repeat, when compiled, the warning that `attach` silences
+
+
+def load(part: str) -> mujoco.MjSpec:
+  """Reads a part's MJCF, e.g. `panda/panda` or `props/cube`."""
+  return mujoco.MjSpec.from_file(str(ROBOTS / f"{part}.xml"))
+
+
+def attach(spec: mujoco.MjSpec, part: str, *, frame: str = "") -> None:
+  """Puts a part into a scene, with its actuators, equality constraints and contact excludes, under the names it has.
+
+  Args:
+    spec: the scene.
+    part: as in `load`. None of its names, those of default classes and materials included, may be in the scene already.
+    frame: of the scene, where the part's own origin comes to lie; the world's origin without.
+  """
+  where = spec.frame(frame) if frame else spec.worldbody.add_frame()
+  # MuJoCo warns that a scene with parts that get no prefix may not come out right as XML, which is not what it is for.
+  warning = mujoco.get_mju_user_warning()
+  mujoco.set_mju_user_warning(lambda message: None)
+  try:
+    spec.attach(load(part), prefix="", frame=where)
+  finally:
+    mujoco.set_mju_user_warning(warning)
+
+
+def add_contact_sensor(spec: mujoco.MjSpec, geom: str, other: str, *, name: str = "", data: str = "found") -> None:
+  """Adds a sensor of the deepest contact between two geoms.
+
+  Args:
+    spec: the scene.
+    geom: from which the normal points.
+    other: to which it points.
+    name: of the sensor, `<geom>_<other>_<data>` without.
+    data: `found` (above 0 while they touch) or `normal` (3 numbers, zeros while they do not).
+  """
+  field = {"found": mujoco.mjtConDataField.mjCONDATA_FOUND, "normal": mujoco.mjtConDataField.mjCONDATA_NORMAL}[data]
+  spec.add_sensor(
+    name=name or f"{geom}_{other}_{data}",
+    type=mujoco.mjtSensor.mjSENS_CONTACT,
+    objtype=mujoco.mjtObj.mjOBJ_GEOM,
+    objname=geom,
+    reftype=mujoco.mjtObj.mjOBJ_GEOM,
+    refname=other,
+    intprm=[1 << int(field), 1, 1],  # 1: the one of smallest distance; 1 contact
+  )
+
+
+def _panda() -> mujoco.MjSpec:
+  """The Panda with its own hand on the floor of a studio."""
+  spec = load("panda/panda")
+  attach(spec, "panda/hand", frame="flange")
+  return spec
+
+
+def _add_floor(spec: mujoco.MjSpec, height: float = 0.0) -> None:
+  add_studio(spec)
+  spec.delete(spec.light("spotlight"))  # scenes here have lights of their own
+  plane = mujoco.mjtGeom.mjGEOM_PLANE
+  spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 0.05], pos=[0, 0, height], material="groundplane")
+
+
+def _add_top_light(spec: mujoco.MjSpec) -> None:
+  spec.worldbody.add_light(
+    name="top",
+    type=mujoco.mjtLightType.mjLIGHT_SPOT,
+    mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
+    pos=[0, 0, 2],
+  )
+
+
+def _add_sun(spec: mujoco.MjSpec, height: float) -> None:
+  spec.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, height], diffuse=[0.3] * 3)
+
+
+def _add_cube(spec: mujoco.MjSpec) -> None:
+  attach(spec, "props/cube")
+  for geom in _GUARDED:
+    add_contact_sensor(spec, geom, "floor")
+  add_contact_sensor(spec, "box", "hand_capsule", name="box_hand_found")
+
+
+def _panda_single_cube() -> mujoco.MjSpec:
+  """A cube to pick up."""
+  spec = _panda()
+  _add_floor(spec)
+  _add_top_light(spec)
+  _add_sun(spec, 1.5)
+  _add_cube(spec)
+  cube = (0.7, 0, 0.03, 1, 0, 0, 0)
+  spec.add_key(name="home", qpos=[*_ARM_HOME, *_FINGERS_OPEN, *cube], ctrl=[*_ARM_HOME, 0.04])
+  return spec
+
+
+def _panda_single_cube_camera() -> mujoco.MjSpec:
+  """A red cube to pick up, a white strip where it may lie, a camera that sees both, one light, materials to draw."""
+  spec = _panda()
+  for i in range(10):
+    white, blue, alpha = 1 - 0.1 * i / 9, 1 - 0.08 * i / 9, 1 - 0.05 * i
+    spec.add_material(name=f"off_white{i}", rgba=[white, white, blue, alpha], shininess=0.25)
+  _add_floor(spec)
+  spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.3] * 3, [0.6] * 3
+  _add_top_light(spec)
+  strip = {"size": [0.02, 1, 0.01], "pos": [0.631, 0, 0.001], "rgba": [1, 1, 1, 1], "contype": 0, "conaffinity": 0}
+  spec.worldbody.add_geom(name="init_space", type=mujoco.mjtGeom.mjGEOM_PLANE, **strip)
+  quat = [0.657706645, 0.265371277, 0.263783826, 0.653772244]
+  spec.worldbody.add_camera(name="front", pos=[1.176, 0.001, 0.483], quat=quat, fovy=42)
+  _add_cube(spec)
+  spec.body("box").pos = [1, 0, 0.03]
+  spec.geom("box").rgba = [1, 0, 0, 1]
+  low = (-2e-05, 0.47804, -0.00055, -1.81309, -0.00161, 2.34597, 0.78501)
+  spec.add_key(name="low_home", qpos=[*low, *_FINGERS_OPEN, 0.7, 0, 0.03, 1, 0, 0, 0], ctrl=[*low, 0.04])
+  arm = (0.0481, 0.5604, -0.0417, -1.8459, 0.0342, 2.3654, 0.7852)
+  cube = (0.6368, 0.0064, 0.1179, 1, 0.0001, -0.001, -0.0063)
+  spec.add_key(name="picked", qpos=[*arm, 0.0198, 0.02, *cube], ctrl=[*arm, 0])
+  return spec
+
+
+def _panda_cabinet() -> mujoco.MjSpec:
+  """A drawer to open, from an arm stretched upwards."""
+  spec = _panda()
+  spec.geom("hand_capsule").conaffinity = 3  # meets the cabinet, too
+  _add_floor(spec)
+  _add_top_light(spec)
+  _add_sun(spec, 1.5)
+  quat = [0.0492779628, 0.0492779628, 0.705387611, 0.705387611]
+  spec.worldbody.add_camera(name="side", pos=[0.5, 1.381, 0.476], quat=quat)
+  attach(spec, "props/cabinet")
+  for geom in _GUARDED:
+    add_contact_sensor(spec, "barrier", geom)
+  spec.add_key(name="upright", qpos=[0] * 10, ctrl=[0] * 8)
+  return spec
+
+
+def _panda_robotiq_cube() -> mujoco.MjSpec:
+  """A foam block to push over a table, with torques, before a wall; gravity does not pull the robot."""
+  spec = load("panda/panda")
+  attach(spec, "panda/robotiq_2f85", frame="flange")
+  _drive_by_torque(spec)
+  spec.option.iterations = spec.option.ls_iterations = spec.option.ccd_iterations = 10
+  spec.visual.global_.azimuth, spec.visual.global_.elevation = -40, -30
+  _add_floor(spec, -0.02297)
+  _add_sun(spec, 3)
+  wall = {"size": [0.48, 0.75, 0.05], "pos": [0.946, 0, 0.5], "quat": [1, 0, -1, 0]}
+  spec.worldbody.add_geom(name="wall", type=mujoco.mjtGeom.mjGEOM_PLANE, **wall)
+  table = {"size": [0.315, 0.6, 0.01], "pos": [0.54586, 0.02337, -0.02], "contype": 0, "conaffinity": 0}
+  spec.worldbody.add_geom(name="pad", type=mujoco.mjtGeom.mjGEOM_BOX, rgba=[0.5, 0.5, 0.5, 0.2], **table)
+  attach(spec, "props/yoga_block")
+  for side in ("left", "right"):
+    for part in ("coupler_col_1", "coupler_col_2", "follower_pad2"):
+      add_contact_sensor(spec, f"{side}_{part}", "box", data="normal")
+  for other in ("wall", "floor"):
+    for geom in _GUARDED:
+      add_contact_sensor(spec, other, geom)
+  arm = (-0.182772, 0.146282, 0.172246, -2.24238, -0.0788546, 2.45127, 0.0160022)
+  block = (0.56784, -0.0253974, 0.0306525, 0, 0, 0, 1)
+  spec.add_key(name="home", qpos=[*arm, *[0.8] * 6, *block], ctrl=[*[0] * 7, 0.82])
+  return spec
+
+
+def _drive_by_torque(spec: mujoco.MjSpec) -> None:
+  """Makes the Panda's servos motors, with a control of 1 for 150 Nm (the first four) or 20 Nm, in light joints."""
+  for body in spec.bodies[1:]:
+    body.gravcomp = 1
+  for i in range(1, 8):
+    spec.joint(f"joint{i}").damping[0] = 1
+    motor = spec.actuator(f"actuator{i}")
+    motor.set_to_motor()
+    motor.gear[0] = 150 if i <= 4 else 20
+    motor.inheritrange, motor.ctrlrange = 0, [-1, 1]
+
+
+TABLETOPS: dict[str, Callable[[], mujoco.MjSpec]] = {
+  "panda_single_cube": _panda_single_cube,
+  "panda_single_cube_camera": _panda_single_cube_camera,
+  "panda_cabinet": _panda_cabinet,
+  "panda_robotiq_cube": _panda_robotiq_cube,
+}
