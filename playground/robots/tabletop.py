@@ -38,7 +38,7 @@ def build_tabletop(name: str) -> mujoco.MjSpec:
 
 
 def load(part: str) -> mujoco.MjSpec:
-  """Reads a part's MJCF, e.g. `panda/panda` or `props/cube`."""
+  """Reads a part's MJCF, e.g. `panda/arm` or `props/cube`."""
   return mujoco.MjSpec.from_file(str(ROBOTS / f"{part}.xml"))
 
 
@@ -51,7 +51,7 @@ def attach(spec: mujoco.MjSpec, part: str, *, frame: str = "") -> None:
     frame: of the scene, where the part's own origin comes to lie; the world's origin without.
   """
   where = spec.frame(frame) if frame else spec.worldbody.add_frame()
-  # MuJoCo warns that a scene with parts that get no prefix may not come out right as XML, which is not what it is for.
+  # MuJoCo warns that a scene whose parts get no prefix may not be written as XML, which nobody does.
   warning = mujoco.get_mju_user_warning()
   mujoco.set_mju_user_warning(lambda message: None)
   try:
@@ -83,13 +83,14 @@ def add_contact_sensor(spec: mujoco.MjSpec, geom: str, other: str, *, name: str 
 
 
 def _panda() -> mujoco.MjSpec:
-  """The Panda with its own hand on the floor of a studio."""
-  spec = load("panda/panda")
+  """The Panda with its own hand."""
+  spec = load("panda/arm")
   attach(spec, "panda/hand", frame="flange")
   return spec
 
 
 def _add_floor(spec: mujoco.MjSpec, height: float = 0.0) -> None:
+  """A studio and its floor, `height` m above the arm's base."""
   add_studio(spec)
   spec.delete(spec.light("spotlight"))  # scenes here have lights of their own
   plane = mujoco.mjtGeom.mjGEOM_PLANE
@@ -170,7 +171,7 @@ def _panda_cabinet() -> mujoco.MjSpec:
 
 def _panda_robotiq_cube() -> mujoco.MjSpec:
   """A foam block to push over a table, with torques, before a wall; gravity does not pull the robot."""
-  spec = load("panda/panda")
+  spec = load("panda/arm")
   attach(spec, "panda/robotiq_2f85", frame="flange")
   _drive_by_torque(spec)
   spec.option.iterations = spec.option.ls_iterations = spec.option.ccd_iterations = 10

@@ -175,3 +175,47 @@ def rebuild(facts: dict[str, Any], hfield_data: np.ndarray | None = None) -> muj
 def padded(parameters: list[float], size: int = 10) -> list[float]:
   """Parameters, of actuators unless `size` says otherwise, with the trailing zeros that the figures leave out."""
   return parameters + [0.0] * (size - len(parameters))
+
+
+def reaching(model: mujoco.MjModel, home: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+  """Random velocities, targets and poses near a keyframe's; every second turns loose bodies any way up."""
+  rng = np.random.default_rng(0)
+  result = []
+  for i in range(16):
+    qpos = np.array(home["qpos"], float)
+    for kind, start, limits in zip(model.jnt_type, model.jnt_qposadr, model.jnt_range, strict=True):
+      if kind != mujoco.mjtJoint.mjJNT_FREE:
+        qpos[start] += rng.normal(0, 0.1) * (limits[1] - limits[0])
+        continue
+      qpos[start : start + 3] += rng.normal([0, 0, -0.02], 0.02)
+      if i % 2:
+        qpos[start + 3 : start + 7] = rng.normal(size=4)
+      qpos[start + 3 : start + 7] /= np.linalg.norm(qpos[start + 3 : start + 7])
+    spread = np.diff(model.actuator_ctrlrange).ravel()
+    result.append((qpos, rng.normal(0, 1, model.nv), home["ctrl"] + rng.normal(0, 0.1, model.nu) * spread))
+  return result
+
+
+def states(model: mujoco.MjModel, keyframe: str) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+  """Random velocities and targets at poses near the keyframe, feet at the ground, and fallen or upside down near it."""
+  rng = np.random.default_rng(0)
+  home = model.key(keyframe)
+  result = []
+  for i in range(16):
+    qpos = home.qpos + np.concatenate([[0, 0, rng.uniform(-0.03, 0.01)], rng.normal(0, 0.05, model.nq - 3)])
+    qpos[2] -= 0.03 * model.nhfield  # on which keyframes stand higher
+    if i % 2:
+      qpos[2] = rng.uniform(0, 0.4) * home.qpos[2]
+      qpos[3:7] = rng.normal(size=4)
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    result.append((qpos, rng.normal(0, 1, model.nv), home.ctrl + rng.normal(0, 0.5, model.nu)))
+  return result
+
+
+def forward(model: mujoco.MjModel, state: tuple[np.ndarray, ...]) -> tuple[mujoco.MjData, np.ndarray]:
+  """The data after `mj_forward`, and the mass matrix."""
+  data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+  data.qpos, data.qvel, data.ctrl = state
+  mujoco.mj_forward(model, data)
+  mujoco.mj_fullM(model, data, mass)
+  return data, mass
