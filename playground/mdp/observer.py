@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from playground.errors import ConfigError
 from playground.mdp.legged import Context
 from playground.mdp.lookup import lookup
 from playground.mdp.noise import add_noise
@@ -39,6 +40,7 @@ class Observer:
 
     Raises:
       UnknownNameError: a part that does not exist.
+      ConfigError: a number of steps below 1.
     """
     slips = {name: config.parity_obs[name] for name in config.parity_obs}
     for name, other in slips.items():
@@ -52,6 +54,9 @@ class Observer:
     self._factors = {name: np.asarray(scales[name]) for name in scales}
     self._steps = {name: int(history[name]) for name in history}
     self._frames: int = config.get("frames", 1)
+    for key, steps in {"frames": self._frames, **{f"history.{name}": n for name, n in self._steps.items()}}.items():
+      if steps < 1:
+        raise ConfigError(f"env.{key}={steps} must be a number of steps, 1 or more.")
     self.looks_back = max(self._frames, *self._steps.values(), 1) > 1
     groups = sorted(config.obs, key=lambda group: (group != ACTOR, group))
     left_out = {name for name, other in slips.items() if other is None}
@@ -76,8 +81,10 @@ class Observer:
   def sizes(self, now: Context) -> dict[str, dict[str, int]]:
     """Returns the length of each part, by observation; of frames the newest, with the others' under `past_frames`."""
     names = {part for parts in self._groups.values() for part in parts} - {ACTOR}
-    steps = {name: self._steps.get(name.removesuffix("_history"), 1) for name in names}
-    sizes = {name: steps[name] * self._part(now, name.removesuffix("_history")).size for name in names}
+    sizes = {}
+    for name in names:
+      base = name.removesuffix("_history")
+      sizes[name] = self._part(now, base).size * (1 if name == base else self._steps[base])
     parts = {part: sizes[part] for part in self._groups[ACTOR]}
     frame = sum(parts.values())
     past = {"past_frames": (self._frames - 1) * frame} if self._frames > 1 else {}

@@ -90,7 +90,7 @@ class Golden:
 
   def __init__(self, name: str):
     with np.load(GOLDEN / f"{name}.npz") as file:
-      self._arrays = {_RENAMED.get(key, key): file[key] for key in file.files}
+      self._arrays: dict[str, np.ndarray] = {_RENAMED.get(key, key): file[key] for key in map(str, file.files)}
     header = json.loads(str(self._arrays.pop("header")))
     silent = [key for key in header["overrides"] if key.startswith("obs_noise.scales.")]  # all of them are 0
     overrides = {_OVERRIDES[key]: value for key, value in header["overrides"].items() if key not in silent}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ml_collections import ConfigDict
 
-from playground.errors import UnknownNameError
+from playground.errors import ConfigError, UnknownNameError
 from playground.mdp.legged import Context
 from playground.mdp.observer import Observer
 
@@ -63,9 +63,9 @@ def test_parity_replaces_and_leaves_out(parity: bool) -> None:
 
 
 def test_a_history_is_newest_first_and_begins_with_zeros() -> None:
-  of = observer(obs={"state": ["command", "target_error_history", "joint_pos"]}, history={"target_error": 3})
+  of = observer(obs={"state": ["command", "target_error_history", "target_error"]}, history={"target_error": 3})
   assert of.looks_back
-  assert of.sizes(moment())["state"] == {"command": 3, "target_error_history": 6, "joint_pos": 2}
+  assert of.sizes(moment())["state"] == {"command": 3, "target_error_history": 6, "target_error": 2}
   errors = [slice(3, 5), slice(5, 7), slice(7, 9)]
   seen = roll(of, *(moment(q) for q in (0.1, 0.2, 0.3, 0.4)))
   expected = [[q - 0.1, -q - 0.2] for q in (0.1, 0.2, 0.3, 0.4)]
@@ -115,4 +115,10 @@ def test_noise_is_on_the_actors_parts_only() -> None:
 )
 def test_unknown_parts(config: dict[str, Any], message: str) -> None:
   with pytest.raises(UnknownNameError, match=message):
+    observer(**config)
+
+
+@pytest.mark.parametrize("config", [{"frames": 0}, {"history": {"joint_pos": 0}}])
+def test_no_step_at_all(config: dict[str, Any]) -> None:
+  with pytest.raises(ConfigError, match="=0 must be a number of steps, 1 or more"):
     observer(**config)
