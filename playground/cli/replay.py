@@ -1,4 +1,4 @@
-"""`playground replay <dump>`: takes the step again that went NaN or infinite, and says where."""
+"""`playground replay <dump>`: takes the step again that went NaN, infinite or absurd, and says where."""
 
 import jax
 from rich.console import Console
@@ -10,7 +10,7 @@ from playground.runs.nonfinite import Dump, nonfinite_fields
 
 
 def replay(path: str, console: Console | None = None) -> int:
-  """Prints what was not finite in the dumped step and in its replay on this machine.
+  """Prints what was NaN, infinite or absurd in the dumped step and in its replay on this machine.
 
   Args:
     path: a run's `nan_dump/step_*.npz`.
@@ -34,4 +34,4 @@ def replay(path: str, console: Console | None = None) -> int:
 
 
 def _listed(fields: list[str]) -> str:
-  return "not finite in " + "; ".join(fields) if fields else "all finite"
+  return "NaN, infinite or absurd in " + "; ".join(fields) if fields else "all finite"

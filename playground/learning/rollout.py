@@ -24,7 +24,7 @@ class Transitions(struct.PyTreeNode):
 
 
 class NonfiniteCapture(struct.PyTreeNode):
-  """The first step of a run in which some environment's numbers went NaN or infinite, for replay.
+  """The first step of a run in which some environment's numbers went NaN, infinite or absurd, for replay.
 
   Attributes:
     found: whether there is one, [1] bool (one a device).

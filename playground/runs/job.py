@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class NonfiniteError(PlaygroundError):
-  """Too many environment steps went NaN or infinite for the run to go on."""
+  """Too many environment steps went NaN, infinite or absurd for the run to go on."""
 
 
 class Job:
@@ -205,11 +205,11 @@ class Job:
       self._dumped = True
       dump = write_dump(self._run_dir.nan_dump, step, capture, self._config.resolved)
       where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
-      self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN or infinite.{where}")
+      self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or absurd.{where}")
     fraction = bad * self._env.action_repeat / max(taken, 1)
     if fraction > self._config.on_nonfinite.max_fraction:
       raise NonfiniteError(
-        f"{fraction:.1%} of the environment steps before step {step:,} went NaN or infinite, more than "
+        f"{fraction:.1%} of the environment steps before step {step:,} went NaN, infinite or absurd, more than "
         f"on_nonfinite.max_fraction={self._config.on_nonfinite.max_fraction:g}.{where}"
       )
 

@@ -1,4 +1,4 @@
-"""The record of the first step that went NaN or infinite, and its replay."""
+"""The record of the first step that went NaN, infinite or absurd, and its replay."""
 
 import json
 from pathlib import Path
@@ -74,7 +74,7 @@ def nonfinite_fields(tree: Any) -> list[str]:
   """Names of the leaves that hold a NaN, infinity or value beyond the guard's limit, with how many."""
   lines = []
   for name, leaf in _named(tree):
-    values, limit = np.asarray(leaf), MAX_VELOCITY if name.endswith("qvel") else MAX_VALUE
+    values, limit = np.asarray(leaf), MAX_VELOCITY if "qvel" in name else MAX_VALUE
     bad = ~(np.abs(values) <= limit) if np.issubdtype(values.dtype, np.floating) else np.zeros(1, bool)
     if bad.any():
       lines.append(f"{name}: {int(bad.sum())} of {values.size}")
