@@ -18,7 +18,8 @@ def make_mesh(num_devices: int) -> Mesh:
 def device_memory(mesh: Mesh) -> int | None:
   """Bytes that a program may use on the smallest device, None where the runtime does not say (CPU)."""
   limits = [(device.memory_stats() or {}).get("bytes_limit") for device in mesh.devices.flat]
-  return None if None in limits else min(limits)
+  known = [limit for limit in limits if limit is not None]
+  return min(known) if len(known) == len(limits) else None
 
 
 def jit_on_mesh(function: Callable[..., Any], mesh: Mesh, in_specs: Any, out_specs: Any, **kwargs: Any) -> Any:

@@ -19,7 +19,7 @@ from playground.robots.scene import ROBOTS, build_scene
 from playground.robots.terrain import HALF_EXTENT, POINTS, START, TERRAINS, add_terrain
 
 DEFAULTS = yaml.safe_load((Path(__file__).parents[2] / "configs/env/_terrain.yaml").read_text())["scene"]
-ROBOT_NAMES = sorted(path.parent.name for path in ROBOTS.glob("*/*.xml"))
+ROBOT_NAMES = sorted(path.stem for path in ROBOTS.glob("*/*.xml") if path.stem == path.parent.name)
 UNEVEN = [name for name in TERRAINS if name != "flat"]
 
 
