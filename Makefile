@@ -25,7 +25,7 @@ run: setup
 	$(BIN)/playground-run $(ARGS)
 
 test: setup
-	$(TEST_ENV) $(BIN)/python -m pytest -q $(ARGS)
+	$(TEST_ENV) $(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)
 
 test-slow: setup
 	$(TEST_ENV) $(BIN)/python -m pytest -q -m slow $(ARGS)
