@@ -25,7 +25,8 @@ class HardwareError(PlaygroundError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-  """Returns ' Did you mean X?' for the closest known name, or '' if none is close."""
+  """Returns ' Did you mean X?' for a name that begins so, else for the closest; '' if none is close."""
   lowered = {k.lower(): k for k in known}
-  match = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+  begun = [k for k in lowered if len(name) > 3 and k.startswith(name.lower())]
+  match = begun or difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
   return f" Did you mean {lowered[match[0]]!r}?" if match else ""

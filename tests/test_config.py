@@ -243,7 +243,7 @@ ERRORS = {
   "randomization.terms.0.field=x": ["randomization.terms is a list of 0."],
   "env@foo=CartpoleBalance": ["env@foo does not exist", "Did you mean 'env'?"],
   "+agent.foo=1": ["agent.foo does not exist: agent has name, num_timesteps, "],
-  "++env.foo=1": ["env.foo does not exist: env has task, "],
+  "++env.foo=1": ["env.foo does not exist: env has "],
   "+foo.bar=1": ["foo.bar does not exist: the configuration has "],
   "~agent.num_envs": ["~agent.num_envs: a key cannot be removed"],
   "agent.learning_rate=fast": ["agent.learning_rate=fast", "must be a number, as its default 0.0003 is."],
