@@ -14,6 +14,7 @@ from playground.learning.algorithms import make_learner
 from playground.learning.checkpoints import Checkpoint, find_checkpoints
 from playground.learning.evaluation import make_evaluator
 from playground.rendering.video import render_video
+from playground.rendering.visuals import drawn_model
 from playground.runs.files import write_json
 from playground.runs.job import episodes_of
 from playground.runs.run_dir import RunDirectory
@@ -54,6 +55,7 @@ def evaluate_run(
   if count < 1:
     raise ConfigError(f"--episodes={count} must be above 0.")
   env = registry.load(run.choices["env"], config=run.env)
+  drawn = drawn_model(env, run.video.visuals)
   _, model = randomized_models(env, run, 1, count)
   learner = make_learner(env, run.agent, hardware.mesh, hardware.network_precision)
   policy = learner.place_policy(checkpoint.restore("policy", learner.policy_shape()))
@@ -75,5 +77,5 @@ def evaluate_run(
   console.print(f"written to {out}", soft_wrap=True)
   if video:
     tape = episodes_of(recording, 1)
-    render_video(env.mj_model, out_path=Path(video), dt=env.dt * env.action_repeat, notify=console.print, **tape)
+    render_video(drawn, out_path=Path(video), dt=env.dt * env.action_repeat, notify=console.print, **tape)
   return 0

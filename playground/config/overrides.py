@@ -17,7 +17,9 @@ from playground.errors import ConfigError, UnknownNameError, nearest
 DEFAULT_EXPERIMENT = "quickstart"
 # Any of these on the command line, and it is not the default run that is meant.
 _CHOOSES_A_RUN = {"experiment", "env", "agent", "robot", "curriculum", "resume"}
-_SHORT = {"terrain": "env.scene.terrain"}  # keys that may be written without their section
+_SHORT = {"terrain": "env.scene.terrain", "visuals": "video.visuals"}  # keys that may be written without their section
+
+_OF_SWEEPS = {"sweep", "sweep_dir", "on_error", "launcher", "search"}
 
 
 class Override(NamedTuple):
@@ -41,6 +43,11 @@ def is_hydras(text: str) -> bool:
   return text.lstrip("+~").startswith(("hydra.", "hydra/"))
 
 
+def is_of_sweep(key: str) -> bool:
+  """Whether a key or group says how a sweep is run, and nothing of its jobs."""
+  return key.split(".")[0] in _OF_SWEEPS
+
+
 def parse_with_hydra(text: str) -> HydraOverride:
   """Reads one override as Hydra does; raises ConfigError if it is none."""
   try:
@@ -61,8 +68,6 @@ def parse(text: str, roots: Sequence[Path]) -> Override:
   text = _SHORT.get(name, name) + equals + value
   parsed = parse_with_hydra(text)
   key = parsed.key_or_group
-  if key == "sweep":
-    raise ConfigError(f"{text} stands for many runs: add -m, as in `playground-run -m {text}`.")
   if parsed.is_sweep_override():
     raise ConfigError(f"{text} names several values, which is a sweep: add -m, or quote the value.")
   is_group = key in groups(roots) and parsed.package is None

@@ -156,6 +156,10 @@ def pushed(c: Context) -> jax.Array:
   """Whether a push is under way, 0 or 1 [1]."""
   if "push" in c.info:
     return c.info["push"].any().astype(jnp.float32)[None]
+  if "pert_interval" in c.info:  # regular kicks; `push_step` is already that of the next step
+    step, interval = c.info["push_step"] - 1, c.info["pert_interval"]
+    kicking = (step >= interval) & (step % interval < c.info["pert_duration"])
+    return kicking.astype(jnp.float32)[None]
   return (c.kept("steps_since_last_pert") >= c.kept("steps_until_next_pert")).astype(jnp.float32)[None]
 
 

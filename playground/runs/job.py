@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import mujoco
 import numpy as np
 
 from playground.envs.base import Env
@@ -44,10 +45,12 @@ class Job:
     progress: Progress,
     interrupts: Interrupts,
     start: Start,
+    drawn: mujoco.MjModel,
   ):
     self._config = config
     self._run_dir = run_dir
     self._env = env
+    self._drawn = drawn
     self._learner = learner
     self._progress = progress
     self._interrupts = interrupts
@@ -174,7 +177,7 @@ class Job:
     view = self._config.video
     self._video = self._videos.submit(
       render_video,
-      self._env.mj_model,
+      self._drawn,
       out_path=self._run_dir.videos / f"step_{step:012d}.mp4",
       dt=self._env.dt * self._env.action_repeat,
       camera=view.camera,

@@ -13,6 +13,7 @@ from playground.learning.algorithms import algorithm
 from playground.learning.evaluation import make_evaluator
 from playground.learning.loop import Loop, compile_program, schedule
 from playground.randomization import Randomizer
+from playground.rendering.visuals import drawn_model
 from playground.runs.chain import train_chain
 from playground.runs.interrupts import Interrupted, Interrupts, exit_code
 from playground.runs.job import Job
@@ -55,6 +56,7 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
   agent = algorithm_class.Config.from_config(config.agent)
   agent.check(hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
+  drawn = drawn_model(env, config.video.visuals)
   model, eval_model = randomized_models(env, config, agent.num_envs, agent.num_eval_envs)
   learner = algorithm_class(env, agent, hardware.mesh, model, hardware.network_precision)
   start.notices += learner.notices()
@@ -80,7 +82,7 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
     timings = {"start_to_compiled_s": to_compiled_s, "trace_s": program.trace_s, "compile_s": program.compile_s}
     run_dir.update_manifest(timings=timings)
 
-    job = Job(config, run_dir, env, learner, progress, interrupts, start)
+    job = Job(config, run_dir, env, learner, progress, interrupts, start, drawn)
     with contextlib.closing(job):
       loop = Loop(learner, program, marks, config.seed, job, model, eval_model)
       interrupts.start_saving()

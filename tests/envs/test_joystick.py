@@ -96,7 +96,7 @@ def test_kick_changes_the_base_velocity(kicked: Joystick, start: State, step) ->
 def test_metrics_are_the_weighted_terms(start: State, kicked: Joystick) -> None:
   scales = kicked.config.reward.scales
   in_use = {name for name in scales if scales[name] != 0}
-  assert set(start.metrics) == {f"reward/{name}" for name in in_use} | {"swing_peak"}
+  assert set(start.metrics) == {f"reward/{name}" for name in in_use} | {"swing_peak", "fall", *kicked.summaries}
   default = jax.vmap(kicked.evaluate)(start.data, start.info, jnp.zeros((4, 12)))
   double = load_task(TASK, {"reward.scales.orientation": 2 * scales.orientation, "reward.clip": [-1e4, 1e4]})
   other = jax.vmap(double.evaluate)(start.data, start.info, jnp.zeros((4, 12)))

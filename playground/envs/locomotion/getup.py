@@ -1,6 +1,7 @@
 """Get up after a fall: one task for all robots, composed by config."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 from playground.envs.base import State
 from playground.envs.locomotion.legged import LeggedTask
 from playground.envs.physics import mjx
+from playground.mdp.legged import Context
 
 
 class Getup(LeggedTask):
@@ -20,6 +22,8 @@ class Getup(LeggedTask):
   - Spot observes the direction of gravity in its own frame (0.2.0 gives it the upward axis in the world frame, which
     depends on the heading).
   """
+
+  summaries: ClassVar[Mapping[str, str]] = {"upright": "last"}
 
   def __init__(self, config: Any):
     super().__init__(config)
@@ -40,6 +44,10 @@ class Getup(LeggedTask):
       data = self.physics.step(model, data, data.ctrl, self._settle_steps)
     info = {"rng": rng, "last_last_act": jnp.zeros(self.action_size)}
     return self._first_state(data.replace(time=jnp.zeros_like(data.time)), info, *noise_key)
+
+  def _measure(self, now: Context) -> dict[str, jax.Array]:
+    """Adds whether the base is upright, within 18 degrees."""
+    return super()._measure(now) | {"upright": (now.sensor("upvector")[2] > 0.95).astype(jnp.float32)}
 
   def _fallen_pose(self, key: jax.Array) -> jax.Array:
     """A pose in the air: any orientation, uniformly, and joint angles uniform within their ranges."""

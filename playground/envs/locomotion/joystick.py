@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +52,7 @@ class Joystick(LeggedTask):
   """
 
   logged = ("swing_peak",)
+  summaries: ClassVar[Mapping[str, str]] = {"tracking_error/lin_vel": "mean", "tracking_error/ang_vel": "mean"}
 
   def __init__(self, config: Any):
     """Builds the task, as `LeggedTask`.
@@ -126,6 +127,14 @@ class Joystick(LeggedTask):
     # A foot that touched in the step before but left the floor since has landed, too.
     first = was_in_air & (now.contact | now.info["last_contact"])
     return dataclasses.replace(now, info={**now.info, **swing}, first_contact=first)
+
+  def _measure(self, now: Context) -> dict[str, jax.Array]:
+    """Adds by how much the velocity in the base's frame misses the command: horizontally, m/s, and turning, rad/s."""
+    linvel, gyro, command = now.sensor("linvel"), now.sensor("gyro"), now.command
+    return super()._measure(now) | {
+      "tracking_error/lin_vel": jnp.linalg.norm(command[:2] - linvel[:2]),
+      "tracking_error/ang_vel": jnp.abs(command[2] - gyro[2]),
+    }
 
   def _next_info(self, now: Context, rng: jax.Array, keys: Mapping[str, jax.Array]) -> dict[str, Any]:
     """Ends the swings of feet on the floor, moves the gait on and draws the next command when it is due."""

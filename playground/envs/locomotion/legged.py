@@ -53,7 +53,8 @@ class LeggedTask(Env):
       UnknownNameError: a reward, observation, termination, robot, terrain or object that does not exist.
       ConfigError: a reward's parameter is missing.
     """
-    mj_model = self._scene(config).compile()
+    self.spec = self._scene(config)
+    mj_model = self.spec.compile()
     set_gains(mj_model, **config.robot.pd)
     super().__init__(config, mj_model)
     self.robot = LeggedRobot(mj_model, config.robot, self.parity)
@@ -107,7 +108,7 @@ class LeggedTask(Env):
     reward = self._sum_up(rewards)
     after = self._next_info(now, rng, keys)
     metrics = {f"reward/{name}": value for name, value in rewards.items()}
-    metrics |= {name: after[name].mean() for name in self.logged}
+    metrics |= {name: after[name].mean() for name in self.logged} | self._measure(now)
     return State(data, obs, reward, now.done.astype(jnp.float32), metrics, after)
 
   def _sum_up(self, rewards: Mapping[str, jax.Array]) -> jax.Array:
@@ -128,6 +129,7 @@ class LeggedTask(Env):
     info = {**info, "last_act": jnp.zeros(self.action_size)}
     info["rng"], obs = self._observe(self._context(data, info, info["last_act"]), info["rng"], noise_key)
     metrics = {name: jnp.zeros(()) for name in (*(f"reward/{name}" for name in self._rewards), *self.logged)}
+    metrics |= {name: jnp.zeros(()) for name in ("fall", *self.summaries)}
     return State(data, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
 
   @property
@@ -193,6 +195,10 @@ class LeggedTask(Env):
     """The next `rng`, and the observation. The noise's keys come from `noise_key`; without one, from `rng`."""
     after, obs = self._observer.observe(now, rng if noise_key is None else noise_key, last)
     return after if noise_key is None else rng, obs
+
+  def _measure(self, now: Context) -> dict[str, jax.Array]:
+    """Metrics of how well the task is done, in units that people use; `fall` counts episodes that ended early."""
+    return {"fall": now.done.astype(jnp.float32)}
 
   def _next_info(self, now: Context, rng: jax.Array, keys: Mapping[str, jax.Array]) -> dict[str, Any]:
     """What the next step starts from; `keys` are those of `_step_draws`, none without a key for noise."""
