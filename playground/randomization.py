@@ -88,6 +88,16 @@ class Term:
     first, second = (self.mean, self.std) if self.distribution == "normal" else (self.range or (None, None))
     return first, second  # pyright: ignore[reportReturnType]  # parse has seen that they are numbers
 
+  def describe(self) -> dict[str, str]:
+    """Field, target, operation and draw (distribution and parameters), for people."""
+    first, second = self.parameters
+    return {
+      "field": self.field if self.column is None else f"{self.field}[:, {self.column}]",
+      "target": self.target if isinstance(self.target, str) else ", ".join(self.target),
+      "operation": self.operation,
+      "draw": f"{self.distribution}({first:g}, {second:g})",
+    }
+
   @classmethod
   def parse(cls, term: Mapping[str, Any], key: str) -> "Term":
     """Checks a term that `key`, e.g. `randomization.terms[0]`, holds; raises ConfigError."""
@@ -182,21 +192,17 @@ class Randomizer:
     return jax.vmap(self.sample)(keys)
 
   def describe(self) -> list[dict[str, str]]:
-    """One row per term for people: field, target, operation, draw (distribution and parameters), and values drawn."""
-    rows = []
-    for draw in self._draws:
-      term = draw.term
-      first, second = term.parameters
-      rows.append(
-        {
-          "field": term.field if term.column is None else f"{term.field}[:, {term.column}]",
-          "target": term.target if isinstance(term.target, str) else ", ".join(term.target),
-          "operation": term.operation,
-          "draw": f"{term.distribution}({first:g}, {second:g})",
-          "values": str(draw.count),
-        }
-      )
-    return rows
+    """One row per term for people: `Term.describe`, and how many values are drawn."""
+    return [draw.term.describe() | {"values": str(draw.count)} for draw in self._draws]
+
+
+def parse_terms(terms: Iterable[Mapping[str, Any]]) -> list[Term]:
+  """Checks the terms of a `configs/randomization/*.yaml`, as far as can be done without a model.
+
+  Raises:
+    ConfigError: a term that cannot work, with its place in the list.
+  """
+  return [Term.parse(term, key) for key, term in _keyed(terms)]
 
 
 def domain_randomizer(

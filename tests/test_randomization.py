@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mujoco import mjx
 
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError
-from playground.randomization import Randomizer, domain_randomizer
+from playground.randomization import Randomizer, domain_randomizer, parse_terms
 from playground.robots.scene import build_scene
 
 CONFIGS = Path(__file__).parents[1] / "configs/randomization"
@@ -113,14 +113,33 @@ DRAWN = {
   "g1": [1, 29, 29, 31, 1, 29],
   "t1": [1, 23, 23, 25, 1, 23, 23, 4],
 }
+# The same, wider, with the joints' damping (after armature), the centre of mass (before the masses) and gains (last).
+DRAWN |= {
+  "go1_strong": [1, 12, 12, 12, 3, 14, 1, 12, 12],
+  "berkeley_humanoid_strong": [1, 12, 12, 12, 3, 14, 1, 12, 12],
+  "g1_strong": [1, 29, 29, 29, 3, 31, 1, 29, 29],
+  "t1_strong": [1, 23, 23, 23, 3, 25, 1, 23, 23, 4],
+}
 
 
 def test_every_robots_terms_bind_to_its_model() -> None:
   assert set(DRAWN) == {path.stem for path in CONFIGS.glob("*.yaml")} - {"none"}
   for robot, drawn in DRAWN.items():
     terms = yaml.safe_load((CONFIGS / f"{robot}.yaml").read_text())["terms"]
-    rows = Randomizer(build_scene(robot).compile(), terms).describe()
+    rows = Randomizer(build_scene(robot.removesuffix("_strong")).compile(), terms).describe()
     assert [int(row["values"]) for row in rows] == drawn, robot
+
+
+@pytest.mark.parametrize("robot", ["go1", "berkeley_humanoid", "g1", "t1"])
+def test_strong_draws_go_beyond_the_others(robot: str) -> None:
+  """Every term of <robot>.yaml is in <robot>_strong.yaml, on the same entries, at least as wide."""
+  usual, strong = (
+    parse_terms(yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["terms"]) for name in (robot, f"{robot}_strong")
+  )
+  for term in usual:
+    same = [t for t in strong if (t.field, t.target, t.operation) == (term.field, term.target, term.operation)]
+    assert len(same) == 1, term
+    assert same[0].parameters[0] <= term.parameters[0] and same[0].parameters[1] >= term.parameters[1], term
 
 
 def test_g1s_feet_slide_alike_in_both_directions() -> None:

@@ -42,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
 
   add("list", _list, "List tasks.").add_argument("word", nargs="?", help="only tasks whose name contains it")
   show = add("show", _show, "Show what a task observes, does, is paid for and is trained with.")
-  show.add_argument("task")
+  show.add_argument("task", help="a task, or randomization=<name> for what that draws")
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
   add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
   evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
@@ -86,11 +86,14 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> int:
-  config = compose([f"env={args.task}", *args.overrides])
   from rich.console import Console
 
-  env = registry.build(config.env)
   console = Console()
+  if args.task.startswith("randomization=") and not args.overrides:
+    console.print(describe_randomization(compose([args.task])))
+    return 0
+  config = compose([f"env={args.task}", *args.overrides])
+  env = registry.build(config.env)
   for part in describe(config, env):
     console.print(part)
   return 0
@@ -103,6 +106,7 @@ def describe(config: RunConfig, env: "Env") -> "Iterable[RenderableType]":
   from playground.randomization import Randomizer
 
   section, choices = config.resolved["env"], config.choices
+  Randomizer(env.mj_model, config.resolved["randomization"]["terms"])  # a term without a target is said before anything
   state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
   ctrl = [f"[{low:g}, {high:g}]" for low, high in dict.fromkeys(map(tuple, env.mj_model.actuator_ctrlrange))]
   auto = f"auto: jax on CPU, {section['cuda_impl']} on an NVIDIA GPU"
@@ -121,11 +125,18 @@ def describe(config: RunConfig, env: "Env") -> "Iterable[RenderableType]":
   scales = section.get("reward", {}).get("scales", {})
   terms = [name.removeprefix("reward/") for name in state.metrics if name.startswith("reward/")]
   yield _table("reward terms and weights", ((t, scales.get(t, "")) for t in dict.fromkeys([*scales, *terms])))
-  rows = Randomizer(env.mj_model, config.resolved["randomization"]["terms"]).describe()
-  drawn = [(row["field"], f"{row['target']}: {row['operation']} {row['draw']}") for row in rows]
-  yield _table(f"randomization: {choices['randomization']}", drawn)
+  yield describe_randomization(config)
   origin = f"tuned/{choices['tuned']}.yaml" if choices.get("tuned") else "defaults, not tuned for this task"
   yield _table(f"{config.agent.name} ({origin})", _flat(config.resolved["agent"]))
+
+
+def describe_randomization(config: RunConfig) -> "RenderableType":
+  """A table of what is drawn from what."""
+  from playground.randomization import parse_terms
+
+  rows = [term.describe() for term in parse_terms(config.resolved["randomization"]["terms"])]
+  drawn = [(row["field"], f"{row['target']}: {row['operation']} {row['draw']}") for row in rows]
+  return _table(f"randomization: {config.choices['randomization']}", drawn)
 
 
 def _observation(env: "Env", obs: Any) -> Iterable[tuple[str, Any]]:

@@ -80,6 +80,7 @@ def test_list_is_fast_and_needs_no_jax():
       ],
     ),
     (["CartpoleBalance", "env.impl=jax"], ["state 5", "upright", "backend jax", "randomization: none none"]),
+    (["randomization=go1"], ["randomization: go1", "trunk: add uniform(-1, 1)", "geom_friction[:, 0] floor"]),
     (["joystick", "robot=go1"], ["joystick", "robot go1", "ppo (defaults, not tuned for this task)"]),
   ],
 )
@@ -93,6 +94,11 @@ def test_show(command: Command, capsys: pytest.CaptureFixture[str], args: list[s
 def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   assert command("show", "CartpoleBalanc") == 2
   assert "Did you mean 'CartpoleBalance'?" in capsys.readouterr().err
+  assert command("show", "Go1JoystickFlatTerrain", "randomization=g1") == 2
+  out, err = capsys.readouterr()
+  assert "target 'left_foot_floor' is no pair of the model" in err and not out
+  assert command("show", "randomization=go2") == 2
+  assert "Did you mean 'go1'?" in capsys.readouterr().err
 
 
 def test_doctor(command: Command, monkeypatch: pytest.MonkeyPatch):
