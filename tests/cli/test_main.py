@@ -1,7 +1,6 @@
 """`playground`: list, show, and what the other commands hand over."""
 
 import sys
-import time
 import types
 from collections.abc import Callable
 from subprocess import run
@@ -52,14 +51,12 @@ def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
   assert "error: No task's name contains 'cartpool'" in capsys.readouterr().err
 
 
-def test_list_is_fast_and_needs_no_jax():
+def test_list_needs_no_jax():
   code = (
     "import sys; sys.argv = ['playground', 'list']; from playground.cli.main import main\n"
     "try: main()\nfinally: assert 'jax' not in sys.modules"
   )
-  start = time.perf_counter()
-  run([sys.executable, "-c", code], check=True, capture_output=True)
-  assert time.perf_counter() - start < 3  # a third of a second, unless the machine is busy
+  run([sys.executable, "-c", code], check=True, capture_output=True)  # a third of a second
 
 
 @pytest.mark.parametrize(
