@@ -1,0 +1,304 @@
+"""What each command measures: its options, and the jobs that they stand for."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from playground.benchmark.arguments import option
+from playground.benchmark.jobs import Job, Plan, probe, run_jobs
+from playground.benchmark.schema import Table
+from playground.benchmark.suites import check_agent, choose_tasks
+from playground.config import RunConfig, compose
+from playground.errors import ConfigError
+
+RESULTS = Path("results/benchmarks")
+TRAINING = "training_steps_per_s"
+QUANTITY = {  # the last row of a measurement
+  "training": TRAINING,
+  "environment": "env_steps_per_s",
+  "breakdown": "seconds_per_step",
+  "startup": "start_to_first_update_s",
+}
+
+# Of the paper's pixel tables (appendix D): episodes of 3 and 4 s, for the Panda with all that is randomised.
+PIXEL_CONDITIONS = {
+  "CartpoleBalanceVision": ["env.ctrl_dt=0.04", "env.episode_length=75"],
+  "PandaPickCubeCartesianVision": [
+    "randomization=panda_vision",
+    "env.episode_length=80",
+    "env.vision.brightness=[0.25,1.1]",
+  ],
+}
+COMPARED_CONDITIONS = [f"env.ctrl_dt={1 / 60}", f"env.sim_dt={1 / 120}", "env.episode_length=180"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Measuring:
+  """Options of everything that measures."""
+
+  out: str | None = option(None, "CSV that rows are added to; null is results/benchmarks/<command>.csv")
+  rerun: bool = option(False, "measure again what the CSV has already")
+  minutes: float | None = option(None, "stop after this long; the same command again measures the rest")
+  workers: int = option(1, "processes at once: they compile side by side, one at a time is timed on a device")
+  gpus: tuple[int, ...] = option((), "GPUs that the processes are spread over; none is all of them to each")
+  cache: bool = option(False, "reuse compiled programs; compile and start times are then not those of a cold start")
+  commit: str | None = option(None, "what to record where there is no git")
+  note: str = option("", "added to the conditions of every row")
+  overrides: tuple[str, ...] = option((), "of the run's configuration")
+
+  name = "measuring"
+  alone = False  # whether it needs the machine to itself
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    raise NotImplementedError
+
+  def check(self) -> None:
+    """Raises PlaygroundError for what cannot be measured, before anything expensive."""
+    if self.workers < 1:
+      raise ConfigError(f"workers={self.workers} must be at least 1.")
+    if self.alone and self.workers > 1:
+      raise ConfigError(f"workers={self.workers}: {self.name} wants the machine to itself, workers=1.")
+
+  def columns(self, task: str, agent: str, setting: Sequence[str] = (), who: str = "ours") -> dict[str, Any]:
+    texts = " ".join((*self.overrides, *setting))
+    return {"benchmark": self.name, "task": task, "agent": agent, "who": who, "setting": texts}
+
+
+@dataclasses.dataclass(frozen=True)
+class OfTasks(Measuring):
+  """Options of what is measured for tasks of one algorithm."""
+
+  suite: str | None = option(None, "dm_control, locomotion, manipulation or all: the tasks of the paper's tables")
+  tasks: tuple[str, ...] = option((), "tasks by name, instead of a suite or on top")
+  agent: str = option("ppo", "ppo or sac")
+  seconds: float = option(4.0, "how long to time each number, at least one update")
+
+  def check(self) -> None:
+    super().check()
+    check_agent(self.agent)
+    self.configured(self.chosen()[0])
+
+  def chosen(self) -> list[str]:
+    return choose_tasks(self.suite, self.tasks)
+
+  def configured(self, task: str, *more: str) -> RunConfig:
+    """A task's run; raises ConfigError for overrides that cannot be."""
+    return compose([f"env={task}", f"agent={self.agent}", *self.overrides, *more])
+
+  def with_envs(self, task: str, count: int) -> list[str]:
+    """Overrides for so many environments; PPO's batch grows where each would give less than a trajectory."""
+    setting = [f"agent.num_envs={count}"]
+    if self.agent == "ppo":  # every environment gives a whole number of trajectories, no fewer than tuned
+      agent = self.configured(task).agent
+      batch = agent.batch_size * max(1, -(-count // (agent.batch_size * agent.num_minibatches)))
+      setting += [f"agent.batch_size={batch}"] * (batch != agent.batch_size)
+    return setting
+
+  def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: Any) -> Job:
+    """A job with overrides, which `setting` says."""
+    overrides = [*self.overrides, *setting]
+    arguments = {"task": task, "agent": self.agent, "overrides": overrides, "seconds": self.seconds, **arguments}
+    return Job(measure, arguments, self.columns(task, self.agent, setting), {"quantity": QUANTITY[measure]})
+
+  def on_one_device(self, job: Job) -> Job:
+    """The job with one device for each process: what most tables are about, so no setting of its own."""
+    arguments = {**job.arguments, "overrides": [*job.arguments["overrides"], "hardware.devices=1"]}
+    return dataclasses.replace(job, arguments=arguments)
+
+
+@dataclasses.dataclass(frozen=True)
+class Throughput(OfTasks):
+  """Training steps/s of each task at the paper's hyperparameters on one device, compile and start time, memory."""
+
+  seeds: int = option(5, "trainings timed, seeds 1 to this")
+
+  name = "throughput"
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    seeds = list(range(1, self.seeds + 1))
+    return [self.on_one_device(self.job("training", task, seeds=seeds)) for task in self.chosen()]
+
+
+@dataclasses.dataclass(frozen=True)
+class Startup(OfTasks):
+  """From the command to the first update, with empty caches and again with full ones, evaluation compiled too."""
+
+  name = "startup"
+  alone = True
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    last = {"quantity": "start_to_first_update_s", "setting": " ".join((*self.overrides, "warm"))}
+    jobs = [self.job("startup", task) for task in self.chosen()]
+    return [dataclasses.replace(job, last=last) for job in jobs]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scaling(OfTasks):
+  """Environment and training steps/s and memory against the number of environments, one device."""
+
+  num_envs: tuple[int, ...] = option((256, 1024, 4096, 16384), "numbers of environments")
+
+  name = "scaling"
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    jobs = []
+    for task in self.chosen():
+      for count in self.num_envs:
+        setting = self.with_envs(task, count)
+        both = self.job("environment", task, setting), self.job("training", task, setting, seeds=[1])
+        jobs += map(self.on_one_device, both)
+    return jobs
+
+
+@dataclasses.dataclass(frozen=True)
+class Breakdown(OfTasks):
+  """Where a training step's time goes: physics, task, episodes, inference, storing, update, added one by one."""
+
+  name = "breakdown"
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, "part=update"))}
+    jobs = [self.on_one_device(self.job("breakdown", task)) for task in self.chosen()]
+    return [dataclasses.replace(job, last=last) for job in jobs]
+
+
+@dataclasses.dataclass(frozen=True)
+class Pixels(OfTasks):
+  """Time of a step from pixels, as in the paper: state alone, with pictures, with inference, with training."""
+
+  sizes: tuple[int, ...] = option((32, 64, 128, 256), "sides of the pictures")
+  num_envs: tuple[int, ...] = option((1024,), "numbers of environments")
+  compared: bool = option(False, "steps of 1/60 s, in which the paper compares simulators; only for Cartpole")
+
+  name = "pixels"
+
+  def chosen(self) -> list[str]:
+    if self.suite or self.tasks:
+      return super().chosen()
+    return ["CartpoleBalanceVision"] if self.compared else list(PIXEL_CONDITIONS)
+
+  def check(self) -> None:
+    super().check()
+    for task in self.chosen():
+      if not self.configured(task).env.vision.enable:
+        raise ConfigError(f"{task} sees nothing: add env.vision.enable=true env.vision.camera=<name>.")
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    jobs = []
+    for task in self.chosen():
+      conditions = COMPARED_CONDITIONS if self.compared else PIXEL_CONDITIONS.get(task, [])
+      for size in self.sizes:
+        for count in self.num_envs:
+          seen = [f"env.vision.width={size}", f"env.vision.height={size}"]
+          setting = [*conditions, *seen, *self.with_envs(task, count)]
+          last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, *setting, "part=update"))}
+          jobs.append(dataclasses.replace(self.on_one_device(self.job("breakdown", task, setting)), last=last))
+    return jobs
+
+
+@dataclasses.dataclass(frozen=True)
+class Topology(OfTasks):
+  """Training steps/s on 1, 2, 4, ... devices of this machine, with hyperparameters as they are and scaled."""
+
+  devices: tuple[int, ...] = option((), "numbers of devices; none is 1, 2, 4, ... as many as there are")
+  hyperparameters: tuple[str, ...] = option(("fixed", "scaled"), "scaled: environments and batch times the devices")
+  seeds: int = option(3, "trainings timed")
+
+  name = "topology"
+  alone = True
+
+  def check(self) -> None:
+    super().check()
+    for kind in self.hyperparameters:
+      if kind not in ("fixed", "scaled"):
+        raise ConfigError(f"hyperparameters={kind} must be fixed, scaled or both.")
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    counts = self.devices or [2**i for i in range(facts["devices"].bit_length())]
+    jobs = []
+    for task in self.chosen():
+      for count in counts:
+        for kind in self.hyperparameters if count > 1 else ("fixed",):
+          setting = [f"hardware.devices={count}"]
+          setting += ["hardware.scale_envs=true"] * (kind == "scaled")
+          jobs.append(self.job("training", task, setting, seeds=list(range(1, self.seeds + 1))))
+    return jobs
+
+
+@dataclasses.dataclass(frozen=True)
+class Chain(Measuring):
+  """Runs a fine-tuning curriculum and reports each stage's return and time."""
+
+  experiment: str = option("go1_joystick_chain", "an experiment that is a chain")
+  runs: str = option(str(RESULTS / "chains"), "folder of the run directories; an unfinished one is resumed")
+  seeds: int = option(1, "runs, seeds 1 to this")
+
+  name = "chain"
+  alone = True
+
+  def check(self) -> None:
+    super().check()
+    if not compose([f"experiment={self.experiment}", *self.overrides]).stages:
+      raise ConfigError(f"experiment={self.experiment} is no chain: choose one that ends in _chain.")
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    agent = compose([f"experiment={self.experiment}", *self.overrides]).agent.name
+    arguments = {"experiment": self.experiment, "overrides": list(self.overrides), "runs": self.runs}
+    columns = self.columns(self.experiment, agent)
+    last = {"quantity": "wall_clock_s", "setting": " ".join((*self.overrides, "stage=all"))}
+    seeds = range(1, self.seeds + 1)
+    return [Job("chain", {**arguments, "seeds": [seed]}, columns, last) for seed in seeds]
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare(OfTasks):
+  """Ours and the public package's PPO, in turn, on one machine in one call; the best of the repeats counts."""
+
+  peer: str = option("playground020", "the package to compare with")
+  peer_python: str = option("python3", "interpreter of the environment that it is installed in")
+  peer_path: str = option("", "PYTHONPATH of that interpreter")
+  peer_menagerie: str = option("", "folder of its robot models, where it should not fetch them")
+  backends: tuple[str, ...] = option(("jax", "warp"), "the peer's backends; ours is the task's own choice")
+  repeats: int = option(3, "turns")
+
+  name = "compare"
+  alone = True
+
+  def check(self) -> None:
+    from playground.benchmark.peer import check_peer
+
+    super().check()
+    if self.agent != "ppo":
+      raise ConfigError(f"agent={self.agent}: the comparison is of PPO.")
+    check_peer(self.peer, self.peer_python, self.peer_path)
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    jobs = []
+    for task in self.chosen():
+      for turn in range(1, self.repeats + 1):
+        # With the hyperparameters of the peer.
+        ours = self.job("training", task, seeds=[turn], agent="ppo_v020", watch_memory=True)
+        jobs.append(self.on_one_device(dataclasses.replace(ours, columns=self.columns(task, "ppo_v020"))))
+        for backend in self.backends:
+          peer = {"peer": self.peer, "python": self.peer_python, "path": self.peer_path}
+          peer |= {"menagerie": self.peer_menagerie, "backend": backend, "seeds": [turn]}
+          columns = self.columns(task, self.agent, (f"env.impl={backend}",), self.peer)
+          jobs.append(Job("peer", {"task": task, "seconds": self.seconds, **peer}, columns, {"quantity": TRAINING}))
+    return jobs
+
+
+COMMANDS: dict[str, type[Measuring]] = {
+  command.name: command for command in (Throughput, Startup, Scaling, Breakdown, Pixels, Topology, Chain, Compare)
+}
+
+
+def run(command: Measuring) -> int:
+  """Measures; returns the exit code of `run_jobs`."""
+  command.check()
+  table = Table(Path(command.out) if command.out else RESULTS / f"{command.name}.csv")
+  hardware = [text for text in command.overrides if text.startswith("hardware")]
+  facts = probe(hardware, command.gpus)
+  plan = Plan(**{field.name: getattr(command, field.name) for field in dataclasses.fields(Plan)})
+  print(f"{facts['devices']} x {facts['device']}; {facts['versions']}")
+  return run_jobs(command.jobs(facts), table, facts, plan)

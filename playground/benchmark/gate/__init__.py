@@ -1,0 +1,110 @@
+"""`playground-bench gate`: has something become slower? Ratios within one run, so that any machine can tell.
+
+Each check takes the processor time of a piece of ours and, in turn with it, that of a workload which has nothing of
+ours in it but uses the machine in the same way; the ratio is compared with the committed one (`benchmarks/gate.csv`).
+"""
+
+import csv
+import dataclasses
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from playground.benchmark.arguments import option
+from playground.config.files import shipped
+from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.runs.files import write_text
+
+Timed = Callable[[], Any]  # does its work and waits for it
+Pair = tuple[Timed, Timed]  # ours and the reference, both compiled
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+  """Fails (exit code 1) where a quick set of ratios, measured on the CPU, is far above the committed ones."""
+
+  checks: tuple[str, ...] = option((), "names of checks, those of the table if none")
+  repeats: int = option(15, "turns of ours and the reference; the median of their ratios counts")
+  update: bool = option(False, "write the ratios measured into the table instead of comparing")
+  table: str | None = option(None, "CSV of check, ratio, tolerance; null is benchmarks/gate.csv")
+
+
+@dataclasses.dataclass(frozen=True)
+class Limit:
+  """What a check may be: the committed ratio, and the factor on it from which on it fails."""
+
+  ratio: float
+  tolerance: float
+
+  @property
+  def most(self) -> float:
+    return self.ratio * self.tolerance
+
+
+TOLERANCE = 1.5  # two busy cores and other processors move a ratio by up to a third
+
+
+def run(options: Options) -> int:
+  """Measures and compares, or writes the table; returns the exit code."""
+  path = Path(options.table) if options.table else shipped("benchmarks") / "gate.csv"
+  limits = _read(path)
+  if options.repeats < 1:
+    raise ConfigError(f"repeats={options.repeats} must be at least 1.")
+  from playground.benchmark.gate.checks import CHECKS
+
+  names = options.checks or tuple(CHECKS if options.update else limits)
+  for name in names:
+    if name not in CHECKS:
+      raise UnknownNameError(f"checks={name} does not exist: choose from {', '.join(CHECKS)}.{nearest(name, CHECKS)}")
+  if not options.update:
+    return judge({name: CHECKS[name] for name in names}, limits, options.repeats)
+  for name in names:
+    ratio = measure(CHECKS[name](), options.repeats)
+    limits[name] = Limit(ratio, limits[name].tolerance if name in limits else TOLERANCE)
+    rows = [f"{name},{limit.ratio:.4g},{limit.tolerance:g}" for name, limit in sorted(limits.items())]
+    write_text(path, "\n".join(["check,ratio,tolerance", *rows]) + "\n")
+    print(f"{name}: {ratio:.3g}", flush=True)
+  return 0
+
+
+def judge(checks: Mapping[str, Callable[[], Pair]], limits: Mapping[str, Limit], repeats: int) -> int:
+  """Compares checks with their limits; a ratio above its limit must show a second time. Returns the exit code."""
+  slow = []
+  for name, build in checks.items():
+    if name not in limits:
+      raise ConfigError(f"{name} has no committed ratio: `playground-bench gate update=true checks={name}` adds it.")
+    pair, limit = build(), limits[name]
+    ratio = measure(pair, repeats)
+    if ratio > limit.most:
+      ratio = min(ratio, measure(pair, 2 * repeats))
+    verdict = "slow" if ratio > limit.most else "ok"
+    print(f"{name}: {ratio:.3g}, committed {limit.ratio:.3g}, at most {limit.most:.3g}: {verdict}", flush=True)
+    slow += [name] * (verdict == "slow")
+  if slow:
+    print(f"error: slower than committed: {', '.join(slow)}.", file=sys.stderr)
+  return 1 if slow else 0
+
+
+def measure(pair: Pair, repeats: int) -> float:
+  """Median over turns of the time that ours takes as a multiple of the reference's, one right after the other."""
+  for timed in pair:
+    timed()
+  return statistics.median(_seconds(pair[0]) / _seconds(pair[1]) for _ in range(repeats))
+
+
+def _seconds(timed: Timed) -> float:
+  """Processor time of all threads of this process: what others do on the machine is hardly in it."""
+  begin = time.process_time()
+  timed()
+  return time.process_time() - begin
+
+
+def _read(path: Path) -> dict[str, Limit]:
+  try:
+    with path.open(encoding="utf-8", newline="") as file:
+      return {row["check"]: Limit(float(row["ratio"]), float(row["tolerance"])) for row in csv.DictReader(file)}
+  except (OSError, KeyError, TypeError, ValueError) as error:
+    raise ConfigError(f"table={path} cannot be read: {getattr(error, 'strerror', None) or error}.") from None

@@ -1,0 +1,1 @@
+"""What a worker runs: a module each, with `measure(facts, **arguments)`."""

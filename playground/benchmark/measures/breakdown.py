@@ -1,0 +1,143 @@
+"""Where the time of training goes: the loop timed with its parts added one by one, as in the paper's pixel tables."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from playground.benchmark.measures.subject import ONE_DEVICE, Subject, alone, num_updates, rate
+from playground.benchmark.worker import Facts
+from playground.envs.base import PIXELS
+from playground.envs.wrappers import Vectorize, wrap_for_training
+from playground.learning.ppo import PPO
+from playground.learning.rollout import unroll
+from playground.learning.sac import SACConfig
+
+PARTS = {  # in the order they are added
+  "physics": "MJX alone under a constant ctrl",
+  "task": "control, pushes, observation, reward, termination",
+  "episodes": "guarded numbers, time limit, auto-reset",
+  "pixels": "what cameras see, where the task has any",
+  "inference": "the actor instead of random actions",
+  "storing": "transitions kept, log-probabilities, sums of what ended (PPO)",
+  "update": "gradient steps: the whole training step",
+}
+TURNS = 3
+LENGTH = 20  # control steps of one call, where the algorithm has no unrolls
+
+# (carry, model fields, key) -> (carry, what else must be computed)
+Run = Callable[[Any, Any, jax.Array], tuple[Any, Any]]
+
+
+def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float, lock: str | None) -> None:
+  """A row for each of `PARTS`: seconds a control step of one environment takes with it and all parts before it.
+
+  The parts take turns, and the best of each one's turns counts: their differences are what is looked at.
+  """
+  subject = Subject.build(facts, task, agent, overrides)
+  learner, state = subject.learner, subject.learner.init(subject.key(0), subject.model)
+  length = getattr(learner.config, "unroll_length", LENGTH)
+  calls: dict[str, tuple[Callable[[int], Any], int]] = {}
+  for part, (run, carry, repeat) in _rolls(subject, state, length).items():
+    calls[part] = (_repeat(subject, run, carry), learner.config.num_envs * length * repeat)
+  calls["update"] = (_train(subject, state), learner.steps_per_update)
+  for call, _ in calls.values():
+    jax.block_until_ready(call(1))
+  best = dict.fromkeys(calls, 0.0)
+  with alone(lock):
+    for _ in range(TURNS):
+      for part, (call, steps) in calls.items():
+        best[part] = max(best[part], rate(call, steps, seconds / TURNS)[0])
+  facts["conditions"] += f"; parts added one by one, best of {TURNS} turns of {seconds / TURNS:.1f} s"
+  for part, speed in best.items():
+    facts.emit("seconds_per_step", 1 / speed, "s", setting=" ".join((*_told(overrides), f"part={part}")))
+
+
+def _told(overrides: list[str]) -> list[str]:
+  """Overrides that make a setting: that one device is used goes without saying."""
+  return [text for text in overrides if text != ONE_DEVICE]
+
+
+def _repeat(subject: Subject, run: Run, carry: Any) -> Callable[[int], Any]:
+  """A function that does `run` a number of times, each time on from where it was."""
+  run = jax.jit(run, donate_argnums=0)
+  carry = jax.tree.map(jnp.copy, carry)  # parts begin in the same state, and each takes its carry's buffers over
+
+  def call(count: int) -> Any:
+    nonlocal carry
+    other = None
+    for i in range(count):
+      carry, other = run(carry, subject.model, subject.key(i))
+    return carry, other
+
+  return call
+
+
+def _train(subject: Subject, state: Any) -> Callable[[int], Any]:
+  """A function that does a number of training steps that learn."""
+  learner = subject.learner
+
+  def call(count: int) -> Any:
+    nonlocal state
+    state, metrics = learner.train(state, subject.model, num_updates(count))
+    return metrics
+
+  if isinstance(learner.config, SACConfig):
+    call(learner.config.prefill_updates)
+  return call
+
+
+def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, Any, int]]:
+  """The parts up to the update: what runs `length` steps, what it carries, control steps that each counts for."""
+  learner, env = subject.learner, subject.learner.env
+  task, repeat, num_envs = env.unwrapped, env.action_repeat, learner.config.num_envs
+  bare, policy = Vectorize(task), learner.policy(state)
+
+  def random_actions(key: jax.Array) -> jax.Array:
+    return jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
+
+  def act(carry: Any, model: Any, key: jax.Array) -> Any:
+    state, policy = carry  # carried along, for what a function merely refers to is compiled into it
+    return env.step(state, learner.act(policy, state.obs, key, False), model), policy
+
+  def advance(data: Any, fields: Any) -> Any:
+    model = task.mjx_model.tree_replace(fields) if fields else task.mjx_model
+    return task.physics.step(model, data, data.ctrl, task.n_substeps)
+
+  def scan(step: Callable[[Any, Any, jax.Array], Any]) -> Run:
+    def run(carry: Any, model: Any, key: jax.Array) -> tuple[Any, Any]:
+      return jax.lax.scan(lambda c, k: (step(c, model, k), None), carry, jax.random.split(key, length))
+
+    return run
+
+  # As a step leaves it: a carry's structure must not change.
+  stepped = jax.jit(bare.step)(
+    jax.jit(bare.reset)(jax.random.split(subject.key(0), num_envs), subject.model),
+    jnp.zeros((num_envs, env.action_size)),
+    subject.model,
+  )
+  by_chance: Callable[[Any], Any] = lambda env: lambda s, model, key: env.step(s, random_actions(key), model)
+  seeing: dict[str, tuple[Run, Any, int]] = {"episodes": (scan(by_chance(env)), state.env_state, repeat)}
+  if any(key.startswith(PIXELS) for key in learner.networks.select(state.env_state.obs)):
+    blind = wrap_for_training(task)
+    first = jax.jit(blind.reset)(jax.random.split(subject.key(0), num_envs), subject.model)
+    seeing = {"episodes": (scan(by_chance(blind)), first, repeat), "pixels": seeing["episodes"]}
+  rolls: dict[str, tuple[Run, Any, int]] = {
+    "physics": (scan(lambda data, model, key: jax.vmap(advance)(data, dict(model))), stepped.data, 1),
+    "task": (scan(by_chance(bare)), stepped, 1),
+    **seeing,
+    "inference": (scan(act), (state.env_state, policy), repeat),
+  }
+  if isinstance(learner, PPO):
+
+    def store(carry: Any, model: Any, key: jax.Array) -> tuple[Any, Any]:
+      before, capture, policy = carry
+      normalizer = policy.normalizer if learner.config.normalize_observations else None
+      after, capture, *stored = unroll(
+        env, before, capture, model, learner.networks, policy.params.policy, normalizer, key, length
+      )
+      return (after, capture, policy), stored
+
+    rolls["storing"] = (store, (state.env_state, state.capture, policy), repeat)
+  return rolls

@@ -1,0 +1,42 @@
+"""Environment steps alone, with random actions."""
+
+import jax
+
+from playground.benchmark.measures.subject import Subject, alone, emit_peak, rate
+from playground.benchmark.worker import Facts
+
+LENGTH = 20  # control steps of one call
+
+
+def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float, lock: str | None) -> None:
+  """A row for env steps a second of as many environments as `agent.num_envs` says, and one for memory.
+
+  The environments are those that a trainer steps: guarded, limited, reset when done, on randomised models.
+  """
+  subject = Subject.build(facts, task, agent, overrides)
+  env, model, num_envs = subject.learner.env, subject.model, subject.learner.config.num_envs
+
+  def roll(state, key, calls):
+    def step(state, key):
+      action = jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
+      return env.step(state, action, model), None
+
+    def body(i, state):
+      return jax.lax.scan(step, state, jax.random.split(jax.random.fold_in(key, i), LENGTH))[0]
+
+    return jax.lax.fori_loop(0, calls, body, state)
+
+  roll = jax.jit(roll, donate_argnums=0)
+  state = jax.jit(env.reset)(jax.random.split(subject.key(0), num_envs), model)
+
+  def call(count: int) -> jax.Array:
+    nonlocal state
+    state = roll(state, subject.key(count), count)
+    return state.done
+
+  jax.block_until_ready(call(1))
+  with alone(lock):
+    speed, timed = rate(call, num_envs * LENGTH * env.action_repeat, seconds)
+  facts["conditions"] = f"random actions; {timed:.1f} s timed"
+  facts.emit("env_steps_per_s", speed, "steps/s")
+  emit_peak(facts)

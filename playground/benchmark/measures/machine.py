@@ -1,0 +1,76 @@
+"""What this machine is: device, driver, versions."""
+
+import contextlib
+import os
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+
+from playground.benchmark.worker import Facts
+from playground.config import compose
+from playground.hardware.setup import setup
+from playground.runs.provenance import package_versions
+
+_NAMES = {"python": "Python", "jax": "JAX", "mujoco": "MuJoCo", "mujoco-mjx": "MJX", "warp-lang": "Warp"}
+
+
+def measure(facts: Facts, overrides: list[str]) -> None:
+  """Says what jobs with these overrides run on: a row whose value is the number of devices."""
+  hardware = setup(compose(["env=CartpoleBalance", *overrides]).hardware)
+  facts.emit("devices", hardware.mesh.size, "", device=device_name(), versions=versions())
+
+
+def device_name() -> str:
+  """The kind of device; of a CPU also which one and how many cores, else two laptops are the same device."""
+  kind = jax.devices()[0].device_kind
+  if jax.devices()[0].platform != "cpu":
+    return kind
+  lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
+  models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+  return f"CPU {models[0]} x {len(models)}" if models else "CPU"
+
+
+def versions() -> str:
+  """Versions of what decides speed, in one line."""
+  found = package_versions()
+  parts = [f"{name} {found[key]}" for key, name in _NAMES.items() if found.get(key)]
+  driver = _query_gpu("driver_version")
+  return "; ".join([*parts, f"driver {driver}"] if driver else parts)
+
+
+@contextlib.contextmanager
+def used_memory(facts: Facts, seed: int) -> Iterator[None]:
+  """A row for the most memory in use on the GPU during the block beyond what was before it; none without a GPU.
+
+  Asked of the driver twice a second, so that what is not JAX's (Warp's arrays, compiled code) counts.
+  """
+  ask = lambda: float(_query_gpu("memory.used") or "nan")
+  before, most, ended = ask(), 0.0, threading.Event()
+
+  def watch() -> None:
+    nonlocal most
+    while not ended.wait(0.5):
+      most = max(most, ask())
+
+  watcher = threading.Thread(target=watch, daemon=True)
+  if before == before:
+    watcher.start()
+  yield
+  ended.set()
+  if before == before:
+    watcher.join()
+    facts.emit("used_memory_gib", (most - before) / 1024, "GiB", seed=seed)
+
+
+def _query_gpu(field: str) -> str | None:
+  """What nvidia-smi says of the first GPU that this process may use; None without one."""
+  first = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0] or "0"
+  if not shutil.which("nvidia-smi"):
+    return None
+  query = ["nvidia-smi", f"--id={first}", f"--query-gpu={field}", "--format=csv,noheader,nounits"]
+  done = subprocess.run(query, capture_output=True, text=True, timeout=20)
+  return done.stdout.strip() or None if done.returncode == 0 else None

@@ -1,0 +1,132 @@
+"""What the measurements share: a task with its learner, clocks, and the facts of this process."""
+
+import contextlib
+import dataclasses
+import fcntl
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from playground import registry
+from playground.benchmark.measures.machine import device_name, versions
+from playground.benchmark.worker import Facts
+from playground.config import RunConfig, compose
+from playground.envs.base import Env
+from playground.envs.wrappers import ModelFields
+from playground.hardware.scaling import scale_envs
+from playground.hardware.setup import Hardware, setup
+from playground.learning.algorithms import algorithm
+from playground.learning.learner import Learner
+from playground.runs.train import randomized_models
+
+ONE_DEVICE = "hardware.devices=1"
+
+
+@dataclasses.dataclass
+class Subject:
+  """A task as `playground-run env=<task> agent=<agent> <overrides>` would train it."""
+
+  config: RunConfig
+  hardware: Hardware
+  env: Env
+  learner: Learner
+  model: ModelFields
+  eval_model: ModelFields
+
+  @classmethod
+  def build(cls, facts: Facts, task: str, agent: str, overrides: Sequence[str]) -> "Subject":
+    """Builds it and fills in the facts that its rows share."""
+    config = compose([f"env={task}", f"agent={agent}", *overrides])
+    hardware = setup(config.hardware)
+    if config.hardware.scale_envs:
+      config, _ = scale_envs(config, hardware.mesh.size)
+    algorithm_class = algorithm(config.agent.name)
+    settings = algorithm_class.Config.from_config(config.agent)
+    env = registry.load(task, config=config.env)
+    models = randomized_models(env, config, settings.num_envs, settings.num_eval_envs)
+    learner = algorithm_class(env, settings, hardware.mesh, models[0], hardware.network_precision)
+    facts.update(
+      backend=env.impl,
+      devices=hardware.mesh.size,
+      device=device_name(),
+      precision=_precision(hardware, learner),
+      versions=versions(),
+      conditions=f"hyperparameters {config.choices.get('tuned') or 'not tuned for this task'}",
+    )
+    return cls(config, hardware, env, learner, *models)
+
+  def models(self, seed: int) -> ModelFields:
+    """The training environments' randomised models of a seed."""
+    config = dataclasses.replace(self.config, seed=seed)
+    return randomized_models(self.env, config, self.learner.config.num_envs, self.learner.config.num_eval_envs)[0]
+
+  def key(self, seed: int) -> jax.Array:
+    """A random key that all devices have."""
+    return jax.device_put(jax.random.PRNGKey(seed), NamedSharding(self.hardware.mesh, P()))
+
+
+def _precision(hardware: Hardware, learner: Learner) -> str:
+  facts, value_dtype = hardware.facts, getattr(learner.networks, "value_dtype", None)
+  critic = f", critic activations {value_dtype}" if value_dtype else ""
+  return f"physics {facts['matmul_precision']}, networks {facts['network_precision']}{critic}"
+
+
+@contextlib.contextmanager
+def alone(lock: str | None) -> Iterator[None]:
+  """The device to itself: others that measure on it wait until the block is done (they may be compiling)."""
+  if lock is None:
+    yield
+    return
+  with Path(lock).open("w") as file:
+    fcntl.flock(file, fcntl.LOCK_EX)
+    yield
+
+
+def rate(call: Callable[[int], Any], steps: int, seconds: float) -> tuple[float, float]:
+  """How fast something repeats.
+
+  Args:
+    call: does a number of repetitions and returns what it computed; called before, so nothing is compiled any more.
+    steps: what one repetition counts for.
+    seconds: how long to time it, at least one repetition.
+
+  Returns:
+    Steps a second over all of the time, and that time (s).
+  """
+  begin = time.perf_counter()
+  jax.block_until_ready(call(1))
+  taken = time.perf_counter() - begin
+  if taken >= seconds:
+    return steps / taken, taken
+  each = max(1, math.ceil(min(1.0, seconds) / taken))  # calls of about a second: the host's share of one is nothing
+  done, begin = 0, time.perf_counter()
+  while (taken := time.perf_counter() - begin) < seconds:
+    jax.block_until_ready(call(each))
+    done += each
+  return done * steps / taken, taken
+
+
+def peak_memory_gib() -> float | None:
+  """Most that JAX's allocator held on any device, None where it does not say (CPU)."""
+  peaks = [(device.memory_stats() or {}).get("peak_bytes_in_use") for device in jax.local_devices()]
+  known = [peak for peak in peaks if peak is not None]
+  return max(known) / 2**30 if known else None
+
+
+def emit_peak(facts: Facts, **columns: Any) -> None:
+  """A row for the memory, where it is known."""
+  peak = peak_memory_gib()
+  if peak is not None:
+    facts.emit("peak_memory_gib", peak, "GiB", **columns)
+
+
+def num_updates(count: int) -> np.int32:
+  """The argument of `Learner.train`."""
+  return np.int32(count)

@@ -1,0 +1,65 @@
+"""Training alone, at full speed: what the paper's throughput tables measure."""
+
+from contextlib import nullcontext
+
+import jax
+
+from playground.benchmark.measures.machine import used_memory
+from playground.benchmark.measures.subject import Subject, alone, emit_peak, num_updates, rate
+from playground.benchmark.worker import Facts
+from playground.learning.loop import compile_program
+from playground.learning.sac import SACConfig
+from playground.runs.provenance import process_age_s
+
+
+def measure(
+  facts: Facts,
+  task: str,
+  agent: str,
+  overrides: list[str],
+  seeds: list[int],
+  seconds: float,
+  lock: str | None,
+  watch_memory: bool = False,
+) -> None:
+  """Rows for compile time, time to the first update and memory, and for each seed the steps a second.
+
+  A seed starts from fresh networks, environments and randomised models; its first update is not timed. No evaluation
+  and no fresh start of all environments is in the time. One compilation serves all seeds.
+
+  Args:
+    facts: takes the rows.
+    task: which.
+    agent: an option of the group.
+    overrides: of the run's configuration.
+    seeds: of the trainings.
+    seconds: how long to time each, at least one update.
+    lock: see `alone`.
+    watch_memory: ask the GPU's driver, too, how much is in use.
+  """
+  with used_memory(facts, seeds[0]) if watch_memory else nullcontext():
+    subject = Subject.build(facts, task, agent, overrides)
+    learner, conditions = subject.learner, facts["conditions"]
+    no_evaluation = jax.jit(lambda policy, key, model: ())
+    program = compile_program(learner, no_evaluation, subject.model, subject.eval_model)
+    facts.emit("trace_s", program.trace_s, "s", seed=seeds[0])
+    facts.emit("compile_s", program.compile_s, "s", seed=seeds[0])
+    warm_up = 1 + (learner.config.prefill_updates if isinstance(learner.config, SACConfig) else 0)
+    for seed in seeds:
+      model = subject.models(seed)
+      with alone(lock):
+        state = None  # the last seed's goes before the next one's comes: a replay buffer is large
+        state = program.init(subject.key(seed), model)
+
+        def train(count: int) -> jax.Array:
+          nonlocal state
+          state, metrics = program.train(state, model, num_updates(count))  # noqa: B023  # called within this turn
+          return metrics["nonfinite"]
+
+        jax.block_until_ready(train(warm_up))
+        if seed == seeds[0] and lock is None:  # with a lock, waiting for it would be in the time
+          facts.emit("start_to_first_update_s", process_age_s(), "s", seed=seed)
+        speed, timed = rate(train, learner.steps_per_update, seconds)
+      how = f"{timed:.1f} s timed after the first update, no evaluation, no outer resets"
+      facts.emit("training_steps_per_s", speed, "steps/s", seed=seed, conditions=f"{conditions}; {how}")
+    emit_peak(facts, seed=seeds[0])

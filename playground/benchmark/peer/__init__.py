@@ -1,0 +1,33 @@
+"""Other packages to measure beside ours; each lives in an environment of its own, none is a dependency."""
+
+import os
+import subprocess
+from pathlib import Path
+
+from playground.errors import ConfigError, UnknownNameError, nearest
+
+FOLDER = Path(__file__).parent
+PEERS = {"playground020": (FOLDER / "playground020.py", ("playground", "0.2.0"))}  # driver, distribution and version
+
+
+def check_peer(peer: str, python: str, path: str) -> None:
+  """Asks the peer's interpreter for the package.
+
+  Raises:
+    UnknownNameError: there is no such peer.
+    ConfigError: the interpreter is not there, or the package not installed for it.
+  """
+  if peer not in PEERS:
+    raise UnknownNameError(f"peer={peer} does not exist: choose from {', '.join(PEERS)}.{nearest(peer, PEERS)}")
+  _, (distribution, version) = PEERS[peer]
+  ask = f"import importlib.metadata as m; print(m.version({distribution!r}))"
+  env = {**os.environ, "PYTHONPATH": path}
+  try:
+    done = subprocess.run([python, "-c", ask], capture_output=True, text=True, env=env)
+  except OSError as error:
+    raise ConfigError(f"peer_python={python} cannot be run: {error.strerror}.") from None
+  if done.returncode or done.stdout.strip() != version:
+    found = f"it has {done.stdout.strip()}" if done.returncode == 0 else "it has none"
+    raise ConfigError(
+      f"{distribution} {version} is not installed for peer_python={python} (peer_path={path or 'none'}): {found}."
+    )

@@ -1,0 +1,140 @@
+"""Drives the public package `playground` 0.2.0, in its own environment: `python playground020.py <json>`.
+
+Imports nothing of ours. Prints one line, `RESULT <json>`. The package is older than current JAX and MuJoCo, so a few
+names that it calls and that are gone are put back first.
+"""
+
+import functools
+import itertools
+import json
+import os
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+
+def put_back_names() -> None:
+  """Restores what JAX and MuJoCo removed."""
+  if not hasattr(jax, "device_put_replicated"):
+    jax.device_put_replicated = replicate  # Brax's trainer
+  clip = jnp.clip
+
+  @functools.wraps(clip)
+  def with_old_bounds(*args: Any, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> jax.Array:
+    bounds = {name: bound for name, bound in (("min", a_min), ("max", a_max)) if bound is not None}
+    return clip(*args, **kwargs, **bounds)
+
+  jnp.clip = with_old_bounds
+  if not hasattr(mujoco.MjSpec, "find_body"):
+    mujoco.MjSpec.find_body = lambda spec, name: spec.body(name)
+
+
+def replicate(tree: Any, devices: list[Any]) -> Any:
+  """A copy of every array on each device, under a leading axis, as pmap takes it."""
+  mesh = jax.sharding.Mesh(np.asarray(devices), ("device",))
+  sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
+  spread = lambda leaf: jax.device_put(jnp.broadcast_to(leaf, (len(devices), *jnp.shape(leaf))), sharding)
+  return jax.tree.map(spread, tree)
+
+
+def use_menagerie(folder: str) -> None:
+  """Takes robot models from a folder, instead of fetching them."""
+  import mujoco_playground._src.mjx_env as mjx_env  # pyright: ignore[reportMissingImports]
+  from etils import epath
+
+  mjx_env.MENAGERIE_PATH = epath.Path(folder)
+
+
+def tuned(task: str, backend: str) -> dict[str, Any]:
+  """The package's own PPO settings for a task."""
+  from mujoco_playground import dm_control_suite, locomotion  # pyright: ignore[reportMissingImports]
+  from mujoco_playground.config import dm_control_suite_params, locomotion_params, manipulation_params  # pyright: ignore[reportMissingImports]
+
+  if task in dm_control_suite._envs:
+    params = dm_control_suite_params
+  else:
+    params = locomotion_params if task in locomotion._envs else manipulation_params
+  return dict(params.brax_ppo_config(task, backend))
+
+
+def load(task: str, backend: str, num_envs: int) -> Any:
+  """The package's task on a backend; Warp's buffers are for 8192 environments, more of them need larger ones."""
+  from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
+
+  config = registry.get_default_config(task)
+  changes: dict[str, Any] = {"impl": backend} if "impl" in config else {}
+  if backend == "warp" and num_envs > 8192:
+    sizes = {name: config.get(name) for name in ("naconmax", "naccdmax")}
+    changes |= {name: int(size * num_envs / 8192) for name, size in sizes.items() if size}
+  return registry.load(task, config_overrides=changes)
+
+
+def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: Any) -> dict[str, Any]:
+  """Trains for some epochs of at least `steps` control steps, without evaluations or resets between."""
+  from brax.training.agents.ppo import networks
+  from brax.training.agents.ppo import train as ppo
+  from mujoco_playground import registry, wrapper  # pyright: ignore[reportMissingImports]
+
+  settings = tuned(task, backend)
+  settings.update(json.loads(os.environ.get("PEER_SETTINGS", "{}")))  # smaller ones, to try the driver out
+  network = dict(settings.pop("network_factory", None) or {})
+  for name in ("num_timesteps", "num_evals", "num_resets_per_eval", "num_eval_envs"):
+    settings.pop(name, None)
+  update_steps = settings["batch_size"] * settings["num_minibatches"] * settings["unroll_length"]
+  update_steps *= settings.get("action_repeat", 1)
+  epoch_steps = -(-steps // update_steps) * update_steps
+  environment, marks = load(task, backend, settings["num_envs"]), []
+  start_s, begin = age_s(), time.perf_counter()
+  ppo.train(
+    environment=environment,
+    num_timesteps=epochs * epoch_steps,
+    num_evals=epochs + 1,
+    run_evals=False,
+    seed=seed,
+    network_factory=functools.partial(networks.make_ppo_networks, **network),
+    wrap_env_fn=wrapper.wrap_for_brax_training,
+    randomization_fn=registry.get_domain_randomizer(task),
+    progress_fn=lambda step, _: marks.append((step, time.perf_counter())),
+    **settings,
+  )
+  times = [begin, *(moment for step, moment in marks if step)]
+  memory = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+  return {
+    "start_s": start_s,
+    "epochs": [later - earlier for earlier, later in itertools.pairwise(times)],
+    "epoch_steps": epoch_steps,
+    "update_steps": update_steps,
+    "peak_memory_gib": None if memory is None else memory / 2**30,
+    "settings": ", ".join(f"{name} {settings[name]}" for name in ("num_envs", "batch_size", "num_minibatches")),
+  }
+
+
+def process_age_s() -> float:
+  """Seconds since this process was started; Linux."""
+  started = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+  return float(Path("/proc/uptime").read_text().split()[0]) - started / os.sysconf("SC_CLK_TCK")
+
+
+def main() -> None:
+  job = json.loads(sys.argv[1])
+  put_back_names()
+  if os.environ.get("PEER_MENAGERIE"):
+    use_menagerie(os.environ["PEER_MENAGERIE"])
+  result = train(job["task"], job["backend"], job["seed"], job["steps"], job["epochs"], process_age_s)
+  names = {"jax": "JAX", "mujoco": "MuJoCo", "mujoco-mjx": "MJX", "brax": "Brax", "warp-lang": "Warp"}
+  have = {dist.name: dist.version for dist in metadata.distributions()}
+  result["versions"] = "; ".join(f"{label} {have[name]}" for name, label in names.items() if name in have)
+  print("\nRESULT " + json.dumps(result), flush=True)
+
+
+if __name__ == "__main__":
+  main()

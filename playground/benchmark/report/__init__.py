@@ -1,0 +1,61 @@
+"""`playground-bench report`: one page from everything that was measured."""
+
+import dataclasses
+from pathlib import Path
+
+from playground.benchmark.arguments import option
+from playground.benchmark.report import sections
+from playground.benchmark.report.evidence import Evidence
+from playground.benchmark.report.page import Block, Heading, Picture, Text, to_html, to_markdown
+from playground.errors import ConfigError
+from playground.runs.files import write_text
+
+PICTURES = "report_pictures"
+TITLE = "Measured"
+SECTIONS = (
+  *(sections.throughput, sections.compared, sections.startup, sections.scaling),
+  *(sections.topology, sections.breakdown, sections.pixels, sections.chains, sections.returns),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+  """One page, report.md and report.html: the paper's tables with our column, curves, bars, conditions."""
+
+  out: str = option("results/benchmarks", "folder of the page")
+  rows: tuple[str, ...] = option(("results/reference", "results/benchmarks"), "folders whose CSVs it is made of")
+
+
+def run(options: Options) -> int:
+  """Writes the page.
+
+  Raises:
+    ConfigError: no rows anywhere, or a folder that cannot be written.
+  """
+  folders = [Path(folder) for folder in options.rows if Path(folder).is_dir()]
+  evidence = Evidence(folders)
+  if not evidence.rows:
+    raise ConfigError(f"rows={','.join(options.rows)}: there is no measured row in these folders.")
+  blocks = page(evidence)
+  out = Path(options.out)
+  try:
+    (out / PICTURES).mkdir(parents=True, exist_ok=True)
+    for block in blocks:
+      if isinstance(block, Picture):
+        write_text(out / PICTURES / f"{block.name}.svg", block.svg)
+    write_text(out / "report.md", to_markdown(blocks, PICTURES))
+    write_text(out / "report.html", to_html(blocks, TITLE))
+  except OSError as error:
+    raise ConfigError(f"out={out} cannot be written: {error.strerror}.") from None
+  print(f"{len(evidence.rows)} rows and {len(evidence.curves)} curves: {out / 'report.md'}, {out / 'report.html'}")
+  return 0
+
+
+def page(evidence: Evidence) -> list[Block]:
+  """The page's blocks."""
+  notes = sections.Notes()
+  blocks: list[Block] = [Heading(1, TITLE)]
+  blocks.append(Text(f"Made by `playground-bench report` from {', '.join(path.name for path in evidence.files)}."))
+  for section in SECTIONS:
+    blocks += section(evidence, notes)
+  return [*blocks, *notes.blocks()]

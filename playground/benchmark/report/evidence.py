@@ -1,0 +1,132 @@
+"""What has been measured: rows of all tables, whoever wrote them, and learning curves."""
+
+import csv
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from playground.benchmark.schema import COLUMNS, QUANTITIES, mean_and_ci95
+
+# Tables measured before `playground-bench`: their words for what a row's quantity is, and their columns.
+_WORDS = {
+  "training steps/s": "training_steps_per_s",
+  "command to first update, cold": "start_to_first_update_s",
+  "final return": "final_return",
+  "peak_gib": "peak_memory_gib",
+}
+_UNITS = {"training_steps_per_s": "steps/s", "final_return": "", "steps": "steps", "peak_memory_gib": "GiB"}
+
+Row = dict[str, Any]  # the columns of a row as text, `value` as a number, and `source`: the file
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+  """A number with its evidence.
+
+  Attributes:
+    mean: over the rows.
+    ci95: half the width of the confidence interval over seeds, None from one row.
+    rows: what it is the mean of; they agree in all but seed and value.
+  """
+
+  mean: float
+  ci95: float | None
+  rows: tuple[Row, ...]
+
+  def __getitem__(self, column: str) -> str:
+    return self.rows[0][column]
+
+
+class Evidence:
+  """All rows and curves below some folders."""
+
+  def __init__(self, folders: Sequence[Path]):
+    self.files: list[Path] = []  # those that something was found in
+    self.rows: list[Row] = []
+    self.curves: dict[str, list[tuple[float, float]]] = {}
+    for path in (path for folder in folders for path in sorted(folder.rglob("*.csv"))):
+      lines = _read(path)
+      rows, curves = list(_rows(path, lines)), _curves(path, lines)
+      self.rows += rows
+      self.curves |= curves
+      self.files += [path] * bool(rows or curves)
+
+  def find(self, **wanted: str) -> list[Figure]:
+    """Figures of the rows with these columns, a GPU's before a CPU's, then the newest, then the largest."""
+    groups: dict[tuple[str, ...], dict[str, Row]] = {}
+    for row in self.rows:
+      if all(row[name] == text for name, text in wanted.items()):
+        same = (str(row["source"]), *(row[name] for name in SAME), row.get("apart", ""))
+        groups.setdefault(same, {})[row["seed"]] = row  # measured again: the later one counts
+    figures = []
+    for rows in groups.values():
+      mean, ci95 = mean_and_ci95(row["value"] for row in rows.values())
+      figures.append(Figure(mean, ci95, tuple(rows.values())))
+    order = lambda f: (f["device"].startswith("CPU"), _before(f["date"]), -f.mean)
+    return sorted(figures, key=order)
+
+  def best(self, **wanted: str) -> Figure | None:
+    """The first of `find`, None if there is none."""
+    return next(iter(self.find(**wanted)), None)
+
+
+SAME = ("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "devices", "device", "commit")
+
+
+def _before(date: str) -> list[int]:
+  """A key that sorts later dates first."""
+  return [-ord(character) for character in date] or [0]
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+  with path.open(encoding="utf-8", errors="replace", newline="") as file:
+    return list(csv.DictReader(file))
+
+
+def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
+  """Rows of a table in the columns of the schema."""
+  if not lines or "task" not in lines[0]:
+    return
+  for line in lines:
+    if "quantity" in line:
+      values = {line["quantity"]: line["value"]}
+    else:
+      values = {name: line[name] for name in line if _WORDS.get(name, name) in QUANTITIES}
+    for quantity, value in values.items():
+      quantity = _WORDS.get(quantity, quantity)
+      if quantity in QUANTITIES and value not in ("", None):
+        yield _row(path, line, quantity, float(value))
+
+
+def _row(path: Path, line: dict[str, str], quantity: str, value: float) -> Row:
+  row: Row = dict.fromkeys(COLUMNS, "") | {name: text for name, text in line.items() if name in COLUMNS}
+  row |= {"source": path, "quantity": quantity, "value": value, "unit": row["unit"] or _UNITS.get(quantity, "s")}
+  if row["benchmark"]:
+    return row
+  call, note = line.get("call", ""), line.get("note", "")
+  row |= {
+    "benchmark": "compare" if "call" in line else "throughput" if "compile_s" in line else "",
+    "agent": row["agent"] or "ppo",
+    "who": row["who"] or "ours",
+    "device": "NVIDIA H200" if "NVIDIA H200" in row["conditions"] else "",
+    "devices": "1",
+    "conditions": "; ".join(part for part in (note, row["conditions"]) if part),
+    "call": call,
+    "apart": call + note,  # what sets runs apart that agree in all else
+  }
+  return row
+
+
+def _curves(path: Path, lines: Sequence[dict[str, str]]) -> dict[str, list[tuple[float, float]]]:
+  """Learning curves of a file, (steps, return) by name: one a run, where it says which."""
+  curves: dict[str, list[tuple[float, float]]] = {}
+  if (path.parent.parent / "config.yaml").is_file():  # a stage of a chain, whose own curve has it
+    return curves
+  if lines and {"step", "eval/episode_reward"} <= set(lines[0]):
+    name = path.parent.name if path.stem == "metrics" else path.stem.removeprefix("curve_")
+    for line in lines:
+      if line["eval/episode_reward"]:
+        point = float(line["step"]), float(line["eval/episode_reward"])
+        curves.setdefault(line.get("run") or name, []).append(point)
+  return curves

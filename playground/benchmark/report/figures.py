@@ -1,0 +1,95 @@
+"""The page's drawings, as SVG."""
+
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+COLOURS = ("#2f6db5", "#d1762f", "#5a9e57", "#b5479a", "#8a6d3b", "#777777")
+Points = Sequence[tuple[float, float]]
+
+
+def _svg(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
+  import matplotlib
+  from matplotlib.figure import Figure  # not pyplot: no global state, no display
+
+  with matplotlib.rc_context({"svg.hashsalt": "playground", "font.size": 9}):  # the same page from the same rows
+    figure = Figure(figsize=size, layout="constrained")
+    draw(figure)
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+  return buffer.getvalue()
+
+
+def lines(title: str, series: Mapping[str, Points], x: str, y: str, log: bool = False) -> str:
+  """Lines over one pair of axes."""
+
+  def draw(figure: Any) -> None:
+    axes = figure.subplots()
+    for colour, (name, points) in zip(COLOURS * len(series), series.items(), strict=False):
+      axes.plot(*zip(*sorted(points), strict=True), marker="o" if len(points) < 12 else "", label=name, color=colour)
+    if log:
+      axes.set_xscale("log", base=2)
+      axes.set_yscale("log")
+    axes.set(title=title, xlabel=x, ylabel=y)
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+
+  return _svg((7, 3.6), draw)
+
+
+def curves(groups: Mapping[str, Mapping[str, Points]]) -> str:
+  """Learning curves, small, a pair of axes a group."""
+  columns = min(4, len(groups))
+  rows = math.ceil(len(groups) / columns)
+
+  def draw(figure: Any) -> None:
+    cells = figure.subplots(rows, columns, squeeze=False).flat
+    for axes, (title, group) in zip(cells, groups.items(), strict=False):
+      for colour, (name, points) in zip(COLOURS * len(group), group.items(), strict=False):
+        axes.plot([step / 1e6 for step, _ in points], [value for _, value in points], label=name, color=colour)
+      axes.set_title(title, fontsize=9)
+      axes.grid(alpha=0.3)
+      axes.legend(frameon=False, fontsize=7)
+    for axes in list(cells):
+      axes.set_axis_off()
+    figure.supxlabel("million control steps")
+    figure.supylabel("return")
+
+  return _svg((2.9 * columns, 2.2 * rows + 0.4), draw)
+
+
+def bars(title: str, groups: Mapping[str, Mapping[str, float]], x: str) -> str:
+  """Bars side by side, a group of them a line of text."""
+
+  def draw(figure: Any) -> None:
+    axes = figure.subplots()
+    names = list(dict.fromkeys(name for group in groups.values() for name in group))
+    height = 0.8 / len(names)
+    for i, name in enumerate(names):
+      at = [row + i * height for row, group in enumerate(groups.values()) if name in group]
+      axes.barh(at, [g[name] for g in groups.values() if name in g], height, label=name, color=COLOURS[i % 6])
+    axes.set_yticks([row + 0.4 - height / 2 for row in range(len(groups))], list(groups))
+    axes.invert_yaxis()
+    axes.set(title=title, xlabel=x)
+    axes.legend(frameon=False)
+
+  return _svg((7, 0.9 + 0.55 * len(groups)), draw)
+
+
+def stacked(title: str, bars: Mapping[str, Mapping[str, float]], x: str) -> str:
+  """Bars made of parts."""
+
+  def draw(figure: Any) -> None:
+    axes = figure.subplots()
+    names = list(dict.fromkeys(name for parts in bars.values() for name in parts))
+    left = dict.fromkeys(bars, 0.0)
+    for i, name in enumerate(names):
+      widths = [parts.get(name, 0.0) for parts in bars.values()]
+      axes.barh(list(bars), widths, left=list(left.values()), label=name, color=COLOURS[i % 6])
+      left = {bar: left[bar] + width for bar, width in zip(left, widths, strict=True)}
+    axes.invert_yaxis()
+    axes.set(title=title, xlabel=x)
+    axes.legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.25))
+
+  return _svg((7, 1.4 + 0.5 * len(bars)), draw)

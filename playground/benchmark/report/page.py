@@ -1,0 +1,110 @@
+"""A page as a list of blocks, written as Markdown with pictures beside it or as one HTML file."""
+
+import dataclasses
+import html
+import re
+from collections.abc import Iterable, Sequence
+
+
+@dataclasses.dataclass(frozen=True)
+class Heading:
+  """A heading of level 1, 2, ..."""
+
+  level: int
+  text: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Text:
+  """A paragraph."""
+
+  text: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+  """Rows of cells; columns that hold numbers stand to the right."""
+
+  header: Sequence[str]
+  rows: Sequence[Sequence[str]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+  """A drawing.
+
+  Attributes:
+    name: of its file, without suffix.
+    svg: the drawing.
+    caption: what it shows.
+  """
+
+  name: str
+  svg: str
+  caption: str
+
+
+NOT_MEASURED = "not measured"
+Block = Heading | Text | Table | Picture
+
+_CODE = re.compile("`([^`]+)`")
+_STYLE = """
+body{font:16px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#1a1a1a}
+table{border-collapse:collapse;margin:1rem 0;font-size:.9rem}
+th,td{border-bottom:1px solid #ddd;padding:.25rem .7rem;text-align:left;vertical-align:top}
+td.n,th.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
+svg{max-width:100%;height:auto} figcaption{font-size:.9rem;color:#555}
+"""
+
+
+def to_markdown(blocks: Iterable[Block], pictures: str) -> str:
+  """Markdown; pictures are files `<pictures>/<name>.svg`."""
+  return "\n\n".join(_markdown(block, pictures) for block in blocks) + "\n"
+
+
+def to_html(blocks: Sequence[Block], title: str) -> str:
+  """One HTML file that needs nothing beside it."""
+  body = "\n".join(_html(block) for block in blocks)
+  head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
+  return f"<!doctype html>\n<html lang=en><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
+
+
+def _markdown(block: Block, pictures: str) -> str:
+  match block:
+    case Heading(level, text):
+      return f"{'#' * level} {text}"
+    case Text(text):
+      return text
+    case Picture(name, _, caption):
+      return f"![{caption}]({pictures}/{name}.svg)"
+    case Table(header, rows):
+      rules = ["---:" if right else "---" for right in _numeric(block)]
+      lines = [header, rules, *([cell.replace("|", "\\|") for cell in row] for row in rows)]
+      return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _html(block: Block) -> str:
+  match block:
+    case Heading(level, text):
+      return f"<h{level}>{html.escape(text)}</h{level}>"
+    case Text(text):
+      marked = _CODE.sub(r"<code>\1</code>", html.escape(text))
+      return f"<p>{marked}</p>"
+    case Picture(_, svg, caption):
+      drawing = svg[svg.index("<svg") :]
+      return f"<figure>{drawing}<figcaption>{html.escape(caption)}</figcaption></figure>"
+    case Table(header, rows):
+      kinds = [' class="n"' if right else "" for right in _numeric(block)]
+
+      def line(cells: Sequence[str], tag: str) -> str:
+        parts = (f"<{tag}{kind}>{html.escape(cell)}</{tag}>" for cell, kind in zip(cells, kinds, strict=True))
+        return f"<tr>{''.join(parts)}</tr>"
+
+      return "\n".join(["<table>", line(header, "th"), *(line(row, "td") for row in rows), "</table>"])
+
+
+def _numeric(table: Table) -> list[bool]:
+  """For each column, whether what is in it are numbers."""
+  is_number = lambda cell: cell[:1].isdigit() or cell in ("", NOT_MEASURED)
+  columns = [[row[i] for row in table.rows] for i in range(len(table.header))]
+  return [all(map(is_number, column)) and any(cell[:1].isdigit() for cell in column) for column in columns]

@@ -1,0 +1,253 @@
+"""The page's sections, each from the rows that its benchmark left; what is missing is said to be."""
+
+import re
+from collections.abc import Iterable, Sequence
+
+from playground.benchmark.report import figures
+from playground.benchmark.report.evidence import Evidence, Figure
+from playground.benchmark.report.page import NOT_MEASURED, Block, Heading, Picture, Table, Text
+from playground.benchmark.suites import SUITES, paper_table
+
+TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipulation": "Manipulation"}
+SPEED = "training_steps_per_s"
+PARTS = ("physics", "task", "episodes", "pixels", "inference", "storing", "update")
+SEEN = {"episodes": "state", "pixels": "+ pictures", "inference": "+ inference", "update": "+ training"}
+_CURVE = re.compile(r"(.+?)_((?:ours|peer|ppo|sac|seed)(?:_.*)?)")  # a curve's name: task and run
+
+
+class Notes:
+  """Conditions, told once each below the tables."""
+
+  def __init__(self) -> None:
+    self._texts: dict[str, int] = {}
+
+  def number(self, figure: Figure) -> str:
+    """The note of a figure's conditions."""
+    untimed = re.sub(r"[\d.]+ s timed", "timed", figure["conditions"])  # else every seed has a note of its own
+    parts = (figure["precision"], figure["versions"], untimed, figure["commit"] and f"commit {figure['commit']}")
+    text = "; ".join(part for part in parts if part)
+    return f"[{self._texts.setdefault(text, len(self._texts) + 1)}]"
+
+  def blocks(self) -> Iterable[Block]:
+    yield Heading(2, "Conditions")
+    yield Table(["note", "conditions"], [[f"[{number}]", text] for text, number in self._texts.items()])
+
+
+def throughput(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """The paper's tables with our column beside theirs."""
+  yield Heading(2, "Training throughput")
+  yield Text(
+    "Control steps trained on a second, at the paper's hyperparameters. The paper's column: one A100, five seeds, "
+    "Brax, steps over wall-clock time of the run. Ours: training alone, compiling and evaluation apart, one device; "
+    "± is the 95 % confidence interval over seeds, where there are several. Every repeat of an action counts, as in "
+    "Brax; the paper does not say. The hardware is not the same, so a ratio is no comparison of programs: that is the "
+    "next section."
+  )
+  for suite in SUITES:
+    for agent in ("ppo", "sac"):
+      lines = [row for row in paper_table(f"{suite}_throughput") if row.get(f"{agent}_sps_mean")]
+      if lines:
+        yield Heading(3, f"{TITLES[suite]}, {agent.upper()}")
+        yield _paper_table(evidence, notes, lines, agent)
+
+
+def _paper_table(evidence: Evidence, notes: Notes, lines: Sequence[dict[str, str]], agent: str) -> Block:
+  header = ["task", "paper, 1 x A100", "ours", "ratio", "seeds", "backend", "device", "compile (s)", "note"]
+  rows = []
+  for line in lines:
+    task, paper = line["registry_env"], float(line[f"{agent}_sps_mean"])
+    theirs = f"{paper:,.0f} ± {float(line[f'{agent}_sps_ci95']):,.0f}"
+    same = {"benchmark": "throughput", "task": task, "agent": agent, "who": "ours", "setting": ""}
+    earlier = {**same, "benchmark": "compare"}  # measured beside the peer only
+    ours = evidence.best(**same, quantity=SPEED) or evidence.best(**earlier, quantity=SPEED)
+    if ours is None:
+      rows.append([task, theirs, NOT_MEASURED, "", "", "", "", "", ""])
+      continue
+    of_it = {**same, **{name: ours[name] for name in ("backend", "device", "commit")}}
+    compiling = evidence.best(**of_it, quantity="compile_s")
+    seeds = str(len(ours.rows)) if ours["seed"] else "1"
+    compile_s = f"{compiling.mean:.1f}" if compiling else ""
+    figures_of_it = [_with_ci(ours), f"{ours.mean / paper:.2f}", seeds]
+    rows.append([task, theirs, *figures_of_it, ours["backend"], ours["device"], compile_s, notes.number(ours)])
+  return Table(header, rows)
+
+
+def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """Ours and the peer's, from the same call on the same machine."""
+  yield Heading(2, "Beside the public package")
+  yield Text(
+    "Ours and `playground` 0.2.0, in turn on one machine in one call, each in fresh processes; of several turns the "
+    "best counts. Start: from the start of the process to the end of the first update, nothing cached."
+  )
+  names = {"training_steps_per_s": "training steps/s", "start_to_first_update_s": "start (s)"}
+  names |= {"peak_memory_gib": "JAX's memory (GiB)", "used_memory_gib": "GPU memory (GiB)"}
+  rows = []
+  for quantity, label in names.items():
+    pick = max if quantity == SPEED else min
+    for ours in evidence.find(benchmark="compare", who="ours", quantity=quantity):
+      call = ours.rows[0].get("call", "")
+      of_it = {name: ours[name] for name in ("task", "source", "device")}
+      for peer in evidence.find(benchmark="compare", quantity=quantity, **of_it):
+        if peer["who"] != "ours" and peer.rows[0].get("call", "") == call:
+          mine, its = (pick(row["value"] for row in figure.rows) for figure in (ours, peer))
+          better = mine / its if quantity == SPEED else its / mine
+          what, who = f"{label}, call {call}" if call else label, f"{peer['who']} {peer['backend']}".strip()
+          found = [ours["task"], what, _short(mine), who, _short(its), f"{better:.2f}"]
+          rows.append([*found, notes.number(ours), notes.number(peer)])
+  if rows:
+    yield Table(["task", "", "ours", "peer", "its", "times better", "ours: note", "its: note"], sorted(rows))
+  else:
+    yield _nothing("compare")
+
+
+def startup(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """From the command to the first update."""
+  yield Heading(2, "From the command to the first update")
+  rows = []
+  for kind in ("cold", "warm"):
+    for figure in evidence.find(benchmark="startup", quantity="start_to_first_update_s", setting=kind):
+      rows.append([figure["task"], figure["agent"], kind, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
+  for figure in evidence.find(benchmark="compare", who="ours", quantity="start_to_first_update_s"):
+    if figure.rows[0].get("call"):
+      name = f"cold, call {figure.rows[0]['call']}"
+      rows.append([figure["task"], figure["agent"], name, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
+  yield Table(["task", "agent", "caches", "seconds", "device", "note"], sorted(rows)) if rows else _nothing("startup")
+
+
+def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """Steps a second and memory against the number of environments."""
+  yield Heading(2, "Against the number of environments")
+  series: dict[str, list[tuple[float, float]]] = {}
+  rows = []
+  for quantity, label in (("env_steps_per_s", "environment"), ("training_steps_per_s", "training")):
+    for figure in evidence.find(benchmark="scaling", who="ours", quantity=quantity):
+      if count := re.search(r"agent\.num_envs=(\d+)", figure["setting"]):
+        series.setdefault(f"{figure['task']}, {label}", []).append((float(count[1]), figure.mean))
+        same = {name: figure[name] for name in ("task", "setting", "device", "commit")}
+        memory = evidence.best(benchmark="scaling", quantity="peak_memory_gib", **same)
+        used = f"{memory.mean:.2f}" if memory else ""
+        device, note = figure["device"], notes.number(figure)
+        rows.append([figure["task"], label, count[1], f"{figure.mean:,.0f}", used, device, note])
+  if not rows:
+    yield _nothing("scaling")
+    return
+  yield Picture("scaling", figures.lines("steps/s", series, "environments", "steps/s", log=True), "Steps a second.")
+  order = lambda row: (row[0], row[1], int(row[2]))
+  yield Table(["task", "", "environments", "steps/s", "memory (GiB)", "device", "note"], sorted(rows, key=order))
+
+
+def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """One device and several."""
+  yield Heading(2, "Devices")
+  yield Text("The paper prints for LeapCubeReorient about 2080 s on one RTX 4090 and 670 s on eight H100 (IV-D).")
+  groups: dict[str, dict[str, float]] = {}
+  rows = []
+  for figure in evidence.find(benchmark="topology", who="ours", quantity="training_steps_per_s"):
+    kind = "scaled" if "scale_envs=true" in figure["setting"] else "fixed"
+    count, device, note = figure["devices"], figure["device"], notes.number(figure)
+    groups.setdefault(f"{figure['task']}, {count}", {})[kind] = figure.mean
+    rows.append([figure["task"], count, kind, _with_ci(figure), device, note])
+  if not rows:
+    yield _nothing("topology")
+    return
+  yield Picture("topology", figures.bars("training steps/s", dict(sorted(groups.items())), "steps/s"), "Devices.")
+  yield Table(["task", "devices", "hyperparameters", "steps/s", "device", "note"], sorted(rows))
+
+
+def breakdown(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """Where a control step's time goes."""
+  yield Heading(2, "Where the time goes")
+  yield Text("The loop timed with its parts added one by one; a part is the difference (the paper's method, D.3).")
+  bars: dict[str, dict[str, float]] = {}
+  rows = []
+  found = evidence.find(benchmark="breakdown", quantity="seconds_per_step")
+  for task, device in dict.fromkeys((figure["task"], figure["device"]) for figure in found):
+    same = [figure for figure in reversed(found) if (figure["task"], figure["device"]) == (task, device)]
+    of_it = {figure["setting"].removeprefix("part="): figure for figure in same}
+    have = [part for part in PARTS if part in of_it]
+    times = [of_it[part].mean for part in have]
+    shares = {p: max(0.0, t - s) * 1e6 for p, t, s in zip(have, times, [0.0, *times[:-1]], strict=True)}
+    if have:
+      bars[f"{task}, {device}"] = {part: share / (times[-1] * 1e6) for part, share in shares.items()}
+      cells = [f"{shares[part]:.3g}" if part in shares else "" for part in PARTS]
+      rows.append([task, *cells, f"{1 / times[-1]:,.0f}", device, notes.number(of_it[have[-1]])])
+  if bars:
+    yield Picture("breakdown", figures.stacked("share of training time", bars, "share"), "Where the time goes.")
+    yield Table(["task", *(f"{part} (µs)" for part in PARTS), "steps/s", "device", "note"], rows)
+  else:
+    yield _nothing("breakdown")
+
+
+def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """Steps a second from pixels, beside the paper's and those of other simulators that it quotes."""
+  yield Heading(2, "From pixels")
+  yield Text("Control steps a second with each part added; random actions before inference, a fresh policy after.")
+  groups: dict[tuple[str, str, str], dict[str, Figure]] = {}
+  for figure in reversed(evidence.find(benchmark="pixels", quantity="seconds_per_step")):
+    setting, _, part = figure["setting"].rpartition("part=")
+    groups.setdefault((figure["task"], setting.strip(), figure["device"]), {})[part] = figure
+  rows = []
+  for (task, setting, device), parts in sorted(groups.items()):
+    own = [f"{1 / parts[part].mean:,.0f}" if part in parts else "" for part in SEEN]
+    rows.append([task, setting, *own, device, notes.number(next(iter(parts.values())))])
+  yield Table(["task", "setting", *SEEN.values(), "device", "note"], rows) if rows else _nothing("pixels")
+  yield Text("The paper's, on one RTX 4090 with Madrona, 1024 environments of 64 x 64 pixels:")
+  measured = [row for row in paper_table("pixel_breakdown") if row["kind"] == "measured"]
+  tasks = dict.fromkeys(row["env"] for row in measured)
+  speeds = lambda task: [f"{float(row['fps']):,.0f}" for row in measured if row["env"] == task]
+  yield Table(["task", *SEEN.values()], [[task, *speeds(task)] for task in tasks])
+  derived = [row for row in paper_table("pixel_breakdown") if row["kind"] == "derived"]
+  cells = [[r["env"], r["component"], r["seconds_per_env_step"], r["fraction_of_training"]] for r in derived]
+  yield Table(["task", "part", "seconds", "share"], cells)
+  yield Text("Its bars, 1024 environments with pictures; simulators are compared under `pixels compared=true`:")
+  seen = ("env_step+pixels", "1024")
+  bars = [row for row in paper_table("pixel_benchmark_upstream") if (row["component"], row["num_envs"]) == seen]
+  cells = [[r["simulator"], r["env"], r["setting"], r["image_side"], f"{float(r['fps_mean']):,.0f}"] for r in bars]
+  yield Table(["simulator", "task", "conditions", "side", "steps/s"], cells)
+
+
+def chains(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """Curricula, stage by stage."""
+  yield Heading(2, "Fine-tuning chains")
+  rows = []
+  for figure in evidence.find(benchmark="chain", quantity="wall_clock_s"):
+    same = {name: figure[name] for name in ("task", "setting", "device", "commit")}
+    score = evidence.best(benchmark="chain", quantity="final_return", **same)
+    stage, seconds = figure["setting"].removeprefix("stage="), f"{figure.mean:,.0f}"
+    result = _with_ci(score) if score else NOT_MEASURED
+    rows.append([figure["task"], stage, result, seconds, figure["device"], notes.number(figure)])
+  yield Table(["chain", "stage", "return", "seconds", "device", "note"], rows) if rows else _nothing("chain")
+
+
+def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """Learning curves and final returns of the runs that were kept."""
+  yield Heading(2, "Returns")
+  groups: dict[str, dict[str, list[tuple[float, float]]]] = {}
+  for name, points in evidence.curves.items():
+    parts = _CURVE.fullmatch(name)
+    task, run = parts.groups() if parts else (name, name)
+    groups.setdefault(task, {})[run] = points
+  if groups:
+    yield Picture("curves", figures.curves(dict(sorted(groups.items()))), "Return of evaluations over control steps.")
+  rows = []
+  for figure in evidence.find(quantity="final_return"):
+    if figure["benchmark"] != "chain":
+      who = [figure["task"], figure["agent"], figure["who"]]
+      each = ", ".join(f"{row['value']:,.1f}" for row in figure.rows)
+      result = [each, figure["backend"], figure["device"]]
+      rows.append([*who, *result, notes.number(figure)])
+  if rows:
+    yield Table(["task", "agent", "who", "return of each run", "backend", "device", "note"], sorted(rows))
+
+
+def _with_ci(figure: Figure) -> str:
+  digits = 0 if figure.mean >= 1000 else 1
+  return f"{figure.mean:,.{digits}f}" + ("" if figure.ci95 is None else f" ± {figure.ci95:,.{digits}f}")
+
+
+def _short(value: float) -> str:
+  return f"{value:,.0f}" if value >= 1000 else f"{value:.4g}"
+
+
+def _nothing(command: str) -> Block:
+  return Text(f"{NOT_MEASURED.capitalize()}: `playground-bench {command}` does.")

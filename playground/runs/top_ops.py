@@ -1,0 +1,107 @@
+"""Where a profiler trace spent its time: a table of operations by self time, from the trace's own file."""
+
+import csv
+import gzip
+import io
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from playground.runs.files import write_text
+
+Event = dict[str, Any]
+
+
+class Op(NamedTuple):
+  """An operation: a kernel on a GPU, a compiled operation on a CPU."""
+
+  name: str
+  calls: int
+  self_s: float
+  share: float  # of all operations' self time
+
+
+def write_top_ops(folder: Path) -> list[Op]:
+  """Reads the newest trace below a folder and writes `top_ops.csv` there.
+
+  Args:
+    folder: what `jax.profiler.start_trace` was given.
+
+  Returns:
+    All operations, the longest first; none if the trace has none.
+  """
+  traces = sorted(folder.rglob("*.trace.json.gz"), key=lambda path: path.stat().st_mtime)
+  ops = top_ops(traces[-1]) if traces else []
+  buffer = io.StringIO()
+  writer = csv.writer(buffer, lineterminator="\n")
+  writer.writerow(("op", "calls", "self_s", "share"))
+  writer.writerows((op.name, op.calls, f"{op.self_s:.6f}", f"{op.share:.4f}") for op in ops)
+  write_text(folder / "top_ops.csv", buffer.getvalue())
+  return ops
+
+
+def top_ops(trace: Path) -> list[Op]:
+  """Operations of a Chrome trace (gzipped JSON), by self time: what they do less what runs inside them.
+
+  On a GPU an operation is a kernel on one of the streams; on a CPU what XLA's threads report. The profiler keeps at
+  most a million events of a trace; what it left out is not in the table.
+  """
+  with gzip.open(trace, "rt", encoding="utf-8") as file:
+    events: list[Event] = json.load(file)["traceEvents"]
+  calls: dict[str, int] = defaultdict(int)
+  times: dict[str, float] = defaultdict(float)
+  for lane in _lanes(events):
+    for name, self_s in _self_times(lane):
+      calls[name] += 1
+      times[name] += self_s
+  total = sum(times.values()) or 1.0
+  ops = [Op(name, calls[name], seconds, seconds / total) for name, seconds in times.items()]
+  return sorted(ops, key=lambda op: -op.self_s)
+
+
+def format_ops(ops: Sequence[Op], count: int = 15) -> list[str]:
+  """Lines for printing the first of them."""
+  lines = [f"{op.share:6.1%} {op.self_s * 1e3:10.2f} ms {op.calls:8,} x  {op.name[:80]}" for op in ops[:count]]
+  return ["  self         time      calls  operation", *lines]
+
+
+def _lanes(events: Iterable[Event]) -> list[list[Event]]:
+  """Events of each thread that runs operations: a GPU's streams, or else XLA's threads on the host."""
+  processes, threads = {}, {}
+  lanes: dict[tuple[int, int], list[Event]] = defaultdict(list)
+  for event in events:
+    if event.get("ph") == "M" and event["name"] == "process_name":
+      processes[event["pid"]] = event["args"]["name"]
+    elif event.get("ph") == "M" and event["name"] == "thread_name":
+      threads[event["pid"], event["tid"]] = event["args"]["name"]
+    elif event.get("ph") == "X":
+      lanes[event["pid"], event["tid"]].append(event)
+  on_device = {pid for pid, name in processes.items() if name.startswith("/device:")}
+  streams = [key for key, name in threads.items() if key[0] in on_device and name.startswith("Stream")]
+  if streams:
+    return [lanes[key] for key in streams]
+  hosts = [key for key, name in threads.items() if name.startswith("tf_XLA")]
+  return [[event for event in lanes[key] if _is_operation(event["name"])] for key in hosts]
+
+
+def _is_operation(name: str) -> bool:
+  """On the host: not the runtime's own doings (`ThreadpoolListener::Record`) nor the marks where an operation ends."""
+  return "::" not in name and not name.startswith("end: ") and re.match(r"[a-z]", name) is not None and " " not in name
+
+
+def _self_times(lane: Sequence[Event]) -> Iterable[tuple[str, float]]:
+  """Name and self time (s) of each event of a thread, whose events lie inside one another or apart."""
+  open_: list[list[Any]] = []  # name, end, self time
+  for event in sorted(lane, key=lambda event: (event["ts"], -event.get("dur", 0.0))):
+    begin, length = event["ts"], event.get("dur", 0.0)
+    while open_ and begin >= open_[-1][1]:
+      name, _, time = open_.pop()
+      yield name, max(time, 0.0) * 1e-6
+    if open_:
+      open_[-1][2] -= length
+    open_.append([event["name"], begin + length, length])
+  for name, _, time in open_:
+    yield name, max(time, 0.0) * 1e-6

@@ -1,0 +1,132 @@
+"""Measurements as processes: rows as they come, what is there is left out, failures do not stop the others."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from playground.benchmark import jobs
+from playground.benchmark.jobs import Job, Plan, probe, run_jobs
+from playground.benchmark.schema import Table
+from playground.errors import HardwareError
+
+FACTS = {"device": "a device", "versions": "1.0"}
+PLAN = Plan(rerun=False, minutes=None, workers=1, gpus=(), cache=True, commit="abc", note="a note")
+WORKER = """
+import json, os, sys, time
+job = json.loads(sys.argv[1]); measure, arguments = job["measure"], job["arguments"]
+def row(**columns):
+  print("ROW " + json.dumps({"quantity": "training_steps_per_s", "unit": "steps/s", **columns}), flush=True)
+print("what a library says")
+if measure == "train":
+  gpu = os.environ["CUDA_VISIBLE_DEVICES"]
+  for seed in arguments["seeds"]: row(seed=seed, value=100.0 + seed, conditions="timed", backend=gpu)
+elif measure == "user": print("ERROR that cannot be."); sys.exit(2)
+elif measure == "bug": sys.exit("Traceback of a bug")
+elif measure == "sleep": row(seed=1, value=1.0); time.sleep(60)
+elif measure == "wait":
+  row(quantity="steps", value=os.getpid())
+  time.sleep(60)
+elif measure == "machine": row(value=2, device="a device", versions="1.0")
+"""
+
+
+@pytest.fixture(autouse=True)
+def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  """A worker that needs no JAX."""
+  script = tmp_path / "worker.py"
+  script.write_text(WORKER)
+  monkeypatch.setattr(jobs, "WORKER", (sys.executable, str(script)))
+  monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+
+
+def job(measure: str, task: str = "A", seeds: tuple[int, ...] = (1, 2)) -> Job:
+  columns = {"benchmark": "throughput", "task": task, "agent": "ppo", "who": "ours", "setting": ""}
+  return Job(measure, {"seeds": list(seeds)}, columns, {"quantity": "training_steps_per_s"})
+
+
+def test_rows_have_their_columns(tmp_path: Path):
+  table = Table(tmp_path / "rows.csv")
+  assert run_jobs([job("train")], table, FACTS, PLAN) == 0
+  for seed in (1, 2):
+    conditions = "timed; caches of earlier runs; a note"
+    assert table.has(
+      {"task": "A", "seed": seed, "value": 100.0 + seed, "commit": "abc", "conditions": conditions, **FACTS}
+    )
+
+
+def test_only_what_is_missing_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+  path = tmp_path / "rows.csv"
+  run_jobs([job("train", seeds=(1,))], Table(path), FACTS, PLAN)
+  run_jobs([job("train", seeds=(1, 2, 3))], Table(path), FACTS, PLAN)
+  assert path.read_text().count("training_steps_per_s") == 3
+  assert run_jobs([job("train", seeds=(1, 2, 3))], Table(path), FACTS, PLAN) == 0
+  assert "1 of 1 are in" in capsys.readouterr().out
+  assert path.read_text().count("training_steps_per_s") == 3
+  other = {**FACTS, "device": "another device"}
+  run_jobs([job("train", seeds=(1,))], Table(path), other, PLAN)
+  run_jobs([job("train", seeds=(1,))], Table(path), FACTS, Plan(**{**vars(PLAN), "rerun": True}))
+  assert path.read_text().count("training_steps_per_s") == 5
+
+
+def test_a_failure_is_named_and_the_others_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+  table = Table(tmp_path / "rows.csv")
+  assert run_jobs([job("user", "U"), job("bug", "B"), job("train", "T")], table, FACTS, PLAN) == 1
+  assert table.has({"task": "T", "seed": 2})
+  captured = capsys.readouterr()
+  assert "U ppo ours: that cannot be." in captured.err
+  assert "Traceback of a bug" in captured.err
+  assert "1 measured, 2 failed, 0 left" in captured.out
+
+
+def test_the_time_is_kept_and_rows_so_far_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+  table = Table(tmp_path / "rows.csv")
+  plan = Plan(**{**vars(PLAN), "minutes": 1.5 / 60})
+  assert run_jobs([job("sleep", "S"), job("train", "T")], table, FACTS, plan) == 3
+  assert table.has({"task": "S", "seed": 1}) and not table.has({"task": "T"})
+  assert "0 failed, 2 left" in capsys.readouterr().out
+
+
+def test_workers_are_spread_over_gpus(tmp_path: Path):
+  path = tmp_path / "rows.csv"
+  plan = Plan(**{**vars(PLAN), "workers": 2, "gpus": (4, 7)})
+  assert run_jobs([job("train", name, (1,)) for name in "ABCDEFGH"], Table(path), FACTS, plan) == 0
+  table = Table(path)
+  assert all(table.has({"task": name}) for name in "ABCDEFGH")
+  assert table.has({"backend": "4"}) and table.has({"backend": "7"})
+
+
+def test_the_machine_is_asked_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch):
+  assert probe([], ()) == {"devices": 2, "device": "a device", "versions": "1.0"}
+  run: Any = jobs._run
+  monkeypatch.setattr(jobs, "_run", lambda measure, *rest: run("user", *rest))
+  with pytest.raises(HardwareError, match="cannot be"):
+    probe([], ())
+
+
+def test_what_was_started_ends_with_us(tmp_path: Path):
+  main = tmp_path / "main.py"
+  table = tmp_path / "rows.csv"
+  main.write_text(f"""
+import signal, sys
+from pathlib import Path
+from playground.benchmark import jobs
+from playground.benchmark.schema import Table
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+jobs.WORKER = {jobs.WORKER!r}
+columns = dict(benchmark="throughput", task="A", agent="ppo", who="ours", setting="")
+job = jobs.Job("wait", {{}}, columns, {{"quantity": "steps"}})
+jobs.run_jobs([job], Table(Path({str(table)!r})), {FACTS!r}, jobs.Plan(False, None, 1, (), True, "", ""))
+""")
+  process = subprocess.Popen([sys.executable, str(main)], stdout=subprocess.PIPE, text=True)
+  assert process.stdout is not None
+  worker = int(process.stdout.readline().split()[-2].replace(",", ""))
+  process.terminate()
+  assert process.wait(20) == 143
+  deadline = time.monotonic() + 20
+  while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+    time.sleep(0.05)
+  assert not Path(f"/proc/{worker}").exists()

@@ -1,0 +1,57 @@
+"""`playground-bench pixels`: its jobs, its table, and a real one in the slow tests."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from playground.benchmark.commands import Pixels
+from playground.benchmark.report import sections
+from playground.benchmark.report.evidence import Evidence
+from playground.benchmark.report.page import Table as Shown
+from playground.benchmark.schema import Table
+from playground.errors import ConfigError
+
+CHECKOUT = Path(__file__).parents[2]
+
+
+def test_every_size_and_number_is_a_job_under_the_papers_conditions() -> None:
+  jobs = Pixels(sizes=(64, 128), num_envs=(1024, 4096)).jobs({})
+  assert [job.columns["task"] for job in jobs] == ["CartpoleBalanceVision"] * 4 + ["PandaPickCubeCartesianVision"] * 4
+  setting = "env.ctrl_dt=0.04 env.episode_length=75 env.vision.width=64 env.vision.height=64 agent.num_envs=4096"
+  assert jobs[1].columns["setting"] == f"{setting} agent.batch_size=512"
+  assert jobs[1].last["setting"] == f"{setting} agent.batch_size=512 part=update"
+  assert "randomization=panda_vision" in jobs[-1].arguments["overrides"]
+  (compared,) = Pixels(sizes=(80,), compared=True).jobs({})
+  assert compared.columns["setting"].startswith(f"env.ctrl_dt={1 / 60} env.sim_dt={1 / 120}")
+
+
+def test_a_task_without_a_camera_is_refused() -> None:
+  with pytest.raises(ConfigError, match=r"CartpoleBalance sees nothing: add env.vision.enable=true"):
+    Pixels(tasks=("CartpoleBalance",)).check()
+  camera = ("env.vision.enable=true", "env.vision.camera=fixed")
+  Pixels(tasks=("CartpoleBalance",), overrides=camera).check()
+
+
+def test_the_report_has_ours_beside_the_papers(tmp_path: Path) -> None:
+  table = Table(tmp_path / "pixels.csv")
+  for part, seconds in (("episodes", 1e-6), ("pixels", 4e-6), ("inference", 5e-6), ("update", 2e-5)):
+    row = {"benchmark": "pixels", "task": "CartpoleBalanceVision", "agent": "ppo", "who": "ours", "device": "GPU"}
+    table.add({**row, "setting": f"a=1 part={part}", "quantity": "seconds_per_step", "value": seconds, "unit": "s"})
+  ours, paper, _, others = (b for b in sections.pixels(Evidence([tmp_path]), sections.Notes()) if isinstance(b, Shown))
+  assert list(ours.rows[0])[:6] == ["CartpoleBalanceVision", "a=1", "1,000,000", "250,000", "200,000", "50,000"]
+  assert list(paper.rows[0]) == ["CartpoleBalance", "1,370,000", "403,000", "341,000", "31,300"]
+  assert {row[0] for row in others.rows} == {"madrona_mjx", "isaac_lab", "maniskill"}
+
+
+@pytest.mark.slow
+def test_a_real_one(tmp_path: Path) -> None:
+  small = ["sizes=8", "num_envs=8", "seconds=0.2", "cache=true", "hardware=cpu", "debug=fast"]
+  command = [sys.executable, "-m", "playground.cli.bench", "pixels", "tasks=CartpoleBalanceVision", *small]
+  done = subprocess.run([*command, f"out={tmp_path}/out.csv"], capture_output=True, text=True, cwd=CHECKOUT)
+  assert done.returncode == 0, done.stdout + done.stderr
+  rows = pd.read_csv(tmp_path / "out.csv")
+  parts = ["physics", "task", "episodes", "pixels", "inference", "storing", "update"]
+  assert [text.split("part=")[1] for text in rows["setting"]] == parts and (rows["value"] > 0).all()

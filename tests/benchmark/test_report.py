@@ -1,0 +1,119 @@
+"""The report: truthful about what is there and what is not, from rows of every age."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from playground.benchmark.report import Options, page, run
+from playground.benchmark.report.evidence import Evidence
+from playground.benchmark.report.page import Heading, Picture, Table, Text, to_html, to_markdown
+from playground.benchmark.schema import Table as Rows
+from playground.benchmark.suites import SUITES, paper_table
+from playground.errors import ConfigError
+
+REFERENCE = Path(__file__).parents[2] / "results/reference"
+ROW = {
+  "benchmark": "throughput", "task": "CheetahRun", "agent": "ppo", "who": "ours", "quantity": "training_steps_per_s",
+  "unit": "steps/s", "backend": "warp", "devices": 1, "device": "NVIDIA X", "commit": "abc",
+  "conditions": "1.0 s timed", "date": "2026-01-01",
+}  # fmt: skip
+
+
+def evidence(folder: Path, *rows: dict[str, Any]) -> Evidence:
+  table = Rows(folder / "rows.csv")
+  for row in rows:
+    table.add(ROW | row)
+  return Evidence([folder])
+
+
+def line_of(found: Evidence, task: str, number: int = 0) -> list[str]:
+  """A task's row in the n-th table of the page."""
+  tables = [block for block in page(found) if isinstance(block, Table)]
+  return next(list(row) for row in tables[number].rows if row[0] == task)
+
+
+def test_mean_and_interval_over_seeds(tmp_path: Path):
+  found = evidence(tmp_path, *({"seed": seed, "value": 870_000.0 + 1000 * seed} for seed in range(1, 6)))
+  line = line_of(found, "CheetahRun")
+  assert line[1:6] == ["435,162 ± 12,183", "873,000 ± 1,963", "2.01", "5", "warp"]
+  assert line_of(found, "HumanoidRun")[2] == "not measured"
+
+
+def test_a_gpu_counts_before_a_cpu_and_new_before_old(tmp_path: Path):
+  found = evidence(
+    tmp_path,
+    {"seed": 1, "value": 3e6, "commit": "old"},
+    {"seed": 1, "value": 1e6, "commit": "new", "date": "2026-02-01"},
+    {"seed": 1, "value": 9e6, "device": "CPU Y x 2", "date": "2026-03-01"},
+    {"seed": 1, "value": 8e6, "setting": "agent.num_envs=4", "date": "2026-03-01"},
+  )
+  assert line_of(found, "CheetahRun")[2] == "1,000,000"
+
+
+def test_measured_again_replaces(tmp_path: Path):
+  found = evidence(tmp_path, {"seed": 1, "value": 1e6}, {"seed": 1, "value": 2e6})
+  assert line_of(found, "CheetahRun")[2] == "2,000,000"
+
+
+def test_every_benchmark_has_its_section(tmp_path: Path):
+  speed = {"quantity": "training_steps_per_s"}
+  found = evidence(
+    tmp_path,
+    {"benchmark": "compare", "seed": 1, "value": 200.0, **speed},
+    {"benchmark": "compare", "seed": 2, "value": 300.0, **speed},
+    {"benchmark": "compare", "who": "playground020", "seed": 1, "value": 150.0, **speed},
+    {"benchmark": "startup", "setting": "cold", "quantity": "start_to_first_update_s", "value": 12.5},
+    {"benchmark": "scaling", "setting": "agent.num_envs=64", "value": 1e4, **speed},
+    {"benchmark": "scaling", "setting": "agent.num_envs=128", "value": 2e4, **speed},
+    {"benchmark": "topology", "setting": "hardware.devices=1", "value": 1e4, **speed},
+    {
+      "benchmark": "topology",
+      "setting": "hardware.devices=2 hardware.scale_envs=true",
+      "devices": 2,
+      "value": 2e4,
+      **speed,
+    },
+    {"benchmark": "chain", "task": "a_chain", "setting": "stage=all", "quantity": "wall_clock_s", "value": 100.0},
+    *(
+      {"benchmark": "breakdown", "setting": f"part={part}", "quantity": "seconds_per_step", "value": value}
+      for part, value in (("physics", 1e-6), ("task", 3e-6), ("update", 10e-6))
+    ),
+  )
+  blocks = page(found)
+  assert {block.name for block in blocks if isinstance(block, Picture)} == {"scaling", "topology", "breakdown"}
+  cells = {cell for block in blocks if isinstance(block, Table) for row in block.rows for cell in row}
+  assert {"2.00", "12.5", "20,000", "a_chain", "100"} <= cells  # 300 / 150: the best of the turns
+  shares = next(b for b in blocks if isinstance(b, Table) and "update (µs)" in b.header).rows[0]
+  assert list(shares[1:8]) == ["1", "2", "", "", "", "", "7"]
+
+
+def test_the_committed_results_make_a_page(tmp_path: Path):
+  assert run(Options(out=str(tmp_path), rows=(str(REFERENCE),))) == 0
+  markdown, html = (tmp_path / "report.md").read_text(), (tmp_path / "report.html").read_text()
+  tasks = [row["registry_env"] for suite in SUITES for row in paper_table(f"{suite}_throughput")]
+  assert len(tasks) == 48
+  assert all(f"| {task} | " in markdown and f"<td>{task}</td>" in html for task in tasks)
+  assert "src=" not in html and 'href="http' not in html, "it needs nothing beside it"
+  assert (tmp_path / "report_pictures" / "curves.svg").is_file()
+
+
+def test_without_rows_it_says_so(tmp_path: Path):
+  with pytest.raises(ConfigError, match="no measured row"):
+    run(Options(out=str(tmp_path), rows=(str(tmp_path),)))
+
+
+def test_blocks_as_markdown_and_html():
+  blocks = [
+    Heading(2, "A & B"),
+    Text("run `it`"),
+    Table(["a", "b"], [["x|y", "1"]]),
+    Picture("p", "<?xml?><svg/>", "C"),
+  ]
+  assert to_markdown(blocks, "d") == (
+    "## A & B\n\nrun `it`\n\n| a | b |\n| --- | ---: |\n| x\\|y | 1 |\n\n![C](d/p.svg)\n"
+  )
+  html = to_html(blocks, "T")
+  for part in ("<h2>A &amp; B</h2>", "<code>it</code>", '<td class="n">1</td>', "<svg/>", "<figcaption>C</figcaption>"):
+    assert part in html
+  assert "<?xml" not in html

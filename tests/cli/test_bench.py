@@ -1,0 +1,88 @@
+"""`playground-bench`: what it says about mistakes, before anything is started."""
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from playground.benchmark import commands
+from playground.cli.bench import main
+
+Command = Callable[..., int]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Command:
+  def started(*args: Any) -> None:
+    raise AssertionError("a mistake must be found before a process is started")
+
+  monkeypatch.setattr(commands, "probe", started)
+
+  def call(*args: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["playground-bench", *args])
+    with pytest.raises(SystemExit) as exit_:
+      main()
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+  return call
+
+
+@pytest.mark.parametrize(
+  ("arguments", "message"),
+  [
+    (["throughputs"], "Did you mean 'throughput'?"),
+    (["throughput"], "Name what to measure"),
+    (["throughput", "suite=locomotions"], "Did you mean 'locomotion'?"),
+    (["throughput", "tasks=CartpoleBalence"], "Did you mean 'CartpoleBalance'?"),
+    (["throughput", "tasks=CheetahRun", "agent=pppo"], "Did you mean 'ppo'?"),
+    (["throughput", "tasks=CheetahRun", "seed=5"], "Did you mean 'seeds'?"),
+    (["throughput", "tasks=CheetahRun", "seeds=many"], "must be a whole number"),
+    (["throughput", "tasks=CheetahRun", "workers=0"], "must be at least 1"),
+    (["throughput", "tasks=CheetahRun", "agent.num_env=64"], "agent.num_env"),
+    (["startup", "tasks=CheetahRun", "workers=2"], "wants the machine to itself"),
+    (["topology", "tasks=CheetahRun", "hyperparameters=doubled"], "must be fixed, scaled or both"),
+    (["chain", "experiment=go1_joystick"], "is no chain"),
+    (["compare", "tasks=CheetahRun", "peer=playground021"], "Did you mean 'playground020'?"),
+    (["compare", "tasks=CheetahRun", "peer_python=no_such_python"], "cannot be run"),
+    (["compare", "tasks=CheetahRun", f"peer_python={sys.executable}"], "playground 0.2.0 is not installed"),
+    (["compare", "tasks=CheetahRun", "agent=sac"], "the comparison is of PPO"),
+    (["report", "rows=no_such_folder"], "no measured row"),
+  ],
+)
+def test_a_mistake_is_one_sentence(
+  command: Command, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+):
+  assert command(*arguments) == 2
+  captured = capsys.readouterr()
+  assert captured.err.startswith("error: ") and captured.err.count("\n") == 1
+  assert message in captured.err
+
+
+def test_help(command: Command, capsys: pytest.CaptureFixture[str]):
+  assert command() == 0
+  listed = capsys.readouterr().out
+  assert all(name in listed for name in (*commands.COMMANDS, "report", "gate"))
+  assert command("throughput", "--help") == 0
+  assert "seeds=5" in capsys.readouterr().out
+
+
+def test_commands_stand_for_jobs():
+  facts = {"devices": 4, "device": "a device", "versions": ""}
+  throughput = commands.Throughput(suite="all", seeds=2).jobs(facts)
+  assert len(throughput) == len(set(map(str, throughput))) >= 40
+  assert all(job.arguments["seeds"] == [1, 2] and not job.columns["setting"] for job in throughput)
+
+  settings = [job.columns["setting"] for job in commands.Topology(tasks=("CartpoleBalance",)).jobs(facts)]
+  assert [text.split()[0] for text in settings] == [f"hardware.devices={n}" for n in (1, 2, 2, 4, 4)]
+  assert settings[-1] == "hardware.devices=4 hardware.scale_envs=true"
+
+  scaling = commands.Scaling(tasks=("CartpoleBalance",), num_envs=(1024, 65536)).jobs(facts)
+  assert [job.measure for job in scaling] == ["environment", "training"] * 2
+  assert scaling[-1].columns["setting"] == "agent.num_envs=65536 agent.batch_size=2048"
+
+  turns = commands.Compare(tasks=("CartpoleBalance",), repeats=2).jobs(facts)
+  assert [(job.measure, job.arguments["seeds"]) for job in turns] == [
+    (who, [turn]) for turn in (1, 2) for who in ("training", "peer", "peer")
+  ]
