@@ -6,13 +6,50 @@ from typing import Any
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 
 AXIS = "data"  # the mesh's axis; inside a mapped function collectives name it
 
 
 def make_mesh(num_devices: int) -> Mesh:
-  """A mesh over the first `num_devices` visible devices."""
-  return Mesh(np.array(jax.devices()[:num_devices]), (AXIS,))
+  """A mesh over the first `num_devices` visible devices of every process (mostly there is one process)."""
+  devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
+  mine = lambda index: [device for device in devices if device.process_index == index][:num_devices]
+  return Mesh(np.array([device for i in range(jax.process_count()) for device in mine(i)]), (AXIS,))
+
+
+def gather_on_mesh(function: Callable[..., Any], mesh: Mesh, spec: Any) -> Any:
+  """Jits a function of one tree, divided as `spec` says, whose results are then whole on every device."""
+  shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), spec)
+  return jax.jit(function, in_shardings=(shardings,), out_shardings=NamedSharding(mesh, P()))
+
+
+def divide(tree: Any, mesh: Mesh) -> Any:
+  """Arrays that every process has, divided over the devices by their leading axis."""
+  if jax.process_count() == 1:  # what is jitted over the mesh takes them as they are
+    return tree
+  return put(tree, mesh, P(AXIS))
+
+
+def put(tree: Any, mesh: Mesh, spec: Any) -> Any:
+  """Puts host arrays, the same in every process, on the devices as `spec` (a tree prefix) says; shares no buffer."""
+  shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), spec)
+  if jax.process_count() == 1:
+    return jax.device_put(tree, shardings, may_alias=False)
+
+  def place(sharding: NamedSharding, part: Any) -> Any:
+    hosts = jax.tree.map(np.asarray, part)  # device_put would compare them between the processes, one by one
+    return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, sharding, lambda index: x[index]), hosts)
+
+  return jax.tree.map(place, shardings, tree)
+
+
+def own_share(array: jax.Array, axis: int) -> np.ndarray:
+  """What this process has of an array that is divided by `axis`, on the host: all of it if there is one process."""
+  if array.is_fully_addressable or array.is_fully_replicated:
+    return np.asarray(array)
+  shards = sorted(array.addressable_shards, key=lambda shard: shard.index[axis].start or 0)
+  return np.concatenate([np.asarray(shard.data) for shard in shards], axis)
 
 
 def device_memory(mesh: Mesh) -> int | None:

@@ -9,6 +9,7 @@ import jax
 from jax.sharding import Mesh
 
 from playground.errors import ConfigError, HardwareError
+from playground.hardware.distributed import join
 from playground.hardware.mesh import make_mesh
 
 PRECISIONS = ("highest", "float32", "tensorfloat32", "high", "bfloat16", "default")
@@ -31,7 +32,7 @@ def setup(config: Any) -> Hardware:
 
   Raises:
     ConfigError: an unknown platform or precision.
-    HardwareError: devices this machine does not have.
+    HardwareError: devices this machine does not have, or other processes of the training that do not come.
   """
   for key in ("matmul_precision", "network_precision"):
     if config[key] not in PRECISIONS:
@@ -41,9 +42,10 @@ def setup(config: Any) -> Hardware:
   _environment(config)
   if config.platform == "cpu":
     jax.config.update("jax_platforms", "cpu")
+  join(config)
   jax.config.update("jax_default_matmul_precision", config.matmul_precision)
   cache = _caches(config)
-  devices = jax.devices()
+  devices = jax.local_devices()
   if config.platform == "gpu" and devices[0].platform != "gpu":
     raise HardwareError(
       "hardware.platform=gpu, but JAX sees no GPU: `playground doctor` says what is missing, hardware=cpu runs without."
@@ -51,21 +53,28 @@ def setup(config: Any) -> Hardware:
   count = len(devices) if config.devices is None else config.devices
   if not 1 <= count <= len(devices):
     raise HardwareError(f"hardware.devices={count}, but this machine has {len(devices)} ({devices[0].device_kind}).")
+  if config.kind is not None and config.kind.lower() not in devices[0].device_kind.lower():
+    raise HardwareError(
+      f"hardware.kind={config.kind}, but this machine has {devices[0].device_kind}: hardware=gpu takes any GPU."
+    )
+  mesh = make_mesh(count)
   facts = {
     "platform": devices[0].platform,
     "device": devices[0].device_kind,
-    "num_devices": count,
+    "num_devices": mesh.size,
+    "num_processes": jax.process_count(),
     "matmul_precision": config.matmul_precision,
     "network_precision": config.network_precision,
     "compilation_cache": cache,
   }
-  return Hardware(make_mesh(count), config.network_precision, facts)
+  return Hardware(mesh, config.network_precision, facts)
 
 
 def this_machine(hardware: Any) -> Any:
   """A run's `hardware` config for looking at it here: one device of whatever kind there is."""
   hardware = hardware.copy_and_resolve_references()
-  hardware.devices = 1
+  hardware.devices, hardware.kind = 1, None
+  hardware.distributed.enable = False
   hardware.platform = "cpu" if hardware.platform == "cpu" else "auto"
   return hardware
 

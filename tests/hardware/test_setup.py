@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from ml_collections import ConfigDict
 
-from playground.config import compose
+from playground.config import compose, config_roots, options
 from playground.errors import ConfigError, HardwareError
 from playground.hardware.setup import setup
 
@@ -51,6 +52,7 @@ def hardware(**changes: Any) -> ConfigDict:
   ("changes", "error", "words"),
   [
     ({"devices": 99}, HardwareError, ["hardware.devices=99", "this machine has 1"]),
+    ({"kind": "H100"}, HardwareError, ["hardware.kind=H100", "this machine has cpu", "hardware=gpu takes any GPU"]),
     ({"platform": "tpu"}, ConfigError, ["hardware.platform='tpu'", "auto, cpu, gpu"]),
     ({"matmul_precision": "hihgest"}, ConfigError, ["hardware.matmul_precision='hihgest'", "highest"]),
   ],
@@ -59,6 +61,21 @@ def test_what_cannot_be_had_is_one_sentence(changes: dict[str, Any], error: type
   with pytest.raises(error) as caught:
     setup(hardware(**changes))
   assert all(word in str(caught.value) for word in words)
+
+
+@pytest.mark.parametrize("preset", [name for name in options("hardware") if "_x" in name])
+def test_presets_are_named_after_their_devices(preset: str) -> None:
+  kind, _, count = preset.rpartition("_x")
+  file = yaml.safe_load((config_roots()[0] / f"hardware/{preset}.yaml").read_text())  # test_config.py composes it
+  assert file["devices"] == int(count)
+  assert file.get("kind", "GPU").replace(" ", "").lower() == kind
+
+
+def test_more_than_there_are_is_one_sentence() -> None:
+  command = [sys.executable, "-m", "playground.cli.run", "hardware=gpu_x2", "hardware.platform=auto", "debug=fast"]
+  done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"JAX_PLATFORMS": "cpu"}, timeout=120)
+  assert done.returncode == 2
+  assert done.stderr.splitlines()[-1] == "error: hardware.devices=2, but this machine has 1 (cpu)."
 
 
 def test_training_over_two_devices_keeps_parameters_equal_and_environments_apart() -> None:

@@ -1,0 +1,20 @@
+"""GPUs of this machine, found without JAX: looking must not take their memory."""
+
+import os
+import subprocess
+from collections.abc import Mapping
+
+
+def visible_gpus(env: Mapping[str, str] = os.environ) -> list[str]:
+  """GPUs as CUDA_VISIBLE_DEVICES names them: its own entries, else all that the driver has."""
+  if env.get("JAX_PLATFORMS") == "cpu":
+    return []
+  named = env.get("CUDA_VISIBLE_DEVICES")
+  if named is not None:
+    return [gpu.strip() for gpu in named.split(",") if gpu.strip() not in ("", "-1")]
+  try:
+    query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
+    done = subprocess.run(query, capture_output=True, text=True, timeout=20)
+  except (OSError, subprocess.TimeoutExpired):
+    return []
+  return done.stdout.split() if done.returncode == 0 else []

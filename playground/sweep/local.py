@@ -1,0 +1,130 @@
+"""Jobs as processes on this machine: each on slots of its GPUs and on cores of its own."""
+
+import contextlib
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+
+from playground.config import Section
+from playground.errors import HardwareError
+from playground.hardware.gpus import visible_gpus
+from playground.sweep.folder import Job, SweepDirectory
+from playground.sweep.worker import COMMAND
+
+MEMORY_FRACTION = 0.9  # of a GPU, shared among its slots; the rest is for Warp and the driver
+
+
+@dataclasses.dataclass(frozen=True)
+class Slot:
+  """Room for one job: a share of a GPU (None without one) and CPU cores."""
+
+  number: int
+  gpu: str | None
+  cores: tuple[int, ...]
+
+
+def make_slots(gpus: Sequence[str], slots_per_gpu: int, cores: Sequence[int], cores_per_job: int) -> list[Slot]:
+  """Divides a machine: slots of the GPUs in turn, so that jobs spread before they share; cores evenly among slots."""
+  places = [gpu for _ in range(slots_per_gpu) for gpu in gpus] or [None] * max(1, len(cores) // cores_per_job)
+  each = len(cores) // len(places)
+  share = lambda i: tuple(cores[i * each : (i + 1) * each]) if each else tuple(cores)
+  return [Slot(i, gpu, share(i)) for i, gpu in enumerate(places)]
+
+
+def pick(free: Sequence[Slot], needs: int | None) -> list[Slot] | None:
+  """Slots for a job that needs that many GPUs (None: one, if there is any), one on each; None if there are too few."""
+  needs = max(1, needs or 0)
+  first: dict[str | None, Slot] = {}
+  for slot in free:
+    first.setdefault(slot.gpu, slot)
+  return list(first.values())[:needs] if len(first) >= needs else None
+
+
+class LocalLauncher:
+  """See `launchers.Launcher`."""
+
+  outlives = False
+
+  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
+    gpus = visible_gpus()
+    if config.gpus is not None and config.gpus > len(gpus):
+      raise HardwareError(f"launcher.gpus={config.gpus}, but this machine has {len(gpus)}.")
+    self._gpus = gpus[: config.gpus]
+    self.slots = make_slots(self._gpus, config.slots_per_gpu, sorted(os.sched_getaffinity(0)), config.cores_per_job)
+    self._sweep = sweep
+    self._config = config
+    self._command = tuple(command)
+    self._workers: dict[str, subprocess.Popen[bytes]] = {}
+    self._taken: dict[str, list[Slot]] = {}
+    for job in sweep.jobs:  # that outlived the process that started them
+      folder = sweep.folder(job)
+      if folder.locked():
+        numbers = folder.record.get("slots", [])
+        self._taken[job.name] = [slot for slot in self.slots if slot.number in numbers]
+
+  def check(self, jobs: Sequence[Job]) -> None:
+    for job in jobs:
+      if (job.needs or 1) > max(1, len(self._gpus)) and self._gpus:
+        raise HardwareError(
+          f"Job {job.name} asks for hardware.devices={job.needs}, but launcher=local has {len(self._gpus)} GPUs here."
+        )
+
+  def start(self, job: Job) -> bool:
+    for name in [name for name in self._taken if not self._at_work(name)]:
+      del self._taken[name]
+    taken = {slot for slots in self._taken.values() for slot in slots}
+    slots = pick([slot for slot in self.slots if slot not in taken], job.needs if self._gpus else 0)
+    if slots is None:
+      return False
+    gpus = [slot.gpu for slot in slots if slot.gpu is not None] if job.needs != 0 else []
+    cores = [core for slot in slots for core in slot.cores]
+    where = f"GPU {','.join(gpus)}" if gpus else f"cores {','.join(map(str, cores))}"
+    limits = ["--grace", str(self._config.grace)]
+    limits += [] if self._config.timeout is None else ["--timeout", str(self._config.timeout)]
+    folder = self._sweep.folder(job)
+    folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
+    numbers = [str(slot.number) for slot in slots]
+    args = [*limits, "--where", where, "--slots", *numbers, "--cores", *map(str, cores), "--", *self._command]
+    with folder.log.open("ab") as log:
+      self._workers[job.name] = subprocess.Popen(
+        [sys.executable, "-m", "playground.sweep.worker", str(folder.path), *args],
+        env=self._environment(gpus),
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,  # Ctrl-C is for us; jobs are asked to stop through the sweep's folder
+      )
+    self._taken[job.name] = slots
+    return True
+
+  def busy(self, job: Job) -> bool:
+    return self._at_work(job.name)
+
+  def kill(self) -> None:
+    for job in self._sweep.jobs:
+      if self._at_work(job.name):
+        # Its worker sees it end; a worker of an earlier start is no child of ours, but its job is as good as dead, too.
+        pid = self._sweep.folder(job).record.get("job_pid")
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+          os.killpg(pid, signal.SIGKILL) if pid else None
+
+  def close(self) -> None:
+    for worker in self._workers.values():
+      worker.wait()
+
+  def _at_work(self, name: str) -> bool:
+    worker = self._workers.get(name)
+    if worker is not None and worker.poll() is None:
+      return True
+    return self._sweep.folder(next(job for job in self._sweep.jobs if job.name == name)).locked()
+
+  def _environment(self, gpus: Sequence[str]) -> dict[str, str]:
+    """What a job must know of its place; without GPUs none is visible."""
+    env = os.environ | {"CUDA_VISIBLE_DEVICES": ",".join(gpus)}
+    shared = self._config.slots_per_gpu
+    if gpus and shared > 1:
+      env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION / shared:.3f}"
+    return env

@@ -1,0 +1,153 @@
+"""From a command line to a sweep on disk: its jobs, each composed and checked, or the sweep that they already are."""
+
+import re
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from playground import config as configs
+from playground.config import RunConfig, Section
+from playground.errors import ConfigError
+from playground.sweep.folder import Job, SweepDirectory
+
+ROOT = Path("results/sweeps")
+
+
+def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
+  """The configurations of all jobs that `-m` is given; of a search, of its first one."""
+  settings, lines = configs.split(configs.expand(overrides))
+  if configs.compose_settings(settings).search.name != "grid":
+    from playground.sweep.search import first_values
+
+    return configs.compose_all([first_values(lines)])
+  return configs.compose_all(configs.combinations(configs.with_default_experiment(lines)))
+
+
+def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
+  """Composes and checks every job, and lays the sweep out on disk or finds it there.
+
+  With `sweep_dir` of a sweep of the same jobs that one goes on; so does, without `sweep_dir`, the newest one of that
+  name that has something left to do.
+
+  Returns:
+    The sweep, and how it is to be run.
+
+  Raises:
+    ConfigError: whatever cannot work; nothing is written then.
+  """
+  settings, lines = configs.split(configs.expand(overrides))
+  chosen = configs.compose_settings(settings)
+  lines = configs.with_default_experiment(lines)
+  if chosen.search.name != "grid":
+    from playground.sweep.search import first_values
+
+    (config,), jobs = configs.compose_all([first_values(lines)]), []
+    name = _name(overrides, [config])
+  else:
+    combinations = configs.combinations(lines)
+    composed = configs.compose_all(combinations)
+    name = _name(overrides, composed)
+    varying = configs.varying(lines)
+    jobs = [
+      make_job(number, job, varying, config)
+      for number, (job, config) in enumerate(zip(combinations, composed, strict=True))
+    ]
+  found = _find(chosen.sweep_dir, name, lines, jobs)
+  if found is not None:
+    return found, chosen
+  path = chosen.sweep_dir or _new(ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
+  settings = [line for line in settings if not line.startswith("sweep_dir=")]
+  return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen
+
+
+def make_job(number: int, overrides: Sequence[str], varying: Sequence[str], config: RunConfig) -> Job:
+  """A job of a sweep.
+
+  Args:
+    number: its place.
+    overrides: its command line.
+    varying: the keys in which jobs differ.
+    config: what it is composed to.
+
+  Raises:
+    ConfigError: it takes several machines.
+  """
+  varies = {key: _value(config, key) for key in varying}
+  said = [str(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={v}" for k, v in varies.items()]
+  words = re.sub(r"[^A-Za-z0-9._=+-]+", "-", "_".join(said or [config.name]))[:80].strip("-.")
+  if config.hardware.distributed.enable:
+    raise ConfigError("hardware=multi_node cannot be given with -m: a job of a sweep runs on one machine.")
+  needs = 0 if config.hardware.platform == "cpu" else config.hardware.devices
+  stages = [stage.agent.num_timesteps for stage in config.stages]
+  steps = sum(stages) if stages else config.agent.num_timesteps
+  return Job(f"{number:03d}_{words}", list(overrides), varies, needs, int(steps))
+
+
+def _value(config: RunConfig, key: str) -> Any:
+  """What a job has for a key or group."""
+  if key in config.choices:
+    return config.choices[key]
+  node: Any = config.resolved
+  for part in {"terrain": "env.scene.terrain", "visuals": "video.visuals"}.get(key, key).split("."):
+    node = node[int(part)] if isinstance(node, list) else node[part] if isinstance(node, Mapping) else None
+  return configs.format_value(node) if isinstance(node, list | Mapping) else node
+
+
+def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
+  """The sweep file's name, or that of what its jobs train."""
+  for text in overrides:
+    if text.startswith("sweep="):
+      return text.partition("=")[2]
+  names = list(dict.fromkeys(config.name for config in composed))
+  return "_".join(names[:2]) + (f"_and_{len(names) - 2}_more" if len(names) > 2 else "")
+
+
+def _find(path: str | None, name: str, lines: Sequence[str], jobs: Sequence[Job]) -> SweepDirectory | None:
+  """The sweep that this is, if it has been started before."""
+  if path is not None:
+    if not (Path(path).expanduser() / "sweep.yaml").exists():
+      return None
+    sweep = SweepDirectory.open(path)
+    if not _same(sweep, lines, jobs):
+      raise ConfigError(
+        f"sweep_dir={path} holds a sweep of other jobs ({' '.join(sweep.command)}): name another folder, or give the "
+        "same command to go on with it."
+      )
+    return sweep
+  for folder in sorted((ROOT / name).glob("*/sweep.yaml"), reverse=True):
+    sweep = SweepDirectory.open(folder.parent)
+    if _same(sweep, lines, jobs):
+      done = all(state.status == "finished" for state in sweep.states().values())
+      return None if done and jobs else sweep
+  return None
+
+
+def _same(sweep: SweepDirectory, lines: Sequence[str], jobs: Sequence[Job]) -> bool:
+  ours = [job.overrides for job in jobs]
+  return sweep.lines == list(lines) and (not jobs or [job.overrides for job in sweep.jobs] == ours)
+
+
+def _new(path: Path) -> Path:
+  """A folder that is not there yet: two sweeps may be started in the same second."""
+  number, folder = 1, path
+  while folder.exists():
+    number += 1
+    folder = path.with_name(f"{path.name}_{number}")
+  return folder
+
+
+def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> Section:
+  """How a sweep is run: as it was started, changed by what is given now.
+
+  Raises:
+    ConfigError: keys that say nothing of a sweep, or cannot be.
+  """
+  for text in extra:
+    if not configs.is_of_sweep(text.lstrip("+~").partition("=")[0]):
+      raise ConfigError(f"{text} cannot be changed in a sweep that has begun: only launcher, search and on_error can.")
+  keys = {text.partition("=")[0] for text in extra}
+  kept = [text for text in sweep.settings if text.partition("=")[0] not in keys]
+  if "launcher" in keys:  # another launcher has other keys
+    kept = [text for text in kept if not text.startswith("launcher.")]
+  return configs.compose_settings([*kept, *extra])

@@ -1,0 +1,86 @@
+"""Jobs as tasks of a Ray cluster, whose nodes share the sweep's folder; a task whose node is lost goes on elsewhere."""
+
+import os
+import socket
+from collections.abc import Sequence
+from typing import Any
+
+from playground.config import Section
+from playground.errors import ConfigError, HardwareError
+from playground.sweep.folder import Job, SweepDirectory
+from playground.sweep.local import MEMORY_FRACTION
+from playground.sweep.worker import COMMAND, Worker
+
+try:
+  import ray
+except ImportError:
+  raise ConfigError('launcher=ray needs Ray: pip install "playground-run[ray]".') from None
+
+
+class RayLauncher:
+  """See `launchers.Launcher`."""
+
+  outlives = False
+
+  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
+    address = config.address or os.environ.get("RAY_ADDRESS")
+    self._owned = not ray.is_initialized()
+    if self._owned:
+      try:
+        ray.init(address=address, log_to_driver=False, include_dashboard=False)
+      except (ConnectionError, RuntimeError, ValueError) as error:
+        raise HardwareError(f"launcher=ray: no cluster at {address}: {str(error).splitlines()[0]}") from None
+    self._sweep = sweep
+    self._config = config
+    self._command = tuple(command)
+    self._tasks: dict[str, Any] = {}
+    self._run = ray.remote(max_calls=1)(_run)  # a process for each job, as with the other launchers
+
+  def check(self, jobs: Sequence[Job]) -> None:
+    has = ray.cluster_resources()
+    for job in jobs:
+      gpus, cores = self._gpus(job), self._config.cores_per_job
+      if gpus > has.get("GPU", 0) or cores > has.get("CPU", 0):
+        raise HardwareError(
+          f"Job {job.name} takes {gpus:g} GPUs and {cores:g} cores, but Ray's cluster has {has.get('GPU', 0):g} and "
+          f"{has.get('CPU', 0):g}: set launcher.gpus_per_job and launcher.cores_per_job."
+        )
+
+  def start(self, job: Job) -> bool:
+    folder, gpus = self._sweep.folder(job), self._gpus(job)
+    folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
+    task = self._run.options(
+      num_cpus=self._config.cores_per_job, num_gpus=gpus, max_retries=self._config.retries, name=job.name
+    )
+    limits = (self._config.timeout, self._config.grace)
+    self._tasks[job.name] = task.remote(str(folder.path.absolute()), self._command, *limits, gpus)
+    return True
+
+  def busy(self, job: Job) -> bool:
+    task = self._tasks.get(job.name)
+    return task is not None and not ray.wait([task], timeout=0)[0]
+
+  def kill(self) -> None:
+    for job in self._sweep.jobs:
+      if self.busy(job):
+        ray.cancel(self._tasks[job.name], force=True)
+
+  def close(self) -> None:
+    if self._owned:
+      ray.shutdown()
+
+  def _gpus(self, job: Job) -> float:
+    if self._config.gpus_per_job is not None:
+      return 0 if job.needs == 0 else self._config.gpus_per_job
+    return job.needs if job.needs is not None else min(1, ray.cluster_resources().get("GPU", 0))
+
+
+def _run(folder: str, command: tuple[str, ...], timeout: float | None, grace: float, gpus: float) -> int:
+  """A task: a worker, on the GPUs that Ray gave it."""
+  from pathlib import Path
+
+  if 0 < gpus < 1:
+    os.environ["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION * gpus:.3f}"
+  given = ",".join(map(str, ray.get_gpu_ids()))
+  where = socket.gethostname() + (f" GPU {given}" if given else "")
+  return Worker(Path(folder), command, timeout, grace).run(where)

@@ -1,0 +1,159 @@
+"""A search in place of every combination: Optuna draws a job's values, and learns from what came out of it.
+
+The study lies in the sweep's folder (`study.log`), a trial is one of its jobs; both go on where they stopped.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSweep
+from hydra.core.override_parser.types import Override as HydraOverride
+
+from playground import config as configs
+from playground.config import Section
+from playground.config.overrides import parse_with_hydra
+from playground.errors import ConfigError, PlaygroundError
+from playground.sweep.folder import Job, JobFolder, SweepDirectory
+
+try:
+  import optuna
+  from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+  from optuna.storages import JournalStorage
+  from optuna.storages.journal import JournalFileBackend
+  from optuna.trial import TrialState
+except ImportError:
+  raise ConfigError('search=optuna needs Optuna: pip install "playground-run[optuna]".') from None
+
+_SAMPLERS = {
+  "tpe": lambda seed: optuna.samplers.TPESampler(seed=seed),
+  "random": lambda seed: optuna.samplers.RandomSampler(seed=seed),
+  "cmaes": lambda seed: optuna.samplers.CmaEsSampler(seed=seed),
+}
+
+
+class Search:
+  """Asks Optuna for jobs and tells it how they ended."""
+
+  def __init__(self, sweep: SweepDirectory, config: Section, notify: Callable[[str], None] = print):
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    self._sweep = sweep
+    self._config = config
+    self._notify = notify
+    self._refused = 0
+    parsed = [parse_with_hydra(line) for line in sweep.lines]
+    self._fixed = [line for line, o in zip(sweep.lines, parsed, strict=True) if not o.is_sweep_override()]
+    self._drawn = {str(o.get_key_element()): distribution(o) for o in parsed if o.is_sweep_override()}
+    self._study = optuna.create_study(
+      storage=JournalStorage(JournalFileBackend(str(sweep.path / "study.log"))),
+      sampler=_SAMPLERS[config.sampler](config.seed + len(sweep.jobs)),
+      direction=config.direction,
+      study_name=sweep.name,
+      load_if_exists=True,
+    )
+    jobs = {job.name: job for job in sweep.jobs}
+    for trial in self._study.get_trials(states=(TrialState.RUNNING,)):  # of an earlier start
+      job = jobs.get(trial.user_attrs.get("job", ""))
+      if job is None:
+        self._study.tell(trial.number, state=TrialState.FAIL)
+      elif sweep.folder(job).state().status == "finished":
+        self.tell(job, sweep.folder(job))
+
+  @property
+  def trials(self) -> int:
+    """How many there are to be."""
+    return self._config.trials
+
+  @property
+  def done(self) -> bool:
+    """Whether there is nothing left to ask for."""
+    return len(self._sweep.jobs) + self._refused >= self.trials
+
+  def ask(self, at_work: int) -> Job | None:
+    """The next job, written to the sweep; None while as many are at work as may be, or if its values do not fit."""
+    if self.done or at_work >= self._config.parallel:
+      return None
+    trial = self._study.ask(self._drawn)
+    overrides = [*self._fixed, *(f"{key}={value}" for key, value in trial.params.items())]
+    try:
+      (config,) = configs.compose_all([overrides])
+    except PlaygroundError as error:
+      self._refused += 1
+      self._study.tell(trial, state=TrialState.FAIL)
+      self._notify(f"A trial is left out: {error}")
+      return None
+    from playground.sweep.plan import make_job
+
+    job = make_job(len(self._sweep.jobs), overrides, list(trial.params), config)
+    trial.set_user_attr("job", job.name)
+    self._sweep.add(job)
+    return job
+
+  def tell(self, job: Job, folder: JobFolder) -> None:
+    """Takes note of how a job ended; one that was only interrupted stays open."""
+    state = folder.state().status
+    if state == "preempted":
+      return
+    value = _value(folder, self._config.metric) if state == "finished" else None
+    (trial,) = [t for t in self._study.get_trials(deepcopy=False) if t.user_attrs.get("job") == job.name][-1:]
+    if trial.state == TrialState.RUNNING:
+      self._study.tell(trial.number, value, state=TrialState.FAIL if value is None else None)
+    elif value is not None:  # it failed first, and a second start made it
+      again = optuna.create_trial(
+        params=trial.params, distributions=trial.distributions, value=value, user_attrs=trial.user_attrs
+      )
+      self._study.add_trial(again)
+
+  def best(self) -> str:
+    """What was found, in a sentence."""
+    if not self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+      return "No trial has finished."
+    trial = self._study.best_trial
+    values = " ".join(f"{key}={configs.format_value(value)}" for key, value in trial.params.items())
+    return f"Best of {len(self._sweep.jobs)} trials: {self._config.metric} {trial.value:g} with {values}"
+
+
+def distribution(override: HydraOverride) -> BaseDistribution:
+  """What a line of the command line lets Optuna draw from; `tag(log, interval(a, b))` is drawn on a log scale.
+
+  Raises:
+    ConfigError: it cannot draw from that.
+  """
+  value = override.value()
+  if isinstance(value, IntervalSweep):
+    log, start, end = "log" in value.tags, value.start, value.end
+    if start is None or end is None or start > end or (log and start <= 0):
+      raise ConfigError(f"{override.input_line}: an interval needs ends in their order, above 0 on a log scale.")
+    if isinstance(start, int) and isinstance(end, int):
+      return IntDistribution(start, end, log=log)
+    return FloatDistribution(start, end, log=log)
+  if isinstance(value, RangeSweep) and not value.shuffle:
+    values = list(value.range())
+    if all(isinstance(v, int) for v in values):
+      return IntDistribution(min(values), max(values), step=abs(int(value.step)))
+  if isinstance(value, ChoiceSweep | RangeSweep):
+    return CategoricalDistribution(list(override.sweep_string_iterator()))
+  raise ConfigError(f"{override.input_line}: a search draws from interval(a, b), range(a, b) or a list.")
+
+
+def first_values(lines: Sequence[str]) -> list[str]:
+  """The overrides of a job that the search could draw: the first value of each list, the low end of each interval."""
+  overrides, drawn = [], False
+  for line in lines:
+    override = parse_with_hydra(line)
+    if override.is_sweep_override():
+      drawn = True
+      draws: Any = distribution(override)
+      low = draws.choices[0] if isinstance(draws, CategoricalDistribution) else draws.low
+      overrides.append(f"{override.get_key_element()}={low}")
+    else:
+      overrides.append(line)
+  if not drawn:
+    example = "agent.learning_rate='tag(log,interval(1e-4,1e-2))'"
+    raise ConfigError(f"search=optuna needs something to draw, such as {example}.")
+  return overrides
+
+
+def _value(folder: JobFolder, metric: str) -> float | None:
+  from playground.runs.files import read_json
+
+  return read_json(folder.path / "summary.json").get(metric)

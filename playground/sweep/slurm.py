@@ -1,0 +1,128 @@
+"""Jobs on a Slurm cluster, submitted through submitit; they go on when the process that submitted them ends.
+
+What Slurm preempts, or ends at its time limit, is asked to save, queued again, and resumes from its checkpoint.
+"""
+
+import dataclasses
+import shutil
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from playground.config import Section
+from playground.errors import ConfigError, HardwareError
+from playground.sweep.folder import ENDED, Job, JobFolder, SweepDirectory
+from playground.sweep.worker import COMMAND, Worker
+
+try:
+  import submitit
+except ImportError:
+  raise ConfigError('launcher=slurm needs submitit: pip install "playground-run[slurm]".') from None
+
+SETTLED = tuple(status for status in ENDED if status not in ("preempted", "killed"))  # those Slurm may start again
+
+
+@dataclasses.dataclass
+class SlurmJob:
+  """What Slurm runs: a worker that can be told to save and come back."""
+
+  folder: Path
+  command: tuple[str, ...]
+  timeout: float | None
+  grace: float
+
+  def __call__(self) -> int:
+    self._worker = Worker(self.folder, self.command, self.timeout, self.grace)
+    return self._worker.run(where=socket.gethostname())
+
+  def checkpoint(self) -> Any:
+    """Called by submitit in the middle of `__call__`, on preemption and shortly before the time limit."""
+    self._worker.interrupt("Slurm wants its place; it is queued again")
+    return submitit.helpers.DelayedSubmission(dataclasses.replace(self))
+
+
+class SlurmLauncher:
+  """See `launchers.Launcher`."""
+
+  outlives = True
+
+  def __init__(
+    self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND, executor: Any = None
+  ):
+    """Args:
+      sweep: what to launch.
+      config: `launcher`.
+      command: what jobs are run with.
+      executor: of submitit; Slurm's if not given.
+
+    Raises:
+      HardwareError: no Slurm here.
+    """
+    if not config.wait and config.max_parallel is not None:
+      raise ConfigError("launcher.wait=false submits all jobs at once: leave launcher.max_parallel out.")
+    if executor is None and shutil.which("sbatch") is None:
+      raise HardwareError("launcher=slurm, but there is no sbatch here: start it on a machine of the cluster.")
+    self._folder = sweep.path.absolute() / "slurm"
+    self._executor = executor or submitit.SlurmExecutor(self._folder, max_num_timeout=config.requeues)
+    self._sweep = sweep
+    self._config = config
+    self._command = tuple(command)
+    self.submitted: dict[str, Any] = {}
+
+  def check(self, jobs: Sequence[Job]) -> None:
+    """Slurm itself says what it cannot give."""
+
+  def start(self, job: Job) -> bool:
+    at_once = self._config.max_parallel
+    if at_once is not None and sum(self.busy(job) for job in self._sweep.jobs) >= at_once:
+      return False
+    folder = self._sweep.folder(job)
+    if isinstance(self._executor, submitit.SlurmExecutor):
+      self._executor.update_parameters(**slurm_parameters(self._config, job))
+    folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
+    task = SlurmJob(folder.path.absolute(), self._command, self._config.timeout, self._config.grace)
+    submitted = self._executor.submit(task)
+    (folder.path / "slurm_id").write_text(submitted.job_id)
+    self.submitted[job.name] = submitted
+    return True
+
+  def busy(self, job: Job) -> bool:
+    folder = self._sweep.folder(job)
+    submitted = self._submitted(job, folder)
+    if submitted is None or folder.state().status in SETTLED:
+      return False
+    return not submitted.done()
+
+  def kill(self) -> None:
+    for job in self._sweep.jobs:
+      if self.busy(job):
+        self.submitted[job.name].cancel()
+
+  def close(self) -> None:
+    """Jobs go on by themselves."""
+
+  def _submitted(self, job: Job, folder: JobFolder) -> Any:
+    """What submitit knows of a job, also of one that an earlier process submitted."""
+    known = folder.path / "slurm_id"
+    if job.name not in self.submitted and known.is_file():
+      self.submitted[job.name] = self._executor.job_class(self._folder, known.read_text())
+    return self.submitted.get(job.name)
+
+
+def slurm_parameters(config: Section, job: Job) -> dict[str, Any]:
+  """What sbatch is told of a job, in submitit's words."""
+  gpus = config.gpus_per_job if config.gpus_per_job is not None else 1 if job.needs is None else job.needs
+  parameters = {
+    "job_name": job.name,
+    "time": config.minutes,
+    "cpus_per_task": config.cores_per_job,
+    "mem": f"{config.memory_gb}GB",
+    "nodes": 1,
+    "ntasks_per_node": 1,
+    "signal_delay_s": int(config.grace) + 30,  # what saving may take, before Slurm's limit
+    "setup": list(config.setup),
+    "additional_parameters": dict(config.parameters),
+  }
+  named = {key: config[key] for key in ("partition", "account", "qos", "constraint")}
+  return parameters | {key: value for key, value in named.items() if value} | ({"gpus_per_node": gpus} if gpus else {})

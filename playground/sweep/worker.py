@@ -1,0 +1,196 @@
+"""One job in one process: starts it or resumes it, watches over it, and records how it ended.
+
+Launchers start this wherever the job is to run; it needs no more than the sweep's folder. It holds the job's lock, so
+that no two of them run the same job.
+"""
+
+import argparse
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from playground.runs.files import read_json
+from playground.sweep.folder import STOP_FILE, JobFolder, SweepDirectory, now
+
+COMMAND = (sys.executable, "-m", "playground.cli.run")
+POLL_S = 0.2
+
+
+class Worker:
+  """Runs one job. `stop` may be called by a signal handler or another thread."""
+
+  def __init__(self, folder: Path, command: Sequence[str] = COMMAND, timeout: float | None = None, grace: float = 60.0):
+    """Args:
+      folder: of the job, `<sweep>/jobs/<job>`.
+      command: what the job's overrides are handed to.
+      timeout: seconds until the job is asked to stop.
+      grace: seconds from then until it is killed.
+    """
+    self._folder = JobFolder(Path(folder).absolute())
+    self._command = tuple(command)
+    self._timeout = timeout
+    self._grace = grace
+    self._stopping = False
+    self._sweep_path = self._folder.path.parents[1]
+    self._child: subprocess.Popen[bytes] | None = None
+    self._record: dict[str, Any] = {}
+
+  def stop(self) -> None:
+    """Asks the job to save and leave."""
+    self._stopping = True
+
+  def run(self, where: str = "", **facts: Any) -> int:
+    """Returns the job's exit code when it has ended; 0, too, if another worker is at it.
+
+    Args:
+      where: what it runs on, for people.
+      **facts: what the launcher wants to find in job.json.
+    """
+    sweep = SweepDirectory.open(self._sweep_path)
+    (job,) = (job for job in sweep.jobs if job.name == self._folder.path.name)
+    with self._folder.claim() as lock:
+      if lock is None:
+        return 0
+      attempt = self._folder.record.get("attempt", 0) + 1
+      self._record = {"attempt": attempt, "host": socket.gethostname(), "where": where, "started": now()}
+      self._record |= {"pid": os.getpid(), **facts}
+      if sweep.stop_file.exists():
+        self._write("preempted", "stopped before it began")
+        return 128 + signal.SIGTERM
+      self._child = self._start(sweep, job.overrides, attempt, lock)
+      self._record["job_pid"] = self._child.pid
+      self._write("running")
+      code, why = self._watch(self._child)
+      self._write(*self._outcome(code, why))
+    return code
+
+  def interrupt(self, reason: str) -> None:
+    """For a signal handler that does not return to `run`: ends the job, saved, and records that it is to go on."""
+    self.stop()
+    if self._child is not None:
+      self._watch(self._child)
+    self._write("preempted", reason)
+
+  def _write(self, status: str, reason: str = "") -> None:
+    ended = {} if self._child is None or self._child.returncode is None else {"exit_code": self._child.returncode}
+    ended |= {} if status == "running" else {"ended": now()}
+    self._folder.write(status=status, reason=reason, **self._record, **ended)
+
+  def _start(
+    self, sweep: SweepDirectory, overrides: Sequence[str], attempt: int, lock: int
+  ) -> "subprocess.Popen[bytes]":
+    path = quoted(self._folder.path)
+    args = [f"resume={path}"] if self._folder.begun else [*overrides, f"run_dir={path}"]
+    with self._folder.log.open("ab") as log:
+      log.write(f"--- start {attempt}, {now()}, {socket.gethostname()}: {' '.join(args)}\n".encode())
+      log.flush()
+      return subprocess.Popen(
+        [*self._command, *args],
+        cwd=sweep.cwd if sweep.cwd.is_dir() else None,
+        env={"WANDB_RUN_GROUP": sweep.group} | os.environ | {"PYTHONUNBUFFERED": "1"},
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,  # so that nothing it starts is left when it is killed
+        pass_fds=[lock],
+      )
+
+  def _watch(self, child: "subprocess.Popen[bytes]") -> tuple[int, str]:
+    """Waits for the job's end; returns its exit code and why it was asked to stop, '' if it was not."""
+    stop_file = self._sweep_path / STOP_FILE
+    began, asked_at, why = time.monotonic(), 0.0, ""
+    while child.poll() is None:
+      time.sleep(POLL_S)
+      passed = time.monotonic() - began
+      if not why:
+        out_of_time = self._timeout is not None and passed > self._timeout
+        why = "timeout" if out_of_time else "stopped" if self._stopping or stop_file.exists() else ""
+        if why:
+          asked_at = passed
+          _signal(child, signal.SIGTERM, group=False)
+      elif passed - asked_at > self._grace:
+        _signal(child, signal.SIGKILL, group=True)
+    _signal(child, signal.SIGKILL, group=True)  # what it may have left behind
+    return child.returncode, why
+
+  def _outcome(self, code: int, why: str) -> tuple[str, str]:
+    """The job's status and its reason, in words."""
+    run = read_json(self._folder.path / "status.json")
+    if code == 0:
+      return "finished", ""
+    if why == "timeout":
+      return "timeout", f"took longer than launcher.timeout={self._timeout:g} s"
+    if why == "stopped" or run.get("status") == "preempted":
+      killed = code == -signal.SIGKILL
+      return "preempted", "killed before it could save" if killed else "stopped; resumes from its checkpoint"
+    if code < 0:
+      name = signal.Signals(-code).name
+      return "killed", f"killed by {name}{', perhaps for want of memory' if code == -signal.SIGKILL else ''}"
+    if run.get("status") == "failed" and run.get("reason"):
+      return "failed", run["reason"]
+    return "failed", f"exit code {code}: {_last_line(self._folder.log)}"
+
+
+@contextlib.contextmanager
+def stopping_on_signals(worker: Worker) -> Iterator[None]:
+  """While it lasts, SIGTERM and SIGINT to this process ask the job to stop; only in a main thread."""
+  if threading.current_thread() is not threading.main_thread():
+    yield
+    return
+  handle = lambda *_: worker.stop()
+  before = {signum: signal.signal(signum, handle) for signum in (signal.SIGTERM, signal.SIGINT)}
+  try:
+    yield
+  finally:
+    for signum, handler in before.items():
+      signal.signal(signum, handler)
+
+
+def quoted(value: object) -> str:
+  """A value for Hydra's command line, whatever characters it has."""
+  return "'" + str(value).replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+  """`python -m playground.sweep.worker <job folder> [options] [-- command]`."""
+  parser = argparse.ArgumentParser(prog="playground.sweep.worker")
+  parser.add_argument("folder", type=Path)
+  parser.add_argument("--timeout", type=float)
+  parser.add_argument("--grace", type=float, default=60.0)
+  parser.add_argument("--where", default="")
+  parser.add_argument("--slots", type=int, nargs="*", default=[])
+  parser.add_argument("--cores", type=int, nargs="*", default=[])
+  argv = list(sys.argv[1:] if argv is None else argv)
+  cut = argv.index("--") if "--" in argv else len(argv)
+  args = parser.parse_args(argv[:cut])
+  if args.cores:
+    os.sched_setaffinity(0, args.cores)
+  worker = Worker(args.folder, argv[cut + 1 :] or COMMAND, args.timeout, args.grace)
+  with stopping_on_signals(worker):
+    return worker.run(args.where, slots=args.slots)
+
+
+def _signal(child: "subprocess.Popen[bytes]", signum: int, group: bool) -> None:
+  with contextlib.suppress(ProcessLookupError):
+    if group:
+      os.killpg(child.pid, signum)
+    else:
+      child.send_signal(signum)
+
+
+def _last_line(log: Path) -> str:
+  """The last thing a job said, mostly its error."""
+  lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+  return (lines or ["it said nothing"])[-1][:300]
+
+
+if __name__ == "__main__":
+  sys.exit(main())

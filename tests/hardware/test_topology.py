@@ -1,0 +1,176 @@
+"""One training on several devices and processes: what is the same everywhere, and what goes on where."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from playground.config import compose
+from playground.errors import ConfigError, HardwareError
+from playground.hardware import distributed
+from playground.hardware.scaling import describe_division, scale_envs
+
+ROOT = Path(__file__).parents[2]
+LINE = ["env=CartpoleBalance", "tuned=null", "debug=fast", "tracking=csv"]
+LINE += ["agent.num_timesteps=1600", "agent.num_evals=5"]
+
+# The point, trained through `train`; prints the checksum of the parameters that each process ends with.
+TRAIN = """
+import sys
+import jax, numpy as np
+from playground import registry
+from playground.config import compose
+from playground.learning.checkpoints import checksum
+from playground.learning.loop import Loop
+from playground.runs.job import Job
+from playground.runs.train import train
+from tests.dummy import Point
+
+registry.load = lambda name, config=None: Point()
+run, ended = Loop.run, []
+
+def remember(loop, *args):
+  state, completed = run(loop, *args)
+  ended.append(checksum([np.asarray(x) for x in jax.device_get(jax.tree.leaves(loop._learner.policy(state)))]))
+  return state, completed
+
+Loop.run = remember
+
+def trained(*overrides, until=None):
+  Job.should_stop = lambda job: until is not None and job._step >= until
+  code = train(compose([*sys.argv[1:], *overrides]))
+  assert code == 0, code
+  return ended[-1]
+"""
+THERE_AND_BACK = """
+import json
+results = [trained("hardware.devices=2", "run_dir=run", until=400)]
+sys.argv[1:] = []
+results.append(trained("resume=run", "hardware.devices=1", until=960))
+results.append(trained("resume=run", "hardware.devices=2"))
+print(json.dumps(results))
+"""
+
+
+def start(
+  script: str, folder: Path, *overrides: str, devices: int = 1, line: list[str] = LINE
+) -> "subprocess.Popen[str]":
+  """Starts a process that trains on simulated devices."""
+  flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", "JAX_PLATFORMS": "cpu"}
+  command = [sys.executable, "-c", script, *line, *overrides]
+  env = os.environ | flags | {"PYTHONPATH": str(ROOT)}
+  return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def test_checkpoints_go_on_on_another_topology(tmp_path: Path) -> None:
+  """From two devices to one, and back."""
+  process = start(TRAIN + THERE_AND_BACK, tmp_path, "hardware=cpu", devices=2)
+  out, _ = process.communicate(timeout=800)
+  assert process.returncode == 0, out[-3000:]
+  *_, ours = json.loads(out.strip().splitlines()[-1])
+  summary = json.loads((tmp_path / "run/summary.json").read_text())
+  assert (summary["status"], summary["steps"], summary["params_sha256"]) == ("finished", 1600, ours)
+  table = pd.read_csv(tmp_path / "run/metrics.csv")
+  assert table["step"].is_unique and table["step"].is_monotonic_increasing, "nothing is trained twice"
+  assert table["eval/episode_reward"].dropna().to_numpy()[-1] > table["eval/episode_reward"][0]
+  assert "On each of 2 devices: 4 of agent.num_envs=8, 4 of agent.batch_size=8, 2 of agent.num_eval_envs=4." in out
+  assert "It was written on 2 devices: on 1, all of it goes on, but random numbers and rounding differ" in out
+  assert "It was written on 1 device: on 2," in out
+
+
+def test_two_processes_are_one_training(tmp_path: Path) -> None:
+  """On the loopback, one device each: the same parameters everywhere, one run directory, and it resumes."""
+  with socket.socket() as free:
+    free.bind(("localhost", 0))
+    port = free.getsockname()[1]
+  keys = [f"hardware.distributed.{key}" for key in ("coordinator", "num_processes", "process_id", "timeout")]
+  script = TRAIN + "print(trained(), jax.process_index(), jax.device_count())"
+  both = ["hardware=multi_node", "hardware.platform=cpu", "run_dir=run"]
+  both += [f"{keys[0]}=localhost:{port}", f"{keys[1]}=2", f"{keys[3]}=200"]
+  processes = [start(script, tmp_path, *both, f"{keys[2]}={index}") for index in (1, 0)]
+  second, first = (process.communicate(timeout=800)[0] for process in processes)
+  assert [process.returncode for process in processes] == [0, 0], first[-3000:] + second[-3000:]
+  ours, *place = first.strip().splitlines()[-1].split()
+  assert place == ["0", "2"]
+  assert second.strip().splitlines()[-1].split() == [ours, "1", "2"], "the same parameters"
+  summary = json.loads((tmp_path / "run/summary.json").read_text())
+  assert (summary["status"], summary["steps"], summary["params_sha256"]) == ("finished", 1600, ours)
+  assert [path.name for path in tmp_path.iterdir()] == ["run"]
+  assert "finished" not in second and "metrics" not in second, "only process 0 reports"
+
+
+# What cannot be
+
+
+def hardware(*overrides: str) -> Any:
+  return compose(["env=CartpoleBalance", *overrides]).hardware
+
+
+@pytest.mark.parametrize(
+  ("overrides", "words"),
+  {
+    ("hardware=multi_node",): ["finds no cluster here", "hardware.distributed.coordinator=<host:port>"],
+    ("hardware=multi_node", "hardware.distributed.process_id=1"): ["hardware.distributed.coordinator is missing"],
+    ("hardware.distributed.process_id=1",): ["hardware.distributed.process_id needs hardware=multi_node."],
+  }.items(),
+)
+def test_too_little_is_said_of_the_others(
+  overrides: tuple[str, ...], words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+  for name in [name for name in os.environ if name.startswith(("SLURM", "OMPI"))]:
+    monkeypatch.delenv(name)
+  with pytest.raises(ConfigError) as caught:
+    distributed.join(hardware(*overrides))
+  assert all(word in str(caught.value) for word in words)
+
+
+def test_a_coordinator_that_is_not_there() -> None:
+  with socket.socket() as taken:  # bound, but nobody listens
+    taken.bind(("localhost", 0))
+    address = f"localhost:{taken.getsockname()[1]}"
+    keys = {"coordinator": address, "num_processes": 2, "process_id": 1, "timeout": 0.3}
+    with pytest.raises(HardwareError) as caught:
+      distributed.join(hardware("hardware=multi_node", *(f"hardware.distributed.{k}={v}" for k, v in keys.items())))
+  assert f"coordinator={address} could not be reached" in str(caught.value)
+  assert "Connection refused" in str(caught.value)
+
+
+def test_an_exchange_that_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
+  from jax.experimental import multihost_utils
+
+  monkeypatch.setattr(distributed, "several", lambda: True)
+  monkeypatch.setattr(multihost_utils, "process_allgather", lambda x: time.sleep(1))
+  config = hardware("hardware.distributed.timeout=0.2")
+  with pytest.raises(HardwareError, match=r"a first exchange between their devices did not end within .*=0\.2 s"):
+    distributed.preflight(config, {})
+  monkeypatch.setattr(multihost_utils, "process_allgather", lambda x: [x, x + 1])
+  with pytest.raises(ConfigError, match="Process 1 has another configuration than process 0"):
+    distributed.preflight(config, {})
+
+
+# hardware.scale_envs
+
+
+def test_environments_and_batch_are_multiplied() -> None:
+  config = compose(["env=CartpoleBalance", "tuned=null", "hardware.scale_envs=true"])
+  scaled, notice = scale_envs(config, 4)
+  assert notice == "hardware.scale_envs: 4 devices, so agent.num_envs 2048 -> 8192, agent.batch_size 1024 -> 4096."
+  assert (scaled.agent.num_envs, scaled.resolved["agent"]["batch_size"]) == (8192, 4096)
+  assert scaled.agent.num_minibatches == config.agent.num_minibatches
+  assert not scaled.hardware.scale_envs and not scaled.resolved["hardware"]["scale_envs"], "a resumed run keeps them"
+  assert describe_division(scaled.agent, 4) == (
+    "On each of 4 devices: 2048 of agent.num_envs=8192, 1024 of agent.batch_size=4096, 32 of agent.num_eval_envs=128."
+  )
+
+
+def test_all_stages_of_a_chain_are_scaled() -> None:
+  config = compose(["experiment=go1_joystick_chain", "hardware.scale_envs=true"])
+  scaled, _ = scale_envs(config, 2)
+  assert [s.agent.num_envs for s in scaled.stages] == [2 * s.agent.num_envs for s in config.stages]

@@ -1,0 +1,55 @@
+"""Stands in for `playground-run` in tests of sweeps: leaves what a run leaves, in no time. `seed` says what happens.
+
+0 to 9 finish; 10 crashes; 11 hangs and does not listen; 12 is killed; 13 saves when it is asked to stop and finishes
+when it is resumed; 14 crashes at its first start only; 15 takes its time.
+"""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+given = dict(arg.split("=", 1) for arg in sys.argv[1:])
+run = Path((given.get("resume") or given["run_dir"]).strip("'"))
+again = "resume" in given
+seed = int((run / "config.yaml").read_text()) if again else int(given["seed"])
+(run / "config.yaml").write_text(str(seed))
+facts = {"pid": os.getpid(), "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"), "cores": sorted(os.sched_getaffinity(0))}
+facts |= {name: os.environ.get(name) for name in ("XLA_PYTHON_CLIENT_MEM_FRACTION", "WANDB_RUN_GROUP")}
+with (run / "starts.jsonl").open("a") as file:
+  file.write(json.dumps(facts | {"began": time.time(), "again": again}) + "\n")
+
+
+def status(word: str, reason: str = "") -> None:
+  (run / "status.json").write_text(json.dumps({"status": word, "reason": reason}))
+
+
+def save(*_: object) -> None:
+  status("preempted", "interrupted and saved")
+  sys.exit(143)
+
+
+status("running")
+if seed == 10 or (seed == 14 and not again):
+  print("Traceback …\nValueError: out of luck")
+  sys.exit(1)
+if seed == 11:
+  signal.signal(signal.SIGTERM, signal.SIG_IGN)
+  time.sleep(60)
+if seed == 12:
+  os.kill(os.getpid(), signal.SIGKILL)
+if seed == 13 and not again:
+  signal.signal(signal.SIGTERM, save)
+  time.sleep(60)
+if seed == 15:
+  time.sleep(1.5)
+rate = float(given.get("agent.learning_rate", 0))
+rows = [f"{step},{seed + step / 100},{step / 10}" for step in (0, 50, 100)]
+(run / "metrics.csv").write_text("\n".join(["step,eval/episode_reward,time/wall_clock_s", *rows]) + "\n")
+score = -((rate - 0.3) ** 2) if rate else seed + 1.0
+summary = {"final_return": score, "best_return": score + 1, "steps": 100, "steps_per_second": 50.0}
+summary |= {"wall_clock_s": 10.0}
+(run / "summary.json").write_text(json.dumps({"status": "finished", **summary}))
+status("finished")

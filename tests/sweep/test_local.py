@@ -1,0 +1,53 @@
+"""How a machine is divided into slots, and what jobs get of it."""
+
+from pathlib import Path
+
+import pytest
+
+from playground.config import compose_settings
+from playground.errors import HardwareError
+from playground.sweep import local
+from playground.sweep.local import LocalLauncher, make_slots, pick
+from tests.sweep.helpers import make_sweep, run, starts, statuses
+
+
+def test_gpus_are_filled_in_turn() -> None:
+  slots = make_slots(["0", "3"], 2, list(range(8)), 99)
+  assert [slot.gpu for slot in slots] == ["0", "3", "0", "3"]
+  assert [slot.cores for slot in slots] == [(0, 1), (2, 3), (4, 5), (6, 7)]
+  assert [slot.gpu for slot in pick(slots, None) or []] == ["0"]
+  assert [slot.gpu for slot in pick(slots, 2) or []] == ["0", "3"]
+  assert pick([slots[0], slots[2]], 2) is None, "a job's devices are different GPUs"
+  assert pick([], None) is None
+
+
+def test_without_gpus_cores_decide() -> None:
+  assert [slot.cores for slot in make_slots([], 4, [4, 5, 6, 7], 2)] == [(4, 5), (6, 7)]
+  assert [slot.cores for slot in make_slots([], 1, [4], 2)] == [(4,)]
+  assert [slot.cores for slot in make_slots(["0"] * 3, 1, [1, 2], 2)] == [(1, 2)] * 3, "fewer cores than slots: shared"
+
+
+def test_each_job_sees_its_own_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(local, "visible_gpus", lambda: ["5", "6"])
+  sweep = make_sweep(tmp_path / "sweep", 15, 0, needs=None)
+  assert run(sweep, "launcher.slots_per_gpu=2") == 0
+  places = [found[0] for found in starts(sweep).values()]
+  assert [place["gpus"] for place in places] == ["5", "6"]
+  assert {place["XLA_PYTHON_CLIENT_MEM_FRACTION"] for place in places} == {"0.450"}
+  both = make_sweep(tmp_path / "both", 0, needs=2)
+  assert run(both) == 0
+  assert starts(both)[0][0]["gpus"] == "5,6"
+  assert starts(both)[0][0]["XLA_PYTHON_CLIENT_MEM_FRACTION"] is None
+  cpu = make_sweep(tmp_path / "cpu", 0, needs=0)
+  assert run(cpu) == 0
+  assert starts(cpu)[0][0]["gpus"] == ""
+
+
+def test_more_gpus_than_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(local, "visible_gpus", lambda: ["0"])
+  sweep = make_sweep(tmp_path / "sweep", 0, needs=2)
+  with pytest.raises(HardwareError, match=r"^Job 000_seed=0 asks for hardware\.devices=2, but .* has 1 GPU"):
+    run(sweep)
+  assert statuses(sweep) == {0: "queued"}
+  with pytest.raises(HardwareError, match=r"launcher\.gpus=2, but this machine has 1\."):
+    LocalLauncher(sweep, compose_settings(["launcher.gpus=2"]).launcher)

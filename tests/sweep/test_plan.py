@@ -1,0 +1,57 @@
+"""From a command line to a sweep on disk."""
+
+from pathlib import Path
+
+import pytest
+
+from playground.errors import ConfigError
+from playground.sweep.plan import plan, settings_of
+
+LINE = ["env=CartpoleBalance,CartpoleSwingup", "seed=1,2", "agent.max_grad_norm=null,1.0", "debug=fast"]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+  monkeypatch.chdir(tmp_path)
+  return tmp_path
+
+
+def test_jobs_are_named_after_what_they_differ_in(here: Path) -> None:
+  sweep, settings = plan([*LINE, "sweep_dir=mine", "launcher.slots_per_gpu=2"])
+  assert sweep.path == Path("mine")
+  assert [job.name for job in sweep.jobs][::3] == [
+    "000_CartpoleBalance_seed=1_max_grad_norm=None",
+    "003_CartpoleBalance_seed=2_max_grad_norm=1.0",
+    "006_CartpoleSwingup_seed=2_max_grad_norm=None",
+  ]
+  assert sweep.jobs[3].varies == {"env": "CartpoleBalance", "seed": 2, "agent.max_grad_norm": 1.0}
+  assert sweep.jobs[3].overrides == ["env=CartpoleBalance", "seed=2", "agent.max_grad_norm=1.0", "debug=fast"]
+  assert {job.steps for job in sweep.jobs} == {320}
+  assert {job.needs for job in sweep.jobs} == {None}
+  assert settings.launcher.slots_per_gpu == settings_of(sweep).launcher.slots_per_gpu == 2
+  assert settings_of(sweep, ["launcher=slurm"]).launcher.name == "slurm"
+
+
+def test_the_same_command_finds_its_sweep_again(here: Path) -> None:
+  first, _ = plan(["seed=1,2"])
+  assert first.path.parent == Path("results/sweeps/quickstart")
+  assert plan(["seed=1,2", "launcher.cores_per_job=1"])[0].path == first.path
+  assert plan(["seed=1,2,3"])[0].path != first.path
+  for job in first.jobs:
+    first.folder(job).write(status="finished")
+  assert plan(["seed=1,2"])[0].path != first.path, "a finished sweep is done anew"
+  assert plan(["seed=1,2", f"sweep_dir={first.path}"])[0].path == first.path, "unless its folder is named"
+  with pytest.raises(ConfigError, match="holds a sweep of other jobs"):
+    plan(["seed=4,5", f"sweep_dir={first.path}"])
+
+
+def test_what_a_job_needs(here: Path) -> None:
+  sweep, _ = plan(["hardware=cpu,gpu", "sweep_dir=a"])
+  assert [job.needs for job in sweep.jobs] == [0, None]
+  assert plan(["hardware.devices=2", "sweep_dir=b"])[0].jobs[0].needs == 2
+
+
+def test_nothing_is_written_when_a_job_cannot_work(here: Path) -> None:
+  with pytest.raises(ConfigError, match=r"^Job experiment=quickstart agent\.num_envs=7: "):
+    plan(["agent.num_envs=128,7"])
+  assert list(here.iterdir()) == []

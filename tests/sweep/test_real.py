@@ -1,0 +1,55 @@
+"""A sweep of real runs, from the command line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+pytestmark = pytest.mark.slow
+
+STEPS = 800_000  # seconds of training, so that a signal finds the runs at work
+LINE = ["env=CartpoleBalance", "seed=1,2", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv"]
+LINE += [f"agent.num_timesteps={STEPS}", "agent.num_evals=5", "launcher.cores_per_job=1"]
+
+
+def start(folder: Path) -> "subprocess.Popen[str]":
+  command = [sys.executable, "-m", "playground.cli.run", "-m", *LINE]
+  env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+  return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def rows(folder: Path) -> int:
+  """Rows of all jobs' metrics so far."""
+  return sum(len(path.read_text().splitlines()) for path in folder.rglob("metrics.csv"))
+
+
+def test_interrupted_and_started_again(tmp_path: Path) -> None:
+  process = start(tmp_path)
+  until = time.monotonic() + 600
+  while rows(tmp_path) < 10:
+    assert process.poll() is None and time.monotonic() < until
+    time.sleep(0.05)
+  process.send_signal(signal.SIGINT)
+  out, _ = process.communicate(timeout=120)
+  assert process.returncode == 130, out
+  (sweep,) = (tmp_path / "results/sweeps/CartpoleBalance").iterdir()
+  stopped = [json.loads(path.read_text())["status"] for path in sweep.rglob("jobs/*/job.json")]
+  assert "preempted" in stopped and any(sweep.rglob("checkpoints/*"))
+
+  out, _ = start(tmp_path).communicate(timeout=900)
+  assert "2 jobs in " in out and sweep.name in out, "the same sweep goes on"
+  table = pd.read_csv(sweep / "sweep.csv")
+  assert list(table["status"]) == ["finished", "finished"]
+  assert list(table["steps"]) == [STEPS, STEPS]
+  assert 2 in list(table["attempts"])
+  groups = pd.read_csv(sweep / "groups.csv")
+  assert list(groups["jobs"]) == [2] and list(groups["final_return_ci95"]) > [0.0]
+  assert (sweep / "report.html").stat().st_size > 20_000
+  logs = [path.read_text() for path in sweep.rglob("job.log")]
+  assert any("Resuming the whole training state" in log for log in logs)  # the other may not have come to save yet

@@ -1,0 +1,83 @@
+"""What a sweep's jobs come to: table, intervals, curves, page."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from playground.runs.files import write_json
+from playground.sweep.folder import Job, SweepDirectory
+from playground.sweep.report import mean_curve
+from playground.sweep.results import collect, group, group_keys, half_width, write_result
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> SweepDirectory:
+  """Two agents, three seeds each, of which one failed; none of them drawn from anywhere but here."""
+  jobs = [
+    Job(f"{i:03d}", [f"agent={a}", f"seed={s}"], {"agent": a, "seed": s})
+    for i, (a, s) in enumerate((a, s) for a in ("ppo", "sac<1>") for s in range(3))
+  ]
+  sweep = SweepDirectory.create(tmp_path / "sweep", "mine", ["playground-run", "-m", "<b>"], [], [], jobs)
+  for job in jobs[:-1]:
+    folder = sweep.folder(job)
+    folder.write(status="finished", attempt=1)
+    score = 10.0 * job.varies["seed"]
+    write_json(folder.path / "summary.json", {"final_return": score, "best_return": score, "steps_per_second": 1000.0})
+    rows = [f"{step},{score + step},{step / 7}" for step in (0, 50, 100)]
+    (folder.path / "metrics.csv").write_text("\n".join(["step,eval/episode_reward,time/wall_clock_s", *rows]) + "\n")
+  sweep.folder(jobs[-1]).write(status="failed", reason="exit code 1: a < b", attempt=2)
+  return sweep
+
+
+def test_groups_differ_in_all_but_the_seed(sweep: SweepDirectory) -> None:
+  groups = group(collect(sweep), group_keys(sweep))
+  assert list(groups["agent"]) == ["ppo", "sac<1>"]
+  assert list(groups["jobs"]) == [3, 2]
+  assert list(groups["final_return"]) == [10.0, 5.0]
+  # t quantiles 0.975 for 2 and 1 degrees of freedom, from tables
+  assert list(groups["final_return_ci95"]) == pytest.approx([4.3027 * 10 / 3**0.5, 12.7062 * 7.0711 / 2**0.5], rel=1e-4)
+  assert list(groups["steps_per_second_ci95"]) == [0, 0]
+
+
+def test_seeds_alone_are_one_group(tmp_path: Path) -> None:
+  jobs = pd.DataFrame({"seed": [1, 2], "status": "finished", "final_return": [1.0, 3.0]})
+  for name in ("best_return", "steps_per_second", "wall_clock_s"):
+    jobs[name] = np.nan
+  groups = group(jobs, [])
+  assert (groups["jobs"][0], groups["final_return"][0]) == (2, 2.0)
+  assert half_width([1.0]) is None
+
+
+def test_what_is_written(sweep: SweepDirectory) -> None:
+  names = [path.relative_to(sweep.path).as_posix() for path in write_result(sweep, lambda text: None)]
+  assert names == [
+    *("sweep.csv", "groups.csv", "plots/curves_over_steps.png", "plots/curves_over_wall_clock.png", "report.html"),
+  ]
+  table = pd.read_csv(sweep.path / "sweep.csv")
+  assert list(table["status"]) == ["finished"] * 5 + ["failed"]
+  assert list(table["overrides"][:2]) == ["agent=ppo seed=0", "agent=ppo seed=1"]
+  assert table["reason"].to_numpy()[-1] == "exit code 1: a < b"
+  page = (sweep.path / "report.html").read_text()
+  assert page.count("data:image/png;base64,") == 2
+  assert not re.search(r'(src|href)="(http|plots|/)', page), "it needs nothing but itself"
+  assert "sac&lt;1&gt;" in page and "a &lt; b" in page and "&lt;b&gt;" in page
+  assert "5 finished, 1 failed" in page
+
+
+def test_a_sweep_that_has_only_begun_has_a_result(tmp_path: Path) -> None:
+  sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], [Job("000", ["seed=1"], {"seed": 1})])
+  write_result(sweep, lambda text: None)
+  assert list(pd.read_csv(tmp_path / "sweep.csv")["status"]) == ["queued"]
+
+
+def test_curves_are_compared_where_all_have_points() -> None:
+  first = (np.array([0.0, 10.0]), np.array([0.0, 10.0]))
+  second = (np.array([0.0, 20.0]), np.array([2.0, 22.0]))
+  x, mean, half = mean_curve([first, second])
+  assert (x[0], x[-1]) == (0, 10)
+  np.testing.assert_allclose(mean, x + 1)
+  np.testing.assert_allclose(half, 12.7062 * 2**0.5 / 2**0.5, rtol=1e-4)
+  np.testing.assert_array_equal(mean_curve([first])[2], 0)

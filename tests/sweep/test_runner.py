@@ -1,0 +1,176 @@
+"""The life of a sweep: jobs that crash, hang or are killed, interrupts, and what a second start does."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from playground.cli import sweep as command
+from playground.errors import CheckpointError, ConfigError
+from playground.sweep.folder import SweepDirectory
+from tests.sweep.helpers import make_sweep, output, run, starts, statuses
+
+CONTROLLER = """
+import sys
+from pathlib import Path
+from playground.sweep.folder import SweepDirectory
+from tests.sweep.helpers import run
+sys.exit(run(SweepDirectory.open(sys.argv[1]), *sys.argv[2:]))
+"""
+
+
+def controller(sweep: SweepDirectory, *settings: str) -> "subprocess.Popen[bytes]":
+  """A process that runs the sweep."""
+  return subprocess.Popen([sys.executable, "-c", CONTROLLER, str(sweep.path), *settings], cwd=Path(__file__).parents[2])
+
+
+def wait_for(what: Callable[[], bool], seconds: float = 30) -> None:
+  until = time.monotonic() + seconds
+  while not what():
+    assert time.monotonic() < until, "what the test waits for does not come"
+    time.sleep(0.05)
+
+
+def alive(pid: int) -> bool:
+  try:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+  except FileNotFoundError:
+    return False
+
+
+def test_whatever_ends_a_job_the_others_go_on(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 10, 11, 12, 0, 1)
+  assert run(sweep, "launcher.timeout=1.5", "launcher.grace=0.5") == 3
+  assert statuses(sweep) == {10: "failed", 11: "timeout", 12: "killed", 0: "finished", 1: "finished"}
+  reasons = [state.reason for state in sweep.states().values()]
+  assert reasons[:3] == [
+    "exit code 1: ValueError: out of luck",
+    "took longer than launcher.timeout=1.5 s",
+    "killed by SIGKILL, perhaps for want of memory",
+  ]
+  assert not alive(starts(sweep)[11][0]["pid"])
+  table = pd.read_csv(sweep.path / "sweep.csv")
+  assert list(table["status"]) == ["failed", "timeout", "killed", "finished", "finished"]
+  assert list(table["final_return"].dropna()) == [1.0, 2.0]
+  assert "[5/5]" in output(sweep) and "000_seed=10 failed" in output(sweep)
+
+
+def test_jobs_share_the_machine(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 15, 15, 0)
+  assert run(sweep) == 0
+  places = [json.loads(line) for job in sweep.jobs for line in (sweep.folder(job).path / "starts.jsonl").open()]
+  first, second, third = sorted(places, key=lambda place: place["began"])
+  assert first["gpus"] == "" and first["WANDB_RUN_GROUP"] == "stub/sweep"
+  if len(os.sched_getaffinity(0)) == 2:  # as many slots
+    assert not set(first["cores"]) & set(second["cores"])
+    assert third["began"] - first["began"] > 1.4, "there was no room for it before"
+
+
+def test_a_second_start_does_only_what_is_missing(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0, 14, 10)
+  assert run(sweep) == 2
+  assert run(SweepDirectory.open(sweep.path)) == 1
+  assert statuses(sweep) == {0: "finished", 14: "finished", 10: "failed"}
+  assert {seed: [start["again"] for start in found] for seed, found in starts(sweep).items()} == {
+    0: [False],
+    14: [False, True],
+    10: [False, True],
+  }
+  assert "1 finished already" in output(sweep)
+
+
+def test_on_error_stop(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 10, 13, 0, 1, 2)
+  assert run(sweep, "on_error=stop", *["launcher.cores_per_job=1"]) == 1
+  found = statuses(sweep)
+  assert found[10] == "failed"
+  assert {found[1], found[2]} == {"queued"}
+  assert run(sweep) == 1, "again, and now the rest is done"
+  assert set(statuses(sweep).values()) == {"failed", "finished"}
+
+
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_saves_and_starts_nothing_more(tmp_path: Path, signum: int, code: int) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 13, 13, 0, 1)
+  process = controller(sweep)
+  folders = [sweep.folder(job).path for job in sweep.jobs]
+  slots = min(2, len(os.sched_getaffinity(0)))
+  wait_for(lambda: sum((folder / "starts.jsonl").is_file() for folder in folders) == slots)
+  time.sleep(0.3)  # let the jobs listen
+  process.send_signal(signum)
+  assert process.wait(30) == code
+  states = [state.status for state in sweep.states().values()]
+  assert states == ["preempted"] * slots + ["queued"] * (4 - slots)
+  assert "goes on" in output(sweep)
+  assert run(sweep) == 0
+  assert set(statuses(sweep).values()) == {"finished"}
+
+
+def test_a_second_interrupt_kills(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 11)
+  process = controller(sweep, "launcher.grace=60")
+  wait_for(lambda: bool(starts(sweep)[11]))
+  time.sleep(0.3)
+  process.send_signal(signal.SIGINT)
+  wait_for(lambda: "asked to stop" in output(sweep))
+  process.send_signal(signal.SIGINT)
+  assert process.wait(20) == 130
+  assert statuses(sweep) == {11: "preempted"}
+  assert not alive(starts(sweep)[11][0]["pid"])
+
+
+def test_jobs_outlive_a_controller_that_is_killed(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 15, 0, 1)
+  process = controller(sweep)
+  wait_for(lambda: bool(starts(sweep)[15]))
+  process.kill()
+  process.wait()
+  assert run(sweep) == 0
+  assert set(statuses(sweep).values()) == {"finished"}
+  assert [len(found) for found in starts(sweep).values()] == [1, 1, 1], "nothing is done twice"
+
+
+def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 15)
+  process = controller(sweep)
+  folder = sweep.folder(sweep.jobs[0])
+  wait_for(lambda: bool(starts(sweep)[15]) and folder.record.get("status") == "running")
+  os.kill(folder.record["pid"], signal.SIGKILL)
+  assert folder.locked() and folder.state().status == "running", "the job itself is still at work"
+  assert process.wait(30) == 0
+  assert folder.state().status == "finished"
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  with sweep.controlled() as ours, pytest.raises(CheckpointError, match="is being run by another process"):
+    assert ours
+    run(sweep)
+
+
+def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(command, "run_sweep", lambda sweep, settings: run(sweep, f"on_error={settings.on_error}"))
+  sweep = make_sweep(tmp_path / "sweep", 0, 14)
+  path = str(sweep.path)
+  assert command.status(path) == 0
+  assert "2 queued" in " ".join(capsys.readouterr().out.split())
+  assert command.retry(path) == 1
+  assert command.retry(path, "on_error=stop") == 0
+  (sweep.path / "sweep.csv").unlink()
+  assert command.collect(path) == 0
+  assert len(pd.read_csv(sweep.path / "sweep.csv")) == 2
+  assert command.stop(path) == 0
+  assert (sweep.path / "stop").exists()
+  with pytest.raises(ConfigError, match="seed=3 cannot be changed in a sweep that has begun"):
+    command.retry(path, "seed=3")
+  with pytest.raises(CheckpointError, match=r"sweeep is not the folder of a sweep.*Did you mean 'sweep'"):
+    command.status(str(tmp_path / "sweeep"))
+
+

@@ -1,0 +1,90 @@
+"""Jobs through submitit: its local executor in place of Slurm, its preemption, and what sbatch would be told."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import submitit
+
+from playground.config import compose_settings
+from playground.errors import ConfigError, HardwareError
+from playground.sweep import slurm
+from playground.sweep.folder import Job
+from playground.sweep.slurm import SlurmLauncher, slurm_parameters
+from tests.sweep.helpers import STUB, make_sweep, run, starts, statuses
+
+
+@pytest.fixture
+def local(monkeypatch: pytest.MonkeyPatch) -> list[SlurmLauncher]:
+  """Makes every Slurm launcher use submitit's local executor; returns those made."""
+  made: list[SlurmLauncher] = []
+
+  class Local(SlurmLauncher):
+    def __init__(self, sweep, config, command):  # pyright: ignore
+      executor = submitit.LocalExecutor(sweep.path.absolute() / "slurm")
+      executor.update_parameters(timeout_min=60, signal_delay_s=1)
+      super().__init__(sweep, config, command, executor)
+      made.append(self)
+
+  monkeypatch.setattr(slurm, "SlurmLauncher", Local)
+  return made
+
+
+def test_jobs_go_through_submitit(tmp_path: Path, local: list[SlurmLauncher]) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0, 10)
+  assert run(sweep, "launcher=slurm", "launcher.max_parallel=2") == 1
+  assert statuses(sweep) == {0: "finished", 10: "failed"}
+  assert run(sweep, "launcher=slurm") == 1
+  assert [len(found) for found in starts(sweep).values()] == [1, 2]
+
+
+def test_a_preempted_job_saves_is_queued_again_and_resumes(tmp_path: Path, local: list[SlurmLauncher]) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 13)
+  settings = compose_settings(["launcher=slurm"])
+  launcher = slurm.SlurmLauncher(sweep, settings.launcher, STUB)
+  (job,) = sweep.jobs
+  assert launcher.start(job)
+  until = time.monotonic() + 40
+  while not starts(sweep)[13]:
+    assert time.monotonic() < until
+    time.sleep(0.05)
+  time.sleep(0.3)  # let it listen
+  os.kill(sweep.folder(job).record["pid"], signal.SIGUSR2)  # as Slurm does, for submitit to handle
+  while launcher.busy(job):
+    assert time.monotonic() < until + 40, statuses(sweep)
+    time.sleep(0.1)
+  assert statuses(sweep) == {13: "finished"}
+  assert [start["again"] for start in starts(sweep)[13]] == [False, True]
+
+
+def test_submitting_without_waiting(tmp_path: Path, local: list[SlurmLauncher]) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  assert run(sweep, "launcher=slurm", "launcher.wait=false") == 0
+  until = time.monotonic() + 40
+  while statuses(sweep) != {0: "finished"}:
+    assert time.monotonic() < until
+    time.sleep(0.1)
+  assert run(sweep, "launcher=slurm", "launcher.wait=false") == 0
+  assert len(starts(sweep)[0]) == 1
+
+
+def test_what_sbatch_is_told() -> None:
+  config = compose_settings(["launcher=slurm", "launcher.partition=gpu", "launcher.minutes=90"]).launcher
+  told = slurm_parameters(config, Job("a", [], {}, needs=2))
+  assert (told["gpus_per_node"], told["time"], told["mem"], told["partition"]) == (2, 90, "32GB", "gpu")
+  assert told["signal_delay_s"] > config.grace
+  assert "account" not in told
+  assert slurm_parameters(config, Job("a", [], {}))["gpus_per_node"] == 1
+  assert "gpus_per_node" not in slurm_parameters(config, Job("a", [], {}, needs=0))
+  executor = submitit.SlurmExecutor.__new__(submitit.SlurmExecutor)
+  assert set(told) <= set(executor._valid_parameters()), "submitit knows them all"
+
+
+def test_without_slurm(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  with pytest.raises(HardwareError, match="there is no sbatch here"):
+    run(sweep, "launcher=slurm")
+  with pytest.raises(ConfigError, match=r"leave launcher\.max_parallel out"):
+    run(sweep, "launcher=slurm", "launcher.wait=false", "launcher.max_parallel=3")
