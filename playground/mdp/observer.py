@@ -1,5 +1,6 @@
 """Puts observations together: their parts, the noise on them, and what they keep of the steps before."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -7,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from playground.errors import ConfigError
-from playground.mdp.legged import Context
 from playground.mdp.lookup import lookup
 from playground.mdp.noise import add_noise
 from playground.mdp.observations import OBSERVATIONS
 
 ACTOR = "state"  # the observation of what the robot's own sensors tell: noisy; the others are exact
+
+Parts = Mapping[str, Callable[[Any], jax.Array]]  # part by name, a function of the present moment
 
 # Parts that a robot computes from another: they carry its noise.
 _COMPUTED_FROM = {"target_error": "joint_pos"}
@@ -30,23 +32,24 @@ class Observer:
     looks_back: whether an observation needs the last one.
   """
 
-  def __init__(self, config: Any, parity: bool):
+  def __init__(self, config: Any, parity: bool, functions: Parts = OBSERVATIONS):
     """Binds the parts that the task's config names.
 
     Args:
-      config: the task's ConfigDict. It has `obs`, `parity_obs` and `noise`; it may have `obs_scales` (factors on
+      config: the task's ConfigDict. It has `obs` and `noise`; it may have `parity_obs`, `obs_scales` (factors on
         parts), `history` and `frames`.
       parity: whether the slips of Playground 0.2.0 in `parity_obs` and `noise.parity_shared` count.
+      functions: the parts to choose from, by name: functions of the present moment.
 
     Raises:
       UnknownNameError: a part that does not exist.
       ConfigError: a number of steps below 1.
     """
-    slips = {name: config.parity_obs[name] for name in config.parity_obs}
+    slips = dict(config.get("parity_obs", {}))
     for name, other in slips.items():
-      lookup(OBSERVATIONS, name if other is None else other, "env.parity_obs")
+      lookup(functions, name if other is None else other, "env.parity_obs")
     slips = slips if parity else {}
-    self._parts = OBSERVATIONS | {name: OBSERVATIONS[other] for name, other in slips.items() if other}
+    self._parts = {**functions, **{name: functions[other] for name, other in slips.items() if other}}
     scales, history = config.get("obs_scales", {}), config.get("history", {})
     for key, names in (("obs_scales", scales), ("history", history)):
       for name in names:
@@ -78,7 +81,7 @@ class Observer:
     self._shared = shared if parity else ()
     self._noise_in_histories: bool = noise.get("in_histories", True)
 
-  def sizes(self, now: Context) -> dict[str, dict[str, int]]:
+  def sizes(self, now: Any) -> dict[str, dict[str, int]]:
     """Returns the length of each part, by observation; of frames the newest, with the others' under `past_frames`."""
     names = {part for parts in self._groups.values() for part in parts} - {ACTOR}
     sizes = {}
@@ -94,7 +97,7 @@ class Observer:
       for group, parts in self._groups.items()
     }
 
-  def observe(self, now: Context, rng: jax.Array, last: Any = None) -> tuple[jax.Array, Any]:
+  def observe(self, now: Any, rng: jax.Array, last: Any = None) -> tuple[jax.Array, Any]:
     """Observes the present.
 
     Args:
@@ -124,7 +127,13 @@ class Observer:
         obs[group] = jnp.concatenate([obs[part] if part in obs else self._part(now, part) for part in parts])
     return rng, obs[ACTOR] if len(obs) == 1 else obs
 
-  def _part(self, now: Context, name: str) -> jax.Array:
+  def skip(self, rng: jax.Array) -> jax.Array:
+    """The random key that `observe` returns, without observing: for what is drawn after it and must be known before."""
+    for _ in self._noise:
+      rng, _ = jax.random.split(rng)
+    return rng
+
+  def _part(self, now: Any, name: str) -> jax.Array:
     value = self._parts[name](now)
     return value * self._factors[name] if name in self._factors else value
 

@@ -1,4 +1,4 @@
-"""Pushes against a robot's body, and when they come: forces for a while (kicks), or jumps of its velocity."""
+"""Pushes against a body, and when they come: forces for a while (kicks, wrenches), or jumps of its velocity."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -70,6 +70,10 @@ class RegularKicks(Kicks):
   (Playground 0.2.0, Barkour.)
   """
 
+  def direction(self, key: jax.Array) -> jax.Array:
+    """Draws which way a kick pushes, a unit vector in the world frame: horizontal, [3]."""
+    return _horizontal(key)
+
   def start(self, keys: Mapping[str, jax.Array], mass: jax.Array) -> Info:
     steps = lambda key, reach: jax.random.randint(keys[key], (), *(round(time / self.dt) for time in reach))
     low, high = self.velocity
@@ -88,11 +92,36 @@ class RegularKicks(Kicks):
     since = info["push_step"] % info["pert_interval"]
     starting = (since == 0) & (info["push_step"] > 0)
     rng, key = jax.random.split(info["rng"])
-    direction = jnp.where(starting, _horizontal(key), info["pert_dir"])
+    direction = jnp.where(starting, self.direction(key), info["pert_dir"])
     force = kick_force(since * self.dt, info["pert_mass"], info["pert_mag"], info["pert_duration"] * self.dt)
     force = jnp.where(since < info["pert_duration"], force, 0.0) * direction
     changed = {"rng": jnp.where(starting, rng, info["rng"]), "push_step": info["push_step"] + 1, "pert_dir": direction}
-    return data.replace(xfrc_applied=data.xfrc_applied.at[self.root, :3].set(force)), changed
+    return data.replace(xfrc_applied=data.xfrc_applied.at[self.root, : force.size].set(force)), changed
+
+
+@dataclasses.dataclass(frozen=True)
+class Wrenches(RegularKicks):
+  """As `RegularKicks`, but forces and torques on a loose object, in any direction. (Playground 0.2.0, LEAP hand.)
+
+  Attributes:
+    angular_velocity: range of the torques' strength, rad/s (a torque is that of a body of 1 m radius of gyration).
+    parity: as Playground 0.2.0, both strengths come from one draw.
+  """
+
+  angular_velocity: Sequence[float]
+  parity: bool = False
+
+  def direction(self, key: jax.Array) -> jax.Array:
+    """Draws a unit vector of force and torque together, world frame, [6]."""
+    vector = jax.random.normal(key, (6,))
+    return vector / jnp.linalg.norm(vector)
+
+  def start(self, keys: Mapping[str, jax.Array], mass: jax.Array) -> Info:
+    info = super().start(keys, mass)
+    key = keys["push_velocity"]
+    low, high = self.angular_velocity
+    turn = jax.random.uniform(key if self.parity else jax.random.fold_in(key, 1), minval=low, maxval=high)
+    return info | {"pert_mag": jnp.repeat(jnp.array([info["pert_mag"], turn]), 3), "pert_dir": jnp.zeros(6)}
 
 
 @dataclasses.dataclass(frozen=True)

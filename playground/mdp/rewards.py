@@ -21,7 +21,7 @@ from playground.mdp.legged import Context
 from playground.mdp.lookup import lookup
 from playground.mdp.stances import STANCES
 
-Term = Callable[[Context], jax.Array]
+Term = Callable[[Any], jax.Array]  # of the present moment: a `Context`, of a robot on legs or of a hand
 
 # The reward from the sums of weighted terms of positive and of negative weight; times the control step.
 TOTALS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {

@@ -8,6 +8,7 @@ are attached, the world's own geoms before all; keyframes and sensors speak of t
 from collections.abc import Callable
 
 import mujoco
+import numpy as np
 
 from playground.errors import UnknownNameError, nearest
 from playground.robots.scene import ROBOTS, add_studio
@@ -82,6 +83,13 @@ def add_contact_sensor(spec: mujoco.MjSpec, geom: str, other: str, *, name: str 
   )
 
 
+def contact_addresses(model: mujoco.MjModel, geom: str) -> np.ndarray:
+  """Where in `sensordata` the `found` sensors of a geom's contacts are, in the sensors' order: shape [sensors]."""
+  of_contacts = (model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & (model.sensor_dim == 1)
+  this = model.geom(geom).id
+  return model.sensor_adr[of_contacts & ((model.sensor_objid == this) | (model.sensor_refid == this))]
+
+
 def _panda() -> mujoco.MjSpec:
   """The Panda with its own hand."""
   spec = load("panda/arm")
@@ -153,6 +161,18 @@ def _panda_single_cube_camera() -> mujoco.MjSpec:
   return spec
 
 
+def _panda_single_cube_pixels() -> mujoco.MjSpec:
+  """The same as a camera should see it: a dark floor that shows the strip, a sun, and the target out of sight."""
+  spec = _panda_single_cube_camera()
+  floor = spec.geom("floor")
+  floor.material, floor.rgba = "", [0.125, 0.125, 0.125, 1]
+  spec.body("mocap_target").geoms[0].rgba = [0, 0, 0, 0]  # the ray caster knows no other transparency than all of it
+  light = spec.light("top")
+  light.type, light.mode = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+  light.pos, light.dir = [2.25, 0, 1.15], [-1.589, -0.001, -0.971]
+  return spec
+
+
 def _panda_cabinet() -> mujoco.MjSpec:
   """A drawer to open, from an arm stretched upwards."""
   spec = _panda()
@@ -210,6 +230,7 @@ def _drive_by_torque(spec: mujoco.MjSpec) -> None:
 TABLETOPS: dict[str, Callable[[], mujoco.MjSpec]] = {
   "panda_single_cube": _panda_single_cube,
   "panda_single_cube_camera": _panda_single_cube_camera,
+  "panda_single_cube_pixels": _panda_single_cube_pixels,
   "panda_cabinet": _panda_cabinet,
   "panda_robotiq_cube": _panda_robotiq_cube,
 }

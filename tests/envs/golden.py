@@ -6,6 +6,7 @@ A file `tests/golden/<Task>.npz` holds T + 1 records of data, info, obs, ... and
 
 import functools
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,11 @@ from playground.envs.base import Env, State
 from playground.envs.dm_control.suite import SuiteTask
 from playground.envs.locomotion.joystick import Joystick
 from playground.envs.locomotion.stand import Stand
+from playground.envs.manipulation.arm import ArmTask
+from playground.envs.manipulation.bimanual import Bimanual
+from playground.envs.manipulation.in_hand import InHand
+from playground.envs.manipulation.pick_cartesian import PickCubeCartesian
+from playground.envs.manipulation.push import PushCube
 from playground.envs.physics import STATE_FIELDS
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -31,9 +37,20 @@ _OVERRIDES = {
   "pert_config.enable": "pushes.enable",
   "velocity_kick": "pushes.velocity",
   "push_config.enable": "pushes.enable",
+  "noise_config.action_max_delay": "delays.action_max",
+  "noise_config.obs_max_delay": "delays.obs_max",
 }
 _UNREAD_INFO = {  # upstream has it, nothing reads it
+  PickCubeCartesian: {"info/_steps", "metrics/reward/no_box_collision"},
+  PushCube: {"info/prev_step_success", "info/angle_curriculum", "info/pos_curriculum"},
+  ArmTask: {"info/target_mat", "info/previously_gripped"},
   SuiteTask: {"info/rng", "info/time_out"},
+  Bimanual: {"info/target_pos", "info/_steps"},
+  InHand: {
+    *("info/step", "info/motor_targets", "info/last_cube_angvel", "info/last_pert_step"),
+    *("info/qpos_error_history", "info/cube_pos_error_history", "info/cube_ori_error_history", "info/success_count"),
+    *("metrics/success_count", "metrics/steps_since_last_success"),
+  },
   Stand: {"info/step"},
   Joystick: {
     *("info/step", "info/motor_targets", "info/filtered_linvel", "info/filtered_angvel", "info/lin_vel"),
@@ -41,21 +58,44 @@ _UNREAD_INFO = {  # upstream has it, nothing reads it
     *("info/left_contact", "info/right_contact"),
   },
 }
+_UNPREFIXED = (  # names of rewards that upstream logs without `reward/`
+  *("gripper_box", "box_target", "robot_target_qpos", "no_floor_collision", "no_barrier_collision"),
+  *("box_handover", "handover_target", "no_table_collision", "left_reward", "right_reward", "left_target_qpos"),
+  *("right_target_qpos", "socket_z_up", "peg_z_up", "socket_entrance_reward", "peg_end2_reward"),
+  *("peg_insertion_reward", "action_rate", "box_orientation", "gripper_collision_side", "joint_vel"),
+  *("joint_vel_limit", "total_command"),
+)
 _RENAMED = {  # upstream's names for what others of its tasks call otherwise
   "info/vel_kick": "info/pert_mag",
   "info/direction": "info/pert_dir",
   "info/kick_dir": "info/pert_dir",
   "info/kick_duration_steps": "info/pert_duration",
   "info/kick_wait_steps": "info/pert_interval",
+  "info/pert_vel": "info/pert_mag",
+  "info/pert_duration_steps": "info/pert_duration",
+  "info/pert_wait_steps": "info/pert_interval",
+  "info/goal_quat_dquat": "info/goal_spin",
+  "info/prev_potential": "info/best_potential",
+  "info/prev_reward": "info/best_reward",
+  "info/prev_action": "info/last_act",
+  "info/last_action": "info/last_act",
+  "info/curriculum_id": "info/AutoResetWrapper_preserve_info/curriculum_id",
+  "info/episode_picked": "info/picked",
+  "info/steps_since_last_success": "info/steps_since_success",
+  **{f"metrics/{term}": f"metrics/reward/{term}" for term in _UNPREFIXED},
 }
-_NOT_UPSTREAM = {  # what our general classes carry, and some of upstream's tasks do not
+_NOT_UPSTREAM = {  # what our general classes carry, and some of upstream's tasks do not; metrics beside
+  InHand: {"info/rng", "info/push_step", "info/pert_mass", "info/stuck"},
+  PickCubeCartesian: {"info/action_delay", "info/no_solution"},
+  PushCube: {"info/action_delay", "info/goals_reached"},
   Joystick: {
     *("info/gait", "info/gait_freq", "info/last_last_act"),
-    *("info/feet_air_time", "info/swing_peak", "info/last_contact", "metrics/swing_peak", "info/command", "info/step"),
+    *("info/feet_air_time", "info/swing_peak", "info/last_contact", "info/command", "info/step"),
     *("info/steps_until_next_pert", "info/steps_since_last_pert", "info/pert_steps", "info/pert_duration"),
     *("info/pert_duration_seconds", "info/pert_mag", "info/pert_dir", "info/pert_mass", "info/push_step"),
   },
 }
+_UNUSED_KEYS = {"AeroCubeRotateZAxis"}  # whose observations split off keys that nothing is drawn from
 _PROGRAMS: dict[Any, Any] = {}  # compiled physics by structure of the model and fields that are kept
 BATCH = 8  # T of all recordings
 KEYS = jnp.stack([jax.random.PRNGKey(seed) for seed in range(BATCH)])
@@ -92,15 +132,22 @@ class Golden:
     with np.load(GOLDEN / f"{name}.npz") as file:
       self._arrays: dict[str, np.ndarray] = {_RENAMED.get(key, key): file[key] for key in map(str, file.files)}
     header = json.loads(str(self._arrays.pop("header")))
-    silent = [key for key in header["overrides"] if key.startswith("obs_noise.scales.")]  # all of them are 0
+    silent = [key for key in header["overrides"] if "noise" in key and "scales." in key]  # all of them are 0
     overrides = {_OVERRIDES[key]: value for key, value in header["overrides"].items() if key not in silent}
     overrides |= {"noise.level": 0.0} if silent else {}
+    if name in _UNUSED_KEYS:
+      del self._arrays["info/rng"]
     self.name = name
     self.env: Env = compiled_task(name, {**overrides, "parity": True})
+    if isinstance(self.env, ArmTask):  # upstream logs their rewards before they are weighted
+      for term, scale in self.env.config.reward.scales.items():
+        if (key := f"metrics/reward/{term}") in self._arrays:
+          self._arrays[key] = self._arrays[key] * scale
     for key in self._arrays.keys() & _ROWS.keys():
       self._arrays[key] = self._our_rows(self._arrays[key], _ROWS[key], header["model"])
     self.actions = jnp.array(self._arrays.pop("action"))
     self._ours = jax.eval_shape(self.env.reset, KEYS[0])
+    self._default = self.env.physics.make()
     states: State = jax.tree_util.tree_map_with_path(self._recorded, self._ours)
     # Tied to a device as what the task computes is, else its program would be compiled again.
     self.states = jax.device_put(states, jax.devices()[0])
@@ -114,10 +161,13 @@ class Golden:
     name = _name(path)
     shape = (len(self.actions) + 1, *ours.shape)
     if name in self._arrays:
-      return jnp.array(self._arrays[name]).reshape(shape)  # one number upstream may be a list of one
-    # Recordings leave out state that is empty or all zero. Anything else that we have, upstream had.
-    state = name.startswith("data/") and name.removeprefix("data/") in STATE_FIELDS
-    assert state or name in _of_class(_NOT_UPSTREAM, self.env), f"{name} was not recorded"
+      recorded = self._arrays[name].reshape(shape[0], -1)  # one number upstream may be a list of one
+      newest = math.prod(ours.shape) if name.endswith("_history") else None  # upstream keeps more than it reads
+      return jnp.array(recorded[:, :newest]).reshape(shape)
+    # Recordings leave out state that is the model's default. Anything else that we have, upstream had.
+    if name.startswith("data/") and (field := name.removeprefix("data/")) in STATE_FIELDS:
+      return jnp.broadcast_to(getattr(self._default, field), shape)
+    assert self._only_ours(name), f"{name} was not recorded"
     return jnp.zeros(shape, ours.dtype)
 
   def _our_rows(self, recorded: np.ndarray, kind: str, names: Mapping[str, list[Any]]) -> np.ndarray:
@@ -145,15 +195,19 @@ class Golden:
       and not (name.startswith("metrics/") and not values.any())
     ]
 
+  def _only_ours(self, name: str) -> bool:
+    """Whether upstream has no such entry, and need not have: we log more."""
+    more = name.startswith("metrics/") or name in _of_class(_NOT_UPSTREAM, self.env)
+    return more and name not in self._arrays
+
   def pairs(self, actual: State, expected: State) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """The recorded leaves of two states as (name, actual, expected), NaN where nothing was recorded.
 
     Floats are in double precision.
     """
-    unrecorded = {name for name in _of_class(_NOT_UPSTREAM, self.env) if name not in self._arrays}
     leaves = jax.tree_util.tree_flatten_with_path(actual)[0]
     for (path, a), b in zip(leaves, jax.tree.leaves(expected), strict=True):
-      if _name(path) not in unrecorded:
+      if not self._only_ours(_name(path)):
         theirs = np.asarray(b, np.float64)
         yield _name(path), np.where(np.isnan(theirs), np.nan, np.asarray(a, np.float64)), theirs
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from playground.errors import UnknownNameError
-from playground.robots.tabletop import TABLETOPS, build_tabletop
+from playground.robots.tabletop import TABLETOPS, build_tabletop, contact_addresses
 from tests.robots.figures import figures
 
 
@@ -84,6 +84,14 @@ def test_robotiq_feels_the_block() -> None:
   normal = data.sensor("left_coupler_col_1_box_normal").data
   np.testing.assert_allclose(np.linalg.norm(normal), 1, atol=1e-6)
   assert normal[2] < -0.9  # from the finger down to the block
+
+
+def test_where_a_geoms_contacts_are() -> None:
+  model = build_tabletop("panda_robotiq_cube").compile()
+  assert contact_addresses(model, "wall").tolist() == [18, 19, 20]  # after six normals
+  assert contact_addresses(model, "floor").tolist() == [21, 22, 23]
+  assert contact_addresses(model, "box").tolist() == []  # those are normals
+  assert contact_addresses(build_tabletop("panda_single_cube").compile(), "box").tolist() == [3]
 
 
 def test_materials_and_light_to_randomise() -> None:

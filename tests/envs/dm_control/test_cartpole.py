@@ -5,9 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from playground.envs.dm_control.cartpole import Cartpole
+from playground import registry
+from playground.envs.dm_control.cartpole import Cartpole, CartpoleVision
+from playground.errors import ConfigError
 from tests.envs.dm_control.states import state_at
 from tests.envs.golden import load_task
+
+UNSEEN = {"vision.enable": False}
 
 TERMS = {
   "CartpoleBalance": {f"reward/{name}" for name in ("upright", "centered", "small_control", "small_velocity")},
@@ -51,3 +55,32 @@ def test_initial_velocity_is_independent_of_the_position(parity: bool) -> None:
   correlation = np.corrcoef(qpos[:, 0], qvel[:, 0])[0, 1]
   assert (correlation > 0.99) if parity else (abs(correlation) < 0.15)
   np.testing.assert_allclose([qpos[:, 1].mean(), qpos[:, 1].std()], [np.pi, 0.01], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+  ("fields", "action", "reward", "done"),
+  [
+    ({}, 0.0, 0.1, 0),
+    ({"qpos": [1.0, 0.0], "qvel": [-2.0, 3.0]}, -0.5, 0.1 - 0.02 - 0.02 - 0.015 - 0.0025, 0),
+    ({"qpos": [0.0, np.pi / 3]}, 0.0, 0.1 - 0.25, 0),
+    ({"qpos": [0.0, -1.6]}, 0.0, 0.1 - (1 - np.cos(1.6)) ** 2, 1),
+    ({"qpos": [-3.1, 0.0]}, 0.0, 0.1 - 0.02 * 3.1**2, 1),
+  ],
+)
+def test_what_the_task_for_pixels_pays(fields: dict[str, list[float]], action: float, reward: float, done: int) -> None:
+  env = load_task("CartpoleBalanceVision", UNSEEN)
+  state = env.evaluate(state_at(env, **fields), {}, jnp.array([action]))
+  np.testing.assert_allclose(state.reward, reward, atol=1e-6)
+  np.testing.assert_allclose(sum(state.metrics.values()), reward, atol=1e-6)
+  assert state.done == done
+
+
+def test_a_control_step_of_the_task_for_pixels() -> None:
+  tasks = [load_task("CartpoleBalanceVision", {**UNSEEN, "parity": parity}) for parity in (False, True)]
+  assert [(env.dt, env.n_substeps, env.episode_length) for env in tasks] == [(0.02, 2, 250), (0.01, 1, 250)]
+
+
+def test_a_hanging_pole_would_end_the_task_for_pixels() -> None:
+  assert registry.task_class(str(registry.config("CartpoleBalanceVision").task)) is CartpoleVision
+  with pytest.raises(ConfigError, match=r"env.swing_up and env.sparse must be false"):
+    registry.load("CartpoleBalanceVision", overrides={**UNSEEN, "swing_up": True})

@@ -23,7 +23,7 @@ OBSERVATION_SIZE = {
 
 def test_the_25_tasks() -> None:
   of_the_suite = lambda name: str(registry.config(name).task).startswith("playground.envs.dm_control.")
-  ours = {name for name in registry.names() if of_the_suite(name)}
+  ours = {name for name in registry.names() if of_the_suite(name) and name != "CartpoleBalanceVision"}
   assert ours == OBSERVATION_SIZE.keys() == DOMAIN.keys()
 
 
