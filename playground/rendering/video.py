@@ -140,7 +140,7 @@ def _render(trajectory: Path, out_path: Path) -> None:
   model = mujoco.MjModel.from_binary_path(str(trajectory.with_suffix(".mjb")))
   data = mujoco.MjData(model)
   width, height, dt = int(saved["width"]), int(saved["height"]), float(saved["dt"])
-  camera = _camera(model, str(saved["camera"]) if "camera" in saved else None)
+  camera = choose_camera(model, str(saved["camera"]) if "camera" in saved else None)
   finite = np.isfinite(saved["qpos"]).all(axis=1)
   length = len(finite) if finite.all() else int(finite.argmin())
   if length == 0:
@@ -173,7 +173,7 @@ def _render(trajectory: Path, out_path: Path) -> None:
   writer.close()
 
 
-def _camera(model: Any, name: str | None) -> Any:
+def choose_camera(model: Any, name: str | None = None) -> Any:
   """Returns the named camera, or the best one the model offers for looking at it from outside."""
   import mujoco
 

@@ -1,0 +1,109 @@
+"""What a camera sees, as an observation of any task."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from playground.envs.base import PIXELS, Env, State
+from playground.envs.physics import PhysicsData, mjx
+from playground.envs.wrappers import Wrapper
+from playground.errors import ConfigError, nearest
+from playground.rendering.batch import BatchRenderer, View, camera_names
+
+_CHANNELS = {"rgb": 3, "gray": 1, "depth": 1}
+
+
+class Vision(Wrapper):
+  """Adds the observation `pixels/<camera>` to a task's own: uint8 [height, width, channels].
+
+  Which of them an agent reads is its own choice (`agent.network.policy_obs_key`). Like the task it is for one
+  environment. A picture shows the state that it comes with. With `frames` above 1 the last ones lie behind each other,
+  the newest last; the past is read out of the last observation, so it begins anew with every episode: before an
+  episode's first picture there were only pictures like it. Brightness, a factor on all pixels, is drawn for every
+  episode; an auto-reset, which brings the first observation back, brings back that one's brightness for this step.
+
+  `env.parity=true` keeps what Playground 0.2.0 lets pass from one episode to the next: frames, and brightness for ever.
+  """
+
+  jitted, observation_size = Env.jitted, Env.observation_size
+
+  def __init__(self, env: Env):
+    """`env`: a task whose config has `vision`, see `configs/config.yaml`.
+
+    Raises:
+      ConfigError: no camera, one that does not exist, or settings that cannot be.
+    """
+    super().__init__(env)
+    config = env.config.vision
+    cameras = camera_names(env.mj_model)
+    if config.camera not in cameras:
+      have = f"the task has {', '.join(cameras)}" if cameras else "the task has none"
+      near = nearest(str(config.camera), cameras)
+      raise ConfigError(f"env.vision.camera={config.camera} is no camera of the model; {have}.{near}")
+    brightness = tuple(config.brightness)
+    if len(brightness) != 2 or not 0 <= brightness[0] <= brightness[1]:
+      raise ConfigError(f"env.vision.brightness={list(brightness)} must be two factors, 0 or more, the lower first.")
+    self._image, self._camera, self._farthest = config.image, config.camera, config.farthest
+    self._frames, self._brightness = config.frames, brightness
+    self._leaks: bool = env.parity and self._frames > 1
+    size = {"width": config.width, "height": config.height}
+    kind = "depth" if self._image == "depth" else "rgb"
+    looks = {"shadows": config.shadows, "textures": config.textures}
+    self._renderer = BatchRenderer(env.physics, View((config.camera,), kinds=(kind,), **size, **looks))
+
+  @property
+  def observation_parts(self) -> dict[str, dict[str, int]]:
+    frame = {f"{self._image}[{age}]": _CHANNELS[self._image] for age in range(1 - self._frames, 1)}
+    return self.env.observation_parts | {PIXELS + self._camera: frame}
+
+  def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
+    state = self.env.reset(rng, model)
+    info = state.info
+    if self._varies:
+      key, draw = jax.random.split(jax.random.fold_in(rng, 1))  # leaves the task its own draws
+      info = info | {"vision_rng": key, "brightness": self._draw(draw)}
+    frame, data = self._look(state.data, info, model)
+    frames = jnp.tile(frame, self._frames)
+    if self._leaks:
+      info = info | {"vision_frames": frames}
+    return self._with(state.replace(data=data, info=info), frames)
+
+  def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
+    if self._varies and not self.env.parity:
+      key, draw = jax.random.split(state.info["vision_rng"])
+      brightness = jnp.where(state.data.time == 0, self._draw(draw), state.info["brightness"])
+      state = state.replace(info=state.info | {"vision_rng": key, "brightness": brightness})
+    after = self.env.step(state, action, model)
+    frame, data = self._look(after.data, after.info, model)
+    past = state.info["vision_frames"] if self._leaks else state.obs[PIXELS + self._camera]
+    frames = jnp.concatenate([past[..., frame.shape[-1] :], frame], axis=-1)
+    info = after.info | ({"vision_frames": frames} if self._leaks else {})
+    return self._with(after.replace(data=data, info=info), frames)
+
+  @property
+  def _varies(self) -> bool:
+    return self._brightness != (1, 1)
+
+  def _draw(self, key: jax.Array) -> jax.Array:
+    return jax.random.uniform(key, minval=self._brightness[0], maxval=self._brightness[1])
+
+  def _look(self, data: PhysicsData, info: Mapping[str, Any], model: mjx.Model | None) -> tuple[jax.Array, PhysicsData]:
+    """The picture of now, [height, width, channels] uint8, and the state to go on with."""
+    pictures, data = self._renderer.render(self.env.mjx_model if model is None else model, data)
+    seen = pictures[self._camera]
+    if self._image == "depth":
+      frame = 255 * jnp.minimum(seen["depth"][..., None] / self._farthest, 1.0)
+    elif self._image == "gray":
+      frame = seen["rgb"].astype(jnp.float32).mean(axis=-1, keepdims=True)
+    else:
+      frame = seen["rgb"]
+    if self._varies:
+      frame = jnp.minimum(frame * info["brightness"], 255)
+    return (frame if frame.dtype == jnp.uint8 else jnp.round(frame).astype(jnp.uint8)), data
+
+  def _with(self, state: State, frames: jax.Array) -> State:
+    """The state with the pictures in its observation."""
+    own = state.obs if isinstance(state.obs, Mapping) else {"state": state.obs}
+    return state.replace(obs={**own, PIXELS + self._camera: frames})

@@ -1,0 +1,126 @@
+"""Convolutional networks for observations that are pictures."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import linen
+
+from playground.envs.base import PIXELS
+from playground.errors import ConfigError, nearest
+
+_POOLS: dict[str, Callable[[jax.Array], jax.Array]] = {
+  "none": lambda x: x.reshape(*x.shape[:-3], -1),
+  "avg": lambda x: x.mean(axis=(-3, -2)),
+  "max": lambda x: x.max(axis=(-3, -2)),
+  "spatial_softmax": lambda x: _expected_places(x),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class CNNConfig:
+  """Layers of a CNN, and what is done before and after them (paper, appendix C.6; Mnih et al., 2015)."""
+
+  channels: Sequence[int] = (16, 32)
+  kernels: Sequence[int] = (5, 3)  # pixels, square
+  strides: Sequence[int] = (2, 2)
+  activation: str = "elu"
+  max_pool: bool = True  # the largest of 2 x 2 pixels after each layer
+  global_pool: str = "none"  # of the last layer: none (all of it), avg, max, spatial_softmax
+  normalize_channels: bool = False  # each channel of a picture to mean 0 and deviation 1
+
+  def check(self, activations: Mapping[str, Any]) -> None:
+    """Raises ConfigError for what cannot be."""
+    lengths = {len(self.channels), len(self.kernels), len(self.strides)}
+    if len(lengths) != 1 or not lengths.isdisjoint({0}):
+      raise ConfigError("agent.network.cnn.channels, kernels and strides must have one entry for each layer.")
+    for name, value, known in (("activation", self.activation, activations), ("global_pool", self.global_pool, _POOLS)):
+      if value not in known:
+        near = nearest(value, known)
+        raise ConfigError(f"agent.network.cnn.{name}={value!r} must be one of {', '.join(known)}.{near}")
+
+
+class CNN(linen.Module):
+  """Features, [..., F], of pictures [..., height, width, channels] uint8."""
+
+  config: CNNConfig
+  activation: Callable[[jax.Array], jax.Array]
+  dtype: Any = jnp.float32
+
+  @linen.compact
+  def __call__(self, pixels: jax.Array) -> jax.Array:
+    config = self.config
+    x = pixels.astype(self.dtype) / 255 - 0.5
+    if config.normalize_channels:
+      x = linen.LayerNorm(use_scale=False, use_bias=False, reduction_axes=(-3, -2), feature_axes=-1, epsilon=1e-6)(x)
+    init = linen.initializers.orthogonal(2**0.5)
+    for i, (channels, size, stride) in enumerate(zip(config.channels, config.kernels, config.strides, strict=True)):
+      conv = linen.Conv(channels, (size, size), stride, "SAME", kernel_init=init, dtype=self.dtype, name=f"conv_{i}")
+      x = self.activation(conv(x))
+      if config.max_pool:
+        x = linen.max_pool(x, (2, 2), (2, 2), "SAME")
+    return _POOLS[config.global_pool](x)
+
+
+class PixelNetwork(linen.Module):
+  """An MLP on the features of pictures, a CNN for each camera, and on a vector beside them if there is one.
+
+  Attributes:
+    cnn: of each camera.
+    cnn_activation: the CNNs'.
+    hidden_layer_sizes: of the MLP.
+    activation: the MLP's.
+    output_size: length of the result.
+    output_init: of the last layer.
+    dtype: of what is computed on the way; parameters and result are float32.
+  """
+
+  cnn: CNNConfig
+  cnn_activation: Callable[[jax.Array], jax.Array]
+  hidden_layer_sizes: Sequence[int]
+  activation: Callable[[jax.Array], jax.Array]
+  output_size: int
+  output_init: Callable[..., jax.Array] = jax.nn.initializers.lecun_uniform()
+  dtype: Any = jnp.float32
+
+  @linen.compact
+  def __call__(self, pictures: Mapping[str, jax.Array], vector: jax.Array | None) -> jax.Array:
+    """The result, [..., output_size], for pictures [..., H, W, C] by camera and a vector [..., D]."""
+    make = lambda key: CNN(self.cnn, self.cnn_activation, self.dtype, name=key.replace("/", "_"))
+    features = [make(key)(pictures[key]) for key in sorted(pictures)]
+    hidden = jnp.concatenate([*features, *([] if vector is None else [vector.astype(self.dtype)])], axis=-1)
+    init = jax.nn.initializers.lecun_uniform()
+    for i, size in enumerate(self.hidden_layer_sizes):
+      hidden = self.activation(linen.Dense(size, dtype=self.dtype, kernel_init=init, name=f"hidden_{i}")(hidden))
+    return linen.Dense(self.output_size, dtype=jnp.float32, kernel_init=self.output_init, name="output")(hidden)
+
+
+def random_shift(obs: dict[str, jax.Array], shifts: jax.Array, pad: int) -> dict[str, jax.Array]:
+  """Moves pictures by whole pixels, repeating their edges (Yarats et al., 2021).
+
+  Args:
+    obs: entries of an observation; pictures are [..., B, H, W, C].
+    shifts: [B, 2] in 0 .. 2 * pad, rows and columns; `pad` is no shift.
+    pad: the largest shift.
+  """
+
+  def shift(picture: jax.Array, start: jax.Array) -> jax.Array:
+    padded = jnp.pad(picture, ((pad, pad), (pad, pad), (0, 0)), mode="edge")
+    return jax.lax.dynamic_slice(padded, (*start, 0), picture.shape)
+
+  def each(x: jax.Array) -> jax.Array:
+    starts = jnp.broadcast_to(shifts, (*x.shape[:-3], 2)).reshape(-1, 2)
+    return jax.vmap(shift)(x.reshape(-1, *x.shape[-3:]), starts).reshape(x.shape)
+
+  return {key: each(x) if key.startswith(PIXELS) else x for key, x in obs.items()}
+
+
+def _expected_places(x: jax.Array) -> jax.Array:
+  """Where each channel is strongest, in [-1, 1]: [..., 2 C] of [..., H, W, C] (Levine et al., 2016)."""
+  height, width, channels = x.shape[-3:]
+  weights = jax.nn.softmax(x.reshape(*x.shape[:-3], height * width, channels), axis=-2)
+  places = jnp.stack(jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij"), axis=-1)
+  expected = jnp.einsum("...pc,pd->...dc", weights, places.reshape(-1, 2))
+  return expected.reshape(*expected.shape[:-2], -1)

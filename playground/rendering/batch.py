@@ -1,0 +1,168 @@
+"""Pictures of a whole batch of environments on the device they run on, by MuJoCo-Warp's ray caster.
+
+`BatchRenderer.render` is written for one environment and is jitted, mapped and scanned over like any other function.
+The renderer below it wants to know the size of its batch beforehand, in a context of its own: `render` makes one when
+it is traced for a batch of a new size, so that training, evaluation and a single picture each have theirs.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from playground.envs.physics import Physics, PhysicsData, mjx
+from playground.errors import ConfigError, UnknownNameError, nearest
+
+Pictures = dict[str, jax.Array]
+_KINDS = ("rgb", "depth", "segmentation")
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+  """What is rendered, of every environment alike.
+
+  Attributes:
+    cameras: names.
+    width: of each picture, pixels.
+    height: of each picture, pixels.
+    kinds: `rgb`, `depth` and `segmentation`, any of them.
+    shadows: whether lights cast them (those with `castshadow`).
+    textures: whether materials show theirs; without, only their colours.
+    geom_groups: which geoms are seen.
+  """
+
+  cameras: tuple[str, ...]
+  width: int = 64
+  height: int = 64
+  kinds: tuple[str, ...] = ("rgb",)
+  shadows: bool = False
+  textures: bool = False
+  geom_groups: tuple[int, ...] = (0, 1, 2)
+
+
+class BatchRenderer:
+  """Renders the environments of one task."""
+
+  def __init__(self, physics: Physics, view: View):
+    """Checks what is asked for; what is made for a batch is made when it is traced.
+
+    Args:
+      physics: the task's, on Warp.
+      view: what to render.
+
+    Raises:
+      ConfigError: a backend that cannot render, or nothing to render.
+      UnknownNameError: a camera or kind that does not exist.
+    """
+    if physics.impl != "warp":
+      raise ConfigError(f"env.impl={physics.impl} cannot render pictures of a batch: set env.impl=warp.")
+    names = camera_names(physics.mj_model)
+    for camera in view.cameras:
+      if camera not in names:
+        have = ", ".join(names) or "none"
+        raise UnknownNameError(f"Camera {camera!r} does not exist; the model has {have}.{nearest(camera, names)}")
+    for kind in view.kinds:
+      if kind not in _KINDS:
+        raise UnknownNameError(f"Kind {kind!r} is unknown: choose from {', '.join(_KINDS)}.{nearest(kind, _KINDS)}")
+    if not view.cameras or not view.kinds:
+      raise ConfigError("Nothing to render: name a camera and a kind of picture.")
+    self.view = view
+    self._physics = physics
+    self._contexts: dict[tuple[Any, ...], Any] = {}
+
+  def render(self, model: mjx.Model, data: PhysicsData) -> tuple[dict[str, Pictures], PhysicsData]:
+    """Renders one environment as it is at this moment.
+
+    Args:
+      model: the device model, randomised or not.
+      data: simulator state.
+
+    Returns:
+      For each camera its pictures by kind: `rgb` [H, W, 3] uint8, `depth` [H, W] float32, metres along the optical
+      axis and 0 for nothing, `segmentation` [H, W] int32, the geom's id and -1 for nothing; and the state to go on
+      with. Two renderings write into the same buffers of the context: whatever renders next must come from that state,
+      or nothing tells the compiler which of them is first.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def one(model: mjx.Model, data: PhysicsData) -> Any:
+      batch = jax.tree.map(lambda x: x[None], data)
+      pictures = jax.vmap(partial(self._render, self._context(1, False)), (None, 0))(model, batch)
+      return jax.tree.map(lambda x: x[0], pictures)
+
+    @one.def_vmap
+    def many(size: int, mapped: Any, model: mjx.Model, data: PhysicsData) -> Any:
+      # Rays are computed once for all environments, unless each has a lens of its own.
+      lenses = bool(mapped[0].cam_fovy or mapped[0].cam_intrinsic)
+      axes = jax.tree.map(lambda is_mapped: 0 if is_mapped else None, tuple(mapped))
+      pictures = jax.vmap(partial(self._render, self._context(size, lenses)), axes)(model, data)
+      return pictures, jax.tree.map(lambda _: True, pictures)
+
+    pictures, token = one(model, data)
+    return pictures, data.replace(time=data.time + token)
+
+  def _render(self, context: Any, model: mjx.Model, data: PhysicsData) -> tuple[dict[str, Pictures], jax.Array]:
+    """The pictures, and a zero that is there only when they are."""
+    handle = context.pytree()
+    full = mjx.refit_bvh(model, self._physics.present(model, data), handle)
+    seg: Any = None
+    if "segmentation" in self.view.kinds:
+      rgb, depth, seg, full = mjx.render_with_segmentation(model, full, handle)
+    else:
+      rgb, depth, full = mjx.render(model, full, handle)
+    unpack = {
+      "rgb": lambda place: _bytes(rgb[place]),
+      "depth": lambda place: depth[place],
+      "segmentation": lambda place: seg[place, 0],
+    }
+    width, height = self.view.width, self.view.height
+    pictures = {}
+    for i, camera in enumerate(self.view.cameras):
+      place = slice(i * width * height, (i + 1) * width * height)
+      flat = {kind: unpack[kind](place) for kind in self.view.kinds}
+      pictures[camera] = {kind: x.reshape(height, width, *x.shape[1:]) for kind, x in flat.items()}
+    token: Any = full._impl._jax_token  # pyright: ignore[reportOptionalMemberAccess]
+    return pictures, token.sum().astype(data.time.dtype)
+
+  def _context(self, size: int, lenses: bool) -> Any:
+    """The renderer's buffers for a batch, on every device that the function being traced runs on."""
+    devices, view = _devices(), self.view
+    key = (size, lenses, *devices)
+    if key not in self._contexts:
+      self._contexts[key] = mjx.create_render_context(
+        self._physics.mj_model,
+        size,
+        devices=devices,
+        cam_res=(view.width, view.height),
+        cam_active=list(view.cameras),
+        render_rgb="rgb" in view.kinds,
+        render_depth="depth" in view.kinds,
+        render_seg="segmentation" in view.kinds,
+        use_shadows=view.shadows,
+        use_textures=view.textures,
+        use_precomputed_rays=not lenses,
+        enabled_geom_groups=list(view.geom_groups),
+      )
+    return self._contexts[key]
+
+
+def camera_names(mj_model: mujoco.MjModel) -> list[str]:
+  """Names of the model's cameras."""
+  return [name for i in range(mj_model.ncam) if (name := mj_model.camera(i).name)]
+
+
+def _bytes(packed: jax.Array) -> jax.Array:
+  """Red, green and blue, [..., 3] uint8, of pixels 0xAARRGGBB."""
+  return jnp.stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)], axis=-1).astype(jnp.uint8)
+
+
+def _devices() -> list[str]:
+  """Warp's names of this process's devices."""
+  if jax.default_backend() != "gpu":
+    return ["cpu"]
+  # Inside a function that is mapped over a mesh, its devices: the first ones (hardware.mesh.make_mesh).
+  count = max(1, jax.sharding.get_abstract_mesh().size // jax.process_count())
+  return [f"cuda:{device.local_hardware_id}" for device in jax.local_devices()[:count]]

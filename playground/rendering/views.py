@@ -1,0 +1,60 @@
+"""A contact sheet: what a task's camera sees at the start of episodes, each on a randomised model of its own."""
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from playground.envs.base import PIXELS, Env
+from playground.envs.wrappers import Vectorize
+from playground.errors import ConfigError
+from playground.randomization import Randomizer
+from playground.rendering.batch import camera_names
+
+_GAP = 2  # pixels between two views
+
+
+def save_views(env: Env, terms: Iterable[Mapping[str, Any]], path: str | Path, count: int = 16, seed: int = 0) -> Path:
+  """Writes `count` views as one picture.
+
+  Args:
+    env: a task with pictures in its observation.
+    terms: of the randomisation, see `Randomizer`.
+    path: the .png to write.
+    count: views, all rendered at once.
+    seed: of episodes and models.
+
+  Raises:
+    ConfigError: the task sees nothing, or the file is not a .png.
+  """
+  import matplotlib.image
+
+  path = Path(path)
+  if path.suffix != ".png":
+    raise ConfigError(f"--views {path}: the picture must be a .png.")
+  sizes = env.observation_size
+  cameras = [key for key in sizes if key.startswith(PIXELS)] if isinstance(sizes, Mapping) else []
+  if not cameras:
+    have = ", ".join(camera_names(env.mj_model)) or "none"
+    raise ConfigError(f"The task sees nothing: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
+  reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
+  model = Randomizer(env.mj_model, terms).sample_batch(jax.random.split(model_key, count))
+  state: Any = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)
+  frames = len(env.observation_parts[cameras[0]])  # of which the newest is shown
+  pictures = np.asarray(state.obs[cameras[0]])
+  matplotlib.image.imsave(path, sheet(pictures[..., -(pictures.shape[-1] // frames) :]))
+  return path
+
+
+def sheet(pictures: np.ndarray) -> np.ndarray:
+  """Lays pictures [N, H, W, 1 or 3] uint8 side by side in rows, one picture [..., 3]."""
+  count, height, width, _ = pictures.shape
+  columns = math.ceil(math.sqrt(count))
+  rows = math.ceil(count / columns)
+  page = np.full((rows, height + _GAP, columns, width + _GAP, 3), 255, np.uint8)
+  for i, picture in enumerate(pictures):
+    page[i // columns, :height, i % columns, :width] = picture
+  return page.reshape(rows * (height + _GAP), columns * (width + _GAP), 3)

@@ -1,0 +1,83 @@
+"""Warp's buffers: what a task needs of them, and that a run says when they are too small."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from playground import registry
+from playground.envs.physics import BufferUse
+from playground.envs.wrappers import wrap_for_evaluation
+from playground.errors import ConfigError
+from playground.learning import buffers
+from playground.learning.buffers import BufferSizes, measure_buffers
+from playground.learning.rollout import episode_sums
+from tests.dummy import PointTask
+
+
+def use(constraints, contacts, overflow) -> BufferUse:
+  return BufferUse(*(jnp.asarray(value, jnp.int32) for value in (constraints, contacts, overflow)))
+
+
+def test_joining_keeps_the_most_and_every_overflow():
+  joined = use([3, 9], [7, 7], [1, 0]).join(use([5, 2], [7, 8], [4, 0]))
+  assert joined.constraints.tolist() == [5, 9]
+  assert joined.contacts.tolist() == [7, 8]
+  assert joined.overflow.tolist() == [5, 0]
+
+
+def test_advice_has_room_and_grows_with_the_environments():
+  sizes = BufferSizes(constraints=28, contacts=4.0)
+  assert sizes.advised(8192) == {"njmax": 36, "naconmax": 40960}
+  assert sizes.advised(16384)["naconmax"] == 2 * 40960
+  assert BufferSizes(0, 0.0).advised(1024) == {"njmax": 0, "naconmax": 0}
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+  """Stands in for the simulation: it needs rows of an environment and pairs of all, and says if that is too many."""
+  tried = []
+
+  def simulate(rows: int, pairs: int, stubborn: int = 0):
+    def roll(env, act, num_envs, num_steps, seed):
+      tried.append((env.njmax, env.naconmax))
+      overflow = stubborn | (rows > env.njmax) * 1 | (pairs > env.naconmax) * 8
+      return BufferUse(np.int32(rows), np.int32(pairs), np.int32(overflow))
+
+    monkeypatch.setattr(buffers, "_roll", roll)
+    monkeypatch.setattr(registry, "build", lambda config: config)
+    return tried
+
+  return simulate
+
+
+@pytest.mark.parametrize(("rows", "pairs", "tries"), [(28, 16, 1), (200, 16, 2), (28, 1000, 5), (60, 60, 1)])
+def test_buffers_grow_until_they_are_large_enough(simulated, rows, pairs, tries):
+  tried = simulated(rows, pairs)
+  config = registry.config("Go1Getup")  # njmax: 160
+  found = measure_buffers(config, None, num_envs=2, num_steps=3)
+  assert found == BufferSizes(rows, pairs / 2)
+  assert len(tried) == tries and tried[-1][0] >= rows and tried[-1][1] >= pairs
+
+
+def test_other_buffers_are_named(simulated):
+  pytest.importorskip("warp")
+  simulated(1, 1, stubborn=32)
+  with pytest.raises(ConfigError, match=r"do not bound \(HFIELD\)"):
+    measure_buffers(registry.config("Go1Getup"), None, 2, 3)
+
+
+def test_overflows_are_counted_for_training():
+  import jax
+
+  state = wrap_for_evaluation(PointTask()).reset(jax.random.split(jax.random.PRNGKey(0), 3), None)
+  assert "overflows" not in episode_sums(state)
+  state = state.replace(data=state.data.replace(buffers=use([1, 1, 1], [1, 1, 1], [0, 4, 1])))
+  assert episode_sums(state)["overflows"] == 2
+
+
+@pytest.mark.slow  # compiles Warp's kernels for the CPU: a minute
+def test_a_real_task_on_warp():
+  pytest.importorskip("warp")
+  found = measure_buffers(registry.config("Go1JoystickFlatTerrain"), None, num_envs=2, num_steps=40)
+  assert found.constraints >= 12, "a Go1 that stands on its feet"
+  assert 1 <= found.contacts <= 4

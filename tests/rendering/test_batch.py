@@ -1,0 +1,120 @@
+"""Pictures of a batch by MuJoCo-Warp, on the CPU: of a cart and its pole at several poses."""
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from playground.config import compose
+from playground.envs.dm_control.cartpole import Cartpole
+from playground.errors import ConfigError, UnknownNameError
+from playground.rendering.batch import BatchRenderer, View
+
+# Cart (m) and pole (rad): in the middle, to the right and leaning, to the left and leaning the other way.
+POSES = jnp.array([[0.0, 0.0], [0.7, 0.4], [-0.7, -0.4]])
+WIDTH, HEIGHT = 32, 24
+
+
+@cache
+def task(impl: str = "warp") -> Cartpole:
+  config = compose(["env=CartpoleBalance", "tuned=null", f"env.impl={impl}"])
+  return Cartpole(config.env)
+
+
+@cache
+def renderer() -> BatchRenderer:
+  return BatchRenderer(task().physics, View(("fixed", "lookatcart"), WIDTH, HEIGHT, ("rgb", "depth", "segmentation")))
+
+
+def render(pose: jax.Array, fields: dict[str, jax.Array]) -> Any:
+  env = task()
+  return renderer().render(env.mjx_model.tree_replace(fields), env.physics.make(qpos=pose))  # pyright: ignore
+
+
+@cache
+def batched() -> Any:
+  renderer()  # not while tracing
+  return jax.jit(jax.vmap(render))
+
+
+@cache
+def pictures() -> Any:
+  return jax.device_get(batched()(POSES, {})[0])
+
+
+def columns_of(geom: str, which: int) -> np.ndarray:
+  """The columns in which a geom is seen by the camera that does not move."""
+  seen = pictures()["fixed"]["segmentation"][which] == task().mj_model.geom(geom).id
+  return np.nonzero(seen.any(axis=0))[0]
+
+
+def test_shapes_and_types() -> None:
+  of = jax.tree.map(lambda x: (x.shape, x.dtype.name), pictures())
+  size = (3, HEIGHT, WIDTH)
+  assert set(of) == {"fixed", "lookatcart"}
+  assert of["fixed"] == {"rgb": ((*size, 3), "uint8"), "depth": (size, "float32"), "segmentation": (size, "int32")}
+
+
+def test_a_cart_is_seen_where_it_is() -> None:
+  middle, right, left = (columns_of("cart", i).mean() for i in range(3))
+  assert left < middle - 3 and right > middle + 3
+  np.testing.assert_allclose(middle, (WIDTH - 1) / 2, atol=1)
+  assert columns_of("pole_1", 1).mean() > right and columns_of("pole_1", 2).mean() < left  # it leans outwards
+  seen = pictures()["fixed"]["rgb"]
+  assert (seen[0] != seen[1]).any() and (seen[1] != seen[2]).any()
+
+
+def test_depth_is_the_distance_along_the_optical_axis() -> None:
+  fixed = jax.tree.map(lambda x: x[0], pictures()["fixed"])
+  cart = task().mj_model.geom("cart")
+  front = 4 - cart.size[1]  # the camera stands 4 m before the rails
+  np.testing.assert_allclose(fixed["depth"][fixed["segmentation"] == cart.id], front, atol=0.02)
+  assert (fixed["depth"][fixed["segmentation"] == -1] == 0).all()
+
+
+def test_a_batch_is_what_its_environments_are_one_by_one_and_under_scan() -> None:
+  def each(_: None, pose: jax.Array) -> tuple[None, Any]:
+    return None, render(pose, {})[0]
+
+  batch = pictures()
+  one_by_one = jax.jit(lambda poses: jax.lax.scan(each, None, poses)[1])(POSES)
+  jax.tree.map(np.testing.assert_array_equal, batch, jax.device_get(one_by_one))
+
+
+def test_each_environment_has_its_own_lens_light_and_colour() -> None:
+  model = task().mjx_model
+  pose = jnp.broadcast_to(POSES[0], (3, 2))
+  wide = model.cam_fovy * jnp.array([1.0, 1.5, 1.0])[:, None]
+  dark = model.light_diffuse * jnp.array([1.0, 1.0, 0.0])[:, None, None]
+  seen = jax.device_get(batched()(pose, {"cam_fovy": wide, "light_diffuse": dark})[0])["fixed"]
+  cart = task().mj_model.geom("cart").id
+  areas = (seen["segmentation"] == cart).sum(axis=(1, 2))
+  assert areas[1] < 0.7 * areas[0] and areas[2] == areas[0]
+  assert seen["rgb"][2].mean() < seen["rgb"][0].mean()
+  np.testing.assert_array_equal(seen["segmentation"][0], pictures()["fixed"]["segmentation"][0])
+
+
+def test_the_state_goes_on_unchanged() -> None:
+  data = batched()(POSES, {})[1]
+  np.testing.assert_array_equal(data.qpos, POSES)
+  np.testing.assert_array_equal(data.time, 0)
+
+
+@pytest.mark.parametrize(
+  ("view", "message"),
+  [
+    (View(("fixd",)), "Camera 'fixd' does not exist; the model has fixed, lookatcart. Did you mean 'fixed'"),
+    (View(("fixed",), kinds=("deph",)), "Kind 'deph' is unknown.*Did you mean 'depth'"),
+  ],
+)
+def test_unknown_names(view: View, message: str) -> None:
+  with pytest.raises(UnknownNameError, match=message):
+    BatchRenderer(task().physics, view)
+
+
+def test_jax_renders_nothing() -> None:
+  with pytest.raises(ConfigError, match=r"env.impl=jax cannot render"):
+    BatchRenderer(task("jax").physics, View(("fixed",)))
