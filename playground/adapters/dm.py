@@ -1,0 +1,49 @@
+"""Tasks as dm_env environments, for agents written against that interface."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_env import specs
+
+from playground.adapters.episodes import Episodes, Moment
+
+
+class DmEnv(dm_env.Environment):
+  """One environment. A dict observation is a dict, an end by the task has discount 0, one by the time limit 1."""
+
+  def __init__(self, task: str, overrides: Mapping[str, Any] | None = None, physics: str = "c", seed: int = 0):
+    """Builds a task; `physics` is `c` or `mjx`, see `playground.adapters.episodes.load_task`."""
+    self._episodes = Episodes(task, overrides, physics)
+    self._random = np.random.default_rng(seed)
+    self._running = False
+
+  def reset(self) -> dm_env.TimeStep:
+    self._running = True
+    return dm_env.restart(self._episodes.reset(int(self._random.integers(2**31 - 1))).obs)
+
+  def step(self, action: np.ndarray) -> dm_env.TimeStep:
+    if not self._running:
+      return self.reset()
+    moment = self._episodes.step(action)
+    self._running = not (moment.terminated or moment.truncated)
+    return _time_step(moment)
+
+  def observation_spec(self) -> Any:
+    sizes = self._episodes.env.observation_size
+    if not isinstance(sizes, Mapping):
+      return specs.Array((sizes,), np.float32, "observation")
+    return {name: specs.Array(shape, np.float32, name) for name, shape in sizes.items()}
+
+  def action_spec(self) -> specs.BoundedArray:
+    return specs.BoundedArray((self._episodes.env.action_size,), np.float32, -1.0, 1.0, "action")
+
+  def reward_spec(self) -> specs.Array:
+    return specs.Array((), float, "reward")
+
+
+def _time_step(moment: Moment) -> dm_env.TimeStep:
+  if moment.terminated:
+    return dm_env.termination(moment.reward, moment.obs)
+  return (dm_env.truncation if moment.truncated else dm_env.transition)(moment.reward, moment.obs)

@@ -1,0 +1,82 @@
+"""One environment of a task, in numpy: what the interfaces of other libraries are made of."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from playground import registry
+from playground.envs.base import Env, State
+from playground.envs.c_physics import on_c_physics
+from playground.envs.wrappers import wrap_for_evaluation
+from playground.mdp.lookup import lookup
+
+Arrays = np.ndarray | dict[str, np.ndarray]
+
+
+class Moment(NamedTuple):
+  """What one environment shows, after a reset or a step.
+
+  Attributes:
+    obs: one vector, or a dict of them.
+    reward: of the step.
+    terminated: the task ended the episode.
+    truncated: time did.
+    metrics: what the task measures in a step, by name.
+  """
+
+  obs: Arrays
+  reward: float
+  terminated: bool
+  truncated: bool
+  metrics: dict[str, float]
+
+
+class Episodes:
+  """A task, one episode after another. The time limit and the repeats of an action are the task's.
+
+  Attributes:
+    env: the task.
+    state: the present state, a batch of one; None before the first reset.
+  """
+
+  def __init__(self, task: str, overrides: Mapping[str, Any] | None = None, physics: str = "c"):
+    """Builds a task; see `load_task`."""
+    self.env = load_task(task, overrides, physics)
+    batch = wrap_for_evaluation(self.env)
+    self._reset, self._step = jax.jit(lambda key: batch.reset(key[None])), jax.jit(batch.step)
+    self.state: State | None = None
+
+  def reset(self, seed: int) -> Moment:
+    """Starts an episode."""
+    state = self.state = self._reset(jax.random.PRNGKey(seed))
+    return self._moment(state)
+
+  def step(self, action: np.ndarray) -> Moment:
+    """Applies an action in [-1, 1], [action_size]."""
+    assert self.state is not None, "reset before the first step"
+    state = self.state = self._step(self.state, np.asarray(action, np.float32)[None])
+    return self._moment(state)
+
+  def _moment(self, state: State) -> Moment:
+    state = jax.tree.map(lambda x: np.array(x[0]), state.replace(data=None))
+    obs: Any = state.obs
+    truncated = bool(state.info["truncation"])
+    ended = bool(state.done) and not truncated
+    return Moment(obs, float(state.reward), ended, truncated, {k: float(v) for k, v in state.metrics.items()})
+
+
+def load_task(task: str, overrides: Mapping[str, Any] | None = None, physics: str = "mjx") -> Env:
+  """Builds a task.
+
+  Args:
+    task: its name.
+    overrides: values of its config by dotted key.
+    physics: `mjx`, or `c`: plain C MuJoCo, which needs no compiling and is the faster for one environment on a CPU.
+
+  Raises:
+    UnknownNameError: no such task, key or physics.
+  """
+  place = lookup({"c": on_c_physics, "mjx": lambda env: env}, physics, "physics")
+  return place(registry.load(task, overrides=overrides))

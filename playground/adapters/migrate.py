@@ -1,0 +1,48 @@
+"""The suites of Playground 0.2.0 as code written for it knows them: `from playground import locomotion` and the like.
+
+`registry` and `wrapper` are our own modules under 0.2.0's names. docs/migrate.md says what else there is to change.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ml_collections import ConfigDict
+
+from playground import registry
+from playground.benchmark.suites import tasks_of
+from playground.envs.base import Env
+
+
+class Suite:
+  """A part of the registry."""
+
+  def __init__(self, members: Callable[[], Sequence[str]]):
+    """Takes what says the names of its tasks."""
+    self._members = members
+
+  @property
+  def ALL_ENVS(self) -> tuple[str, ...]:  # 0.2.0's name
+    return tuple(self._members())
+
+  def load(
+    self, env_name: str, config: ConfigDict | None = None, config_overrides: Mapping[str, Any] | None = None
+  ) -> Env:
+    """See `registry.load`."""
+    return registry.load(env_name, config=config, config_overrides=config_overrides)
+
+  def get_default_config(self, env_name: str) -> ConfigDict:
+    """See `registry.config`."""
+    return registry.config(env_name)
+
+  def get_domain_randomizer(self, env_name: str) -> Callable[..., Any] | None:
+    """See `registry.get_domain_randomizer`."""
+    return registry.get_domain_randomizer(env_name)
+
+
+def _beginning(*robots: str) -> Callable[[], Sequence[str]]:
+  return lambda: [name for name in registry.names() if name.startswith(robots)]
+
+
+dm_control_suite = Suite(lambda: tasks_of("dm_control"))
+locomotion = Suite(_beginning("Apollo", "Barkour", "Berkeley", "G1", "Go1", "H1", "Op3", "Spot", "T1"))
+manipulation = Suite(_beginning("Aero", "Aloha", "Leap", "Panda"))

@@ -1,0 +1,83 @@
+"""`playground export <run>`: writes `policy.onnx` and `policy.yaml`, if they compute what was trained."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rich.console import Console
+
+from playground.deploy.policy import ExportedPolicy
+from playground.deploy.trained import TrainedPolicy
+from playground.errors import PlaygroundError
+from playground.extras import need
+from playground.runs.files import replacing, write_text
+
+TOLERANCE = 1e-5  # of an action, against the trained policy's
+_ENVS, _DECISIONS = 8, 125  # 1000 observations
+
+
+class ParityError(PlaygroundError):
+  """An exported policy that acts otherwise than the trained one."""
+
+
+def export_run(path: str, *, out: str | None = None, console: Console | None = None) -> int:
+  """Exports a run's newest checkpoint, or the one given.
+
+  The exported policy acts on 1000 observations that the trained one made in C MuJoCo, and must do the same.
+
+  Args:
+    path: a run directory, or one of its checkpoints.
+    out: the folder to write to; by default `export/` in the run's.
+    console: for the output.
+
+  Returns:
+    The exit code, 0.
+
+  Raises:
+    ParityError: the exported policy acts otherwise; nothing is written.
+    PlaygroundError: no such run or checkpoint, or one that cannot be exported.
+  """
+  console = console or Console()
+  need("deploy", "onnx", "onnxruntime")
+  trained = TrainedPolicy.open(path)
+  obs, actions, state = trained.record(_ENVS, _DECISIONS)
+  exported = trained.export(state)
+  error = check_parity(exported, obs, actions)
+  folder = Path(out).expanduser() if out else trained.run_dir.path / "export"
+  folder.mkdir(parents=True, exist_ok=True)
+  with replacing(folder / "policy.onnx") as temporary:
+    temporary.write_bytes(exported.model)
+  write_text(folder / "policy.yaml", _yaml(exported.contract))
+  console.print(_summary(exported.contract, len(obs), error, 1e6 * exported.latency(obs)), soft_wrap=True)
+  console.print(f"written to {folder / 'policy.onnx'} and policy.yaml", soft_wrap=True)
+  return 0
+
+
+def check_parity(exported: ExportedPolicy, obs: np.ndarray, actions: np.ndarray) -> float:
+  """Returns the largest difference of an action.
+
+  Raises:
+    ParityError: it is above `TOLERANCE`, or not a number.
+  """
+  error = float(np.abs(exported.actions(obs) - actions).max())
+  if not error <= TOLERANCE:
+    difference = f"differ by {error:.1e}, more than {TOLERANCE:g}"
+    raise ParityError(f"The exported policy's actions {difference}: nothing is written.")
+  return error
+
+
+def _yaml(contract: Mapping[str, Any]) -> str:
+  return yaml.safe_dump(contract, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+
+
+def _summary(contract: Mapping[str, Any], count: int, error: float, micros: np.ndarray) -> str:
+  policy, rate = contract["policy"], contract["rate_hz"]
+  sizes = f"{policy['observation_size']} numbers in, {policy['action_size']} out"
+  return (
+    f"{contract['task']}, {contract['origin']['steps']:,} steps trained: {sizes}\n"
+    f"same actions on {count} observations of its own in C MuJoCo: largest difference {error:.1e}\n"
+    f"inference on one core here: {np.median(micros):.0f} µs (median), {np.quantile(micros, 0.99):.0f} µs (99 %) "
+    f"of the {1e6 / rate:,.0f} µs there are at {rate:g} Hz"
+  )

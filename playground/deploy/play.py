@@ -1,0 +1,105 @@
+"""`playground play <run|policy.onnx>`: the exported policy in plain C MuJoCo, measured, filmed or watched."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.console import Console
+from rich.table import Table
+
+from playground import config as configs
+from playground.deploy.policy import ExportedPolicy
+from playground.deploy.trained import TrainedPolicy, load_on_c_physics
+from playground.envs.base import Env
+from playground.errors import ConfigError
+from playground.hardware.mesh import make_mesh
+from playground.hardware.setup import setup, this_machine
+from playground.learning.evaluation import make_evaluator
+from playground.rendering.video import render_video
+from playground.runs.files import write_json
+from playground.runs.job import episodes_of
+
+
+def play(
+  path: str,
+  *,
+  episodes: int = 10,
+  seed: int = 0,
+  video: str | None = None,
+  viewer: bool = False,
+  console: Console | None = None,
+) -> int:
+  """Runs a policy, in ONNX Runtime, in C MuJoCo: at its rate, with its noise, pushes and delays, the model as it is.
+
+  Args:
+    path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it.
+    episodes: how many to measure.
+    seed: of the episodes.
+    video: where to render the first episode to (.mp4).
+    viewer: whether to show the policy in MuJoCo's viewer instead of measuring it.
+    console: for the output.
+
+  Returns:
+    The exit code, 0.
+
+  Raises:
+    PlaygroundError: no such run or policy, or no display for the viewer.
+  """
+  console = console or Console()
+  if episodes < 1:
+    raise ConfigError(f"--episodes={episodes} must be above 0.")
+  if viewer:
+    from playground.deploy.viewer import need_display
+
+    need_display()
+  exported, env, folder = open_policy(path)
+  if viewer:
+    from playground.deploy.viewer import view
+
+    view(env, exported, seed, console)
+    return 0
+  evaluate = make_evaluator(env, exported.act, episodes, make_mesh(1), 1 if video else 0)
+  scores, recording = evaluate({}, jax.random.PRNGKey(seed), {})
+  scores = {name: float(value) for name, value in jax.device_get(scores).items()}
+  origin = exported.contract["origin"]
+  console.print(_table(exported.contract, episodes, scores))
+  out = folder / f"play_step_{origin['steps']:012d}_seed_{seed}.json"
+  write_json(out, {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "scores": scores, "origin": origin})
+  console.print(f"written to {out}", soft_wrap=True)
+  if video:
+    tape = episodes_of(recording, 1)
+    render_video(env.mj_model, out_path=Path(video), dt=env.dt * env.action_repeat, notify=console.print, **tape)
+  return 0
+
+
+def open_policy(path: str) -> tuple[ExportedPolicy, Env, Path]:
+  """The exported policy, its task on C MuJoCo, and the folder that results go to.
+
+  Raises:
+    PlaygroundError: no such run or policy.
+  """
+  if Path(path).suffix == ".onnx":
+    exported = ExportedPolicy.load(path)
+    task = exported.contract["task"]
+    setup(this_machine(configs.compose([f"env={task}", "hardware=cpu"]).hardware))
+    return exported, load_on_c_physics(task, exported.contract["env"]), Path(path).expanduser().parent
+  trained = TrainedPolicy.open(path)
+  folder = trained.run_dir.path / "export"
+  folder.mkdir(exist_ok=True)
+  return trained.export(), trained.env, folder
+
+
+def _table(contract: Mapping[str, Any], episodes: int, scores: Mapping[str, float]) -> Table:
+  """Scores, beside those of the last evaluation in training."""
+  trained = contract["origin"]["evaluation"]
+  title = f"{contract['task']}, {contract['origin']['steps']:,} steps trained"
+  table = Table("per episode", title=title)
+  table.add_column(f"C MuJoCo, mean of {episodes}", justify="right")
+  if trained:
+    table.add_column(f"MJX in training, at {trained['steps']:,} steps", justify="right")
+    table.caption = "Here the model as it is and the policy's mode; in training as that was configured."
+  for name, value in scores.items():
+    beside = [f"{trained[name]:.4g}" if name in trained else ""] if trained else []
+    table.add_row(name.removeprefix("episode_"), f"{value:.4g}", *beside)
+  return table

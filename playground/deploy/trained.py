@@ -1,0 +1,144 @@
+"""A run's policy with its task on C MuJoCo: what is exported, and played."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas
+from ml_collections import ConfigDict
+
+from playground import config as configs
+from playground import registry
+from playground.config import RunConfig
+from playground.deploy.contract import describe_policy
+from playground.deploy.graph import policy_graph
+from playground.deploy.policy import ExportedPolicy
+from playground.envs.base import Env, State
+from playground.envs.c_physics import on_c_physics
+from playground.envs.wrappers import wrap_for_training
+from playground.errors import ConfigError
+from playground.extras import need
+from playground.hardware.setup import setup, this_machine
+from playground.learning.algorithms import make_learner
+from playground.learning.checkpoints import Checkpoint, find_checkpoints
+from playground.learning.learner import Learner, Policy
+from playground.runs.run_dir import RunDirectory
+
+_EXACT = "highest"  # precision of matrix products: what the exported policy computes
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainedPolicy:
+  """A checkpoint's policy, ready to act.
+
+  Attributes:
+    run: the run's configuration.
+    run_dir: its folder.
+    step: control steps trained.
+    env: the task, on C MuJoCo.
+    learner: the algorithm.
+    policy: networks and normaliser.
+  """
+
+  run: RunConfig
+  run_dir: RunDirectory
+  step: int
+  env: Env
+  learner: Learner
+  policy: Policy
+
+  @classmethod
+  def open(cls, path: str | Path) -> "TrainedPolicy":
+    """Reads a run's newest checkpoint, or the one given; all of it computes on the CPU.
+
+    Raises:
+      PlaygroundError: no such run or checkpoint, one that does not fit, or a policy that sees pictures.
+    """
+    checkpoint = Checkpoint(find_checkpoints(path)[0])
+    run_dir = RunDirectory.open(checkpoint.path.parents[1])
+    run = configs.from_saved(run_dir.config)
+    hardware_config = this_machine(run.hardware)
+    hardware_config.platform = "cpu"
+    hardware = setup(hardware_config)
+    env = load_on_c_physics(run.choices["env"], run.env)
+    learner = make_learner(env, run.agent, hardware.mesh, _EXACT)
+    policy = learner.place_policy(checkpoint.restore("policy", learner.policy_shape()))
+    return cls(run, run_dir, checkpoint.step, env, learner, policy)
+
+  def act(self, obs: Any) -> jax.Array:
+    """The deterministic action."""
+    return self.learner.act(self.policy, obs, jax.random.PRNGKey(0), deterministic=True)
+
+  def record(self, num_envs: int, decisions: int) -> tuple[np.ndarray, np.ndarray, State]:
+    """Lets the policy act, noise and all.
+
+    Returns:
+      What the actor saw, [num_envs * decisions, n], what it did, [..., action_size], and a state of one environment.
+    """
+    batch = wrap_for_training(self.env)
+
+    def decide(state: State, _: None) -> tuple[State, tuple[jax.Array, jax.Array]]:
+      action = self.act(state.obs)
+      return batch.step(state, action), (self.learner.networks.select(state.obs)[self.entry], action)
+
+    @jax.jit
+    def roll(key: jax.Array) -> Any:
+      return jax.lax.scan(decide, batch.reset(jax.random.split(key, num_envs)), None, decisions)
+
+    state, (obs, actions) = roll(jax.random.PRNGKey(0))
+    flat = lambda x: np.asarray(x).reshape(-1, x.shape[-1])
+    return flat(obs), flat(actions), jax.tree.map(lambda x: x[0], state)
+
+  @property
+  def entry(self) -> str:
+    """The entry of the observation that the actor sees."""
+    return self.learner.networks.policy_obs_key
+
+  def export(self, state: State | None = None) -> ExportedPolicy:
+    """The policy as a controller has it; `state` is any of one environment (a fresh one if None)."""
+    need("deploy", "onnx", "onnxruntime")
+    normalizer: Any = jax.device_get(self.policy.normalizer)
+    seen = (normalizer.mean[self.entry], normalizer.std[self.entry])
+    params = jax.device_get(self.policy.params.policy)["params"]
+    agent = self.run.agent
+    model = policy_graph(params, agent.network.activation, seen if agent.normalize_observations else None)
+    origin = {
+      "run": self.run_dir.path.absolute().name,
+      "experiment": self.run.name,
+      "agent": agent.name,
+      "steps": self.step,
+      **(self.run_dir.manifest.get("git") or {}),
+      "evaluation": self._newest_evaluation(),
+    }
+    state = jax.jit(self.env.reset)(jax.random.PRNGKey(0)) if state is None else state
+    config: Mapping[str, Any] = self.run.resolved["env"]
+    contract = describe_policy(self.env, config, self.run.choices["env"], origin, self.entry, state)
+    return ExportedPolicy(model.SerializeToString(), contract)
+
+  def _newest_evaluation(self) -> dict[str, float]:
+    """`steps` and the scores of the last evaluation in the training run, {} if there was none."""
+    if not self.run_dir.metrics_csv.is_file():
+      return {}
+    table = pandas.read_csv(self.run_dir.metrics_csv)
+    evaluated = table[(table.step <= self.step) & table["eval/episode_reward"].notna()]
+    if not len(evaluated):
+      return {}
+    last = evaluated.iloc[-1]
+    scores = {name.removeprefix("eval/"): float(last[name]) for name in table if str(name).startswith("eval/episode_")}
+    return {"steps": int(last.step)} | scores
+
+
+def load_on_c_physics(task: str, config: Any) -> Env:
+  """Builds a task on C MuJoCo.
+
+  Raises:
+    ConfigError: it sees pictures, which MuJoCo-Warp renders.
+  """
+  config = ConfigDict(config)
+  if "vision" in config and config.vision.enable:
+    raise ConfigError(f"{task} sees pictures (env.vision.enable=true), which cannot be exported or played.")
+  config.impl = "jax"  # whose model is the smallest to build; it is not simulated
+  return on_c_physics(registry.load(task, config=config))

@@ -1,0 +1,62 @@
+"""MuJoCo's native viewer on a policy: push with the mouse, steer with the arrow keys."""
+
+import os
+import sys
+import time
+
+import numpy as np
+from rich.console import Console
+
+from playground.deploy.player import Player
+from playground.deploy.policy import ExportedPolicy
+from playground.envs.base import Env
+from playground.errors import HardwareError
+
+_STEP = 0.1  # m/s and rad/s of the command, for each press
+# GLFW's codes of the keys -> component of the command, direction.
+_STEERING = {265: (0, 1), 264: (0, -1), 263: (2, 1), 262: (2, -1), ord(","): (1, 1), ord("."): (1, -1)}
+_AS_THE_TASK_DRAWS, _RESET = 259, 257  # backspace, enter
+_HELP = (
+  "Keys: up and down go, left and right turn, comma and period go sideways, backspace leaves commands to the task, "
+  "enter begins anew. Double-click a body, then hold ctrl and drag with the right button to push it."
+)
+
+
+def need_display() -> None:
+  """Raises HardwareError where there is no screen for a window."""
+  if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    raise HardwareError("--viewer needs a display, and there is none here: use --video FILE.")
+
+
+def view(env: Env, exported: ExportedPolicy, seed: int, console: Console) -> None:
+  """Shows a policy in real time until its window is closed."""
+  import mujoco.viewer
+
+  player = Player(env, exported, seed)
+  data = mujoco.MjData(env.mj_model)
+
+  def on_key(key: int) -> None:
+    if key == _RESET:
+      player.reset()
+    elif key == _AS_THE_TASK_DRAWS:
+      player.command = None
+    elif key in _STEERING and player.takes_commands:
+      component, sign = _STEERING[key]
+      player.command = np.zeros(3) if player.command is None else player.command.copy()
+      player.command[component] += sign * _STEP
+      console.print(f"command {np.round(player.command, 1).tolist()}")
+
+  console.print(_HELP, soft_wrap=True)
+  with mujoco.viewer.launch_passive(env.mj_model, data, key_callback=on_key) as window:
+    while window.is_running():
+      began = time.perf_counter()
+      state = player.decide()
+      with window.lock():
+        for name in ("qpos", "mocap_pos", "mocap_quat"):
+          getattr(data, name)[:] = getattr(state.data, name)
+        mujoco.mj_forward(env.mj_model, data)
+        data.xfrc_applied[:] = 0
+        mujoco.mjv_applyPerturbForce(env.mj_model, data, window.perturb)
+        player.force = data.xfrc_applied.astype(np.float32)
+      window.sync()
+      player.pause_until_due(began)

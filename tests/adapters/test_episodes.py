@@ -1,0 +1,30 @@
+"""How the episodes end that other libraries see."""
+
+import numpy as np
+import pytest
+
+from playground import registry
+from playground.adapters.episodes import Episodes, Moment
+from tests.dummy import Point
+
+
+def ends(monkeypatch: pytest.MonkeyPatch, env: Point, steps: int) -> list[Moment]:
+  monkeypatch.setattr(registry, "load", lambda name, overrides=None: env)
+  episodes = Episodes("Point", physics="mjx")
+  episodes.reset(0)
+  return [episodes.step(np.zeros(2)) for _ in range(steps)]
+
+
+def test_a_failure_terminates(monkeypatch: pytest.MonkeyPatch) -> None:
+  moments = ends(monkeypatch, Point(nan_at=3), 3)
+  assert [moment.terminated for moment in moments] == [False, False, True]
+  assert not any(moment.truncated for moment in moments)
+
+
+def test_time_truncates_and_actions_are_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+  moments = ends(monkeypatch, Point(episode_length=4, action_repeat=2), 2)
+  assert [moment.truncated for moment in moments] == [False, True]
+  assert not any(moment.terminated for moment in moments)
+  first = moments[0]
+  assert isinstance(first.obs, dict) and first.obs["privileged_state"].shape == (4,)
+  assert first.reward == pytest.approx(-2 * first.metrics["distance"])

@@ -1,0 +1,112 @@
+"""`playground export` and `playground play` on a checkpoint of an untrained policy."""
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import yaml
+
+from playground.cli.main import main
+from playground.config import compose
+from playground.deploy.policy import ExportedPolicy
+from playground.envs.c_physics import on_c_physics
+from playground.hardware.mesh import make_mesh
+from playground.learning.algorithms import make_learner
+from playground.learning.checkpoints import CheckpointStore
+from playground.learning.learner import Policy
+from playground.registry import load
+from playground.runs.run_dir import RunDirectory
+
+Command = Callable[..., int]
+STEPS = 3000
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+  """A run's directory as training leaves it."""
+  path = tmp_path_factory.mktemp("deploy") / "run"
+  config = compose(["env=CartpoleBalance", "debug=fast", "hardware=cpu", "env.episode_length=40", f"run_dir={path}"])
+  run_dir = RunDirectory.create(path, config.resolved)
+  run_dir.update_manifest(git={"commit": "abc", "dirty": False})
+  run_dir.metrics_csv.write_text(
+    "step,eval/episode_reward,eval/episode_length\n0,1.0,40\n2000,12.5,40\n2500,,\n4000,30.0,40\n"
+  )
+  env = on_c_physics(load("CartpoleBalance", config=config.env))
+  learner = make_learner(env, config.agent, make_mesh(1), None)
+  rng = np.random.default_rng(0)
+  weights = jax.tree.map(lambda x: rng.uniform(0.1, 0.5, x.shape).astype(x.dtype), learner.policy_shape())
+  store = CheckpointStore(run_dir.checkpoints)
+  store.save(STEPS, Policy(weights.params, weights.normalizer), {"rest": np.zeros(1)}, {"env": "CartpoleBalance"})
+  store.close()
+  return path
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Command:
+  def call(*args: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["playground", *args])
+    with pytest.raises(SystemExit) as exit_:
+      main()
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+  return call
+
+
+def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  assert command("export", str(run)) == 0
+  out = " ".join(capsys.readouterr().out.split())
+  difference = re.search(r"same actions on 1000 observations .* largest difference (\S+)", out)
+  assert difference and float(difference[1]) <= 1e-5
+  assert re.search(r"\d+ µs \(median\).* of the 10,000 µs there are at 100 Hz", out)
+  contract = yaml.safe_load((run / "export" / "policy.yaml").read_text())
+  origin = {"run": "run", "agent": "ppo", "steps": STEPS, "commit": "abc", "dirty": False}
+  assert origin.items() <= contract["origin"].items()
+  assert contract["origin"]["evaluation"] == {"steps": 2000, "episode_reward": 12.5, "episode_length": 40}
+
+  scores = []
+  for policy in (run, run / "export" / "policy.onnx"):
+    assert command("play", str(policy), "--episodes", "3", "--seed", "4") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4.json").read_text())
+    assert (report["simulator"], report["episodes"]) == ("C MuJoCo", 3)
+    scores.append(report["scores"])
+    assert re.search(rf"reward\W+{scores[-1]['episode_reward']:.4g}\W+12.5\b", shown)
+  assert scores[0] == scores[1]
+  assert 0 < scores[0]["episode_reward"] < 40 == scores[0]["episode_length"]
+
+
+def test_a_policy_that_acts_otherwise_is_not_written(
+  command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  truly = ExportedPolicy.actions
+  monkeypatch.setattr(ExportedPolicy, "actions", lambda self, obs: truly(self, obs) + np.float32(1e-3))
+  assert command("export", str(run), "--out", str(tmp_path / "out")) == 2
+  assert "differ by 1.0e-03, more than 1e-05: nothing is written" in capsys.readouterr().err
+  assert not (tmp_path / "out").exists()
+
+
+def test_one_sentence_each(
+  command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+  for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+    monkeypatch.delenv(name, raising=False)
+  (tmp_path / "policy.onnx").touch()
+  (tmp_path / "other.onnx").touch()
+  (tmp_path / "other.yaml").write_text("format: something else")
+  for args, said in [
+    (["play", str(tmp_path / "policy.onnx")], "policy.yaml does not exist"),
+    (["play", str(tmp_path / "other.onnx")], "other.yaml is not a policy's contract"),
+    (["play", str(tmp_path / "none")], "does not exist: give a run directory"),
+    (["play", str(tmp_path), "--episodes", "0"], "--episodes=0 must be above 0"),
+    (["play", str(tmp_path), "--viewer"], "--viewer needs a display"),
+    (["export", str(tmp_path)], "holds no checkpoint"),
+  ]:
+    assert command(*args) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and said in line

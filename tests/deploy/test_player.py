@@ -1,0 +1,81 @@
+"""Watching a policy: commands and pushes of the watcher, and episodes that begin anew."""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.viewer
+import numpy as np
+import pytest
+from rich.console import Console
+
+from playground.deploy.player import Player
+from playground.deploy.viewer import view
+from playground.envs.base import State
+from playground.envs.c_physics import on_c_physics
+from playground.envs.physics import PhysicsData
+from playground.registry import load
+from tests.dummy import Point
+
+NO_ACTION: Any = SimpleNamespace(contract={"policy": {"entry": "state"}}, actions=lambda obs: np.zeros(2))
+
+
+class Commanded(Point):
+  """Shows the command and the force that reached it; draws a command of its own, 7, in each step."""
+
+  mj_model: Any = SimpleNamespace(nbody=1)  # pyright: ignore[reportIncompatibleVariableOverride]
+
+  def reset(self, rng: jax.Array, model: Any = None) -> State:
+    state = super().reset(rng)
+    data = state.data.replace(xfrc_applied=jnp.zeros((1, 6)))
+    return state.replace(data=data, info=state.info | {"command": jnp.zeros(3)})
+
+  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+    state = super().evaluate(data, info, action)
+    return state.replace(
+      reward=info["command"][0],
+      metrics={"force": data.xfrc_applied[0, 0]},
+      info=state.info | {"command": jnp.full(3, 7.0)},
+    )
+
+
+def test_what_the_watcher_asks_for() -> None:
+  player = Player(Commanded(episode_length=4), NO_ACTION)
+  assert player.takes_commands and player.period == 0.1
+  assert player.decide().reward == 0
+  assert player.decide().reward == 7  # the task's own
+  player.command, player.force[0, 0] = np.array([0.5, 0, 0]), 20.0
+  state = player.decide()
+  assert (state.reward, state.metrics["force"]) == (0.5, 20)
+  assert player.episode_return == 7.5
+  player.command, player.force[0, 0] = None, 0.0
+  assert (player.decide().reward, player.state.metrics["force"]) == (7, 0)
+  player.decide()  # of the next episode
+  assert (player.state.info["age"], player.episode_return) == (1, 0)
+
+
+def test_the_viewer_shows_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+  env = on_c_physics(load("CartpoleBalance"))
+  shown: list[np.ndarray] = []
+  keys: list[Any] = []
+
+  @contextlib.contextmanager
+  def window(model: mujoco.MjModel, data: mujoco.MjData, key_callback: Any) -> Iterator[Any]:
+    assert model is env.mj_model
+    keys.append(key_callback)
+    yield SimpleNamespace(
+      is_running=lambda: len(shown) < 3,
+      lock=contextlib.nullcontext,
+      perturb=mujoco.MjvPerturb(),
+      sync=lambda: shown.append(data.qpos.copy()),
+    )
+
+  monkeypatch.setattr(mujoco.viewer, "launch_passive", window)
+  full: Any = SimpleNamespace(contract=NO_ACTION.contract, actions=lambda obs: np.ones(1))
+  view(env, full, 0, Console(quiet=True))
+  assert shown[0][0] < shown[1][0] < shown[2][0]  # the cart drives off
+  keys[0](265)  # a command to a task that takes none
