@@ -7,7 +7,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 # Compiling is most of what the tests do. Git ignores the folder; nothing is lost with it but time.
-TEST_ENV := JAX_COMPILATION_CACHE_DIR="$(CURDIR)/.pytest_cache/xla"
+TEST_ENV := JAX_COMPILATION_CACHE_DIR="$(CURDIR)/.pytest_cache/xla" WARP_CACHE_PATH="$(CURDIR)/.pytest_cache/warp"
 
 .DEFAULT_GOAL := setup
 .PHONY: setup run test test-slow lint wheel

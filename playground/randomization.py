@@ -8,7 +8,8 @@ terms:
   - {field: body_mass, target: trunk, operation: add, distribution: normal, mean: 0.0, std: 0.5}
 ```
 
-Terms apply in order, each to the result of those before. Derived quantities (`body_subtreemass`, `dof_invweight0`,
+Terms apply in order, each to the result of those before. Lights, cameras, colours and materials are fields like any
+others (docs/vision.md). Derived quantities (`body_subtreemass`, `dof_invweight0`,
 `body_invweight0`, `dof_M0`) keep their nominal values, as in Playground 0.2.0.
 """
 
@@ -23,6 +24,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
+from mujoco.mjx._src.math import quat_mul, rotate
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 
@@ -34,17 +36,26 @@ _OBJECTS = {
   "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
   "tendon": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
   "pair": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
+  "light": (mujoco.mjtObj.mjOBJ_LIGHT, "nlight"),
+  "cam": (mujoco.mjtObj.mjOBJ_CAMERA, "ncam"),
+  "mat": (mujoco.mjtObj.mjOBJ_MATERIAL, "nmat"),
   "jnt": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
   "dof": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
   "qpos": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
 }
-# A servo pulls with gain * ctrl + bias * q: the position gain stands in two fields, with opposite signs.
-_LINKED = {"actuator_kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0))}
+# What stands in two fields: (field, column, sign) of each. A servo pulls with gain * ctrl + bias * q, so its position
+# gain is in both with opposite signs; a body that is denser has more inertia in proportion.
+_LINKED: dict[str, tuple[tuple[str, int | None, float], ...]] = {
+  "actuator_kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)),
+  "body_density": (("body_mass", None, 1.0), *(("body_inertia", axis, 1.0) for axis in range(3))),
+}
+_SCALED_ONLY = ("body_density",)
 
 _OPERATIONS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
   "set": lambda nominal, draw: jnp.broadcast_to(draw, nominal.shape),
   "scale": lambda nominal, draw: nominal * draw,
   "add": lambda nominal, draw: nominal + draw,
+  "rotate": lambda nominal, draw: jax.vmap(_turn)(nominal, draw),
 }
 _DISTRIBUTIONS: dict[str, Callable[[jax.Array, tuple[int, ...], float, float], jax.Array]] = {
   "uniform": lambda key, shape, lo, hi: jax.random.uniform(key, shape, minval=lo, maxval=hi),
@@ -52,7 +63,9 @@ _DISTRIBUTIONS: dict[str, Callable[[jax.Array, tuple[int, ...], float, float], j
     jax.random.uniform(key, shape, minval=math.log(lo), maxval=math.log(hi))
   ),
   "normal": lambda key, shape, mean, std: mean + std * jax.random.normal(key, shape),
+  "bernoulli": lambda key, shape, mean, _: jax.random.bernoulli(key, mean, shape),
 }
+_PARAMETERS = {"normal": ("mean", "std"), "bernoulli": ("mean",)}  # of the others: range
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,14 +73,16 @@ class Term:
   """One randomisation term, as written in `configs/randomization/*.yaml`.
 
   Attributes:
-    field: a float field of `mjx.Model` with a row per geom, body, site, actuator, tendon, pair, joint, dof or qpos
-      entry, or `actuator_kp`, which moves a position servo's gain and bias together.
+    field: a field of `mjx.Model`, of numbers or switches, with a row per geom, body, site, actuator, tendon, pair,
+      light, camera, material, joint, dof or qpos entry, or `actuator_kp`, which moves a position servo's gain and bias
+      together, or `body_density`, which scales a body's mass and inertia together.
     target: whose rows: a name, a list of names, `all`, or `joints` (every joint but the free ones).
-    operation: `set`, `scale` or `add`.
+    operation: `set`, `scale`, `add`, or `rotate`, which turns a direction or quaternion about a random axis by the
+      angle that is drawn, rad.
     range: (low, high) of `uniform` and `log_uniform`.
-    mean: of `normal`.
+    mean: of `normal`, and of `bernoulli` the probability of true.
     std: of `normal`.
-    distribution: `uniform`, `log_uniform` or `normal`.
+    distribution: `uniform`, `log_uniform` or `normal`; of a switch `bernoulli`.
     column: column, or columns, of a two-dimensional field; None is all.
     shared: one draw for all entries, instead of one for each.
   """
@@ -84,18 +99,20 @@ class Term:
 
   @property
   def parameters(self) -> tuple[float, float]:
-    """The distribution's two parameters: (low, high) or (mean, std)."""
-    first, second = (self.mean, self.std) if self.distribution == "normal" else (self.range or (None, None))
+    """The distribution's two parameters: (low, high) or (mean, std); a bernoulli's std is 0 here."""
+    moments = (self.mean, 0.0 if self.distribution == "bernoulli" else self.std)
+    first, second = moments if self.distribution in _PARAMETERS else (self.range or (None, None))
     return first, second  # pyright: ignore[reportReturnType]  # parse has seen that they are numbers
 
   def describe(self) -> dict[str, str]:
     """Field, target, operation and draw (distribution and parameters), for people."""
     first, second = self.parameters
+    parameters = f"{first:g}" if self.distribution == "bernoulli" else f"{first:g}, {second:g}"
     return {
       "field": self.field if self.column is None else f"{self.field}[:, {self.column}]",
       "target": self.target if isinstance(self.target, str) else ", ".join(self.target),
       "operation": self.operation,
-      "draw": f"{self.distribution}({first:g}, {second:g})",
+      "draw": f"{self.distribution}({parameters})",
     }
 
   @classmethod
@@ -111,7 +128,7 @@ class Term:
     parsed = cls(**term)
     _choose(f"{key}.operation", parsed.operation, _OPERATIONS)
     _choose(f"{key}.distribution", parsed.distribution, _DISTRIBUTIONS)
-    needed = ("mean", "std") if parsed.distribution == "normal" else ("range",)
+    needed = _PARAMETERS.get(parsed.distribution, ("range",))
     for name in ("range", "mean", "std"):
       if (name in needed) != (getattr(parsed, name) is not None):
         verb = "needs" if name in needed else "has no"
@@ -125,7 +142,9 @@ class Term:
       raise ConfigError(f"{key}.{needed[0]}: {values} are not two finite numbers.")
     if parsed.distribution == "normal" and values[1] < 0:
       raise ConfigError(f"{key}.std={values[1]} is negative.")
-    if parsed.distribution != "normal" and values[0] > values[1]:
+    if parsed.distribution == "bernoulli" and not 0 <= values[0] <= 1:
+      raise ConfigError(f"{key}.mean={values[0]} is no probability.")
+    if "range" in needed and values[0] > values[1]:
       raise ConfigError(f"{key}.range={list(values)} has its low end above its high end.")
     if parsed.distribution == "log_uniform" and values[0] <= 0:
       raise ConfigError(f"{key}.range={list(values)} must be above 0 for log_uniform.")
@@ -153,9 +172,16 @@ class _Draw(NamedTuple):
 
   def __call__(self, key: jax.Array) -> jax.Array:
     # One flat draw, a scalar if single: the order and shapes of Playground 0.2.0, so that the numbers are the same.
+    if self.term.operation == "rotate":
+      key, axis_key = jax.random.split(key)
+      axes = jax.random.normal(axis_key, (*(() if self.term.shared else self.shape), 3))
     scalar = self.count == 1
     draw = _DISTRIBUTIONS[self.term.distribution](key, () if scalar else (self.count,), *self.term.parameters)
-    return draw if scalar else draw.reshape(self.shape)
+    draw = draw if scalar else draw.reshape(self.shape)
+    if self.term.operation == "rotate":
+      axes = axes / jnp.linalg.norm(axes, axis=-1, keepdims=True)
+      return jnp.broadcast_to(jnp.asarray(draw)[..., None] * axes, (*self.shape, 3))
+    return draw
 
 
 class Randomizer:
@@ -184,7 +210,7 @@ class Randomizer:
       drawn, operation = draw(draw_key), _OPERATIONS[draw.term.operation]
       for field, index, sign in draw.slots:
         new = sign * operation(sign * values[field][index], drawn)
-        values[field] = values[field].at[index].set(new)
+        values[field] = values[field].at[index].set(new.astype(values[field].dtype))
     return values
 
   def sample_batch(self, keys: jax.Array) -> dict[str, jax.Array]:
@@ -250,11 +276,17 @@ def _bind(mj_model: mujoco.MjModel, term: Term, key: str) -> _Draw:
       f"{key}.field {term.field!r} is no field of the model that can be randomised.{nearest(str(term.field), fields)}"
     )
   rows = _rows(mj_model, term, key)
+  _check_kind(mj_model, term, key)
   if term.field in _LINKED:
     if term.column is not None:
       raise ConfigError(f"{key}.column={term.column!r}: field {term.field!r} has no columns, leave the key out.")
-    slots = [_Slot(field, np.ix_(rows, np.array([column])), sign) for field, column, sign in _LINKED[term.field]]
-    return _Draw(term, tuple(slots), (len(rows), 1))
+    if term.field in _SCALED_ONLY and term.operation != "scale":
+      raise ConfigError(f"{key}.operation={term.operation!r}: field {term.field!r} can only be scaled.")
+    slots = [
+      _Slot(field, (rows,) if column is None else (rows, np.array(column)), sign)
+      for field, column, sign in _LINKED[term.field]
+    ]
+    return _Draw(term, tuple(slots), (len(rows),))
   shape = getattr(mj_model, term.field).shape
   width = shape[1] if len(shape) == 2 else 0
   if term.column is None:
@@ -265,15 +297,36 @@ def _bind(mj_model: mujoco.MjModel, term: Term, key: str) -> _Draw:
       allowed = f"columns 0 to {width - 1}" if width else "no columns, leave the key out"
       raise ConfigError(f"{key}.column={term.column!r}: field {term.field!r} has {allowed}.")
   index = np.ix_(rows, np.array(columns)) if width else (rows,)
+  if term.operation == "rotate":
+    return _Draw(term, (_Slot(term.field, index, 1.0),), (len(rows),))
   return _Draw(term, (_Slot(term.field, index, 1.0),), (len(rows), len(columns)) if width else (len(rows),))
 
 
+def _check_kind(mj_model: mujoco.MjModel, term: Term, key: str) -> None:
+  """Raises ConfigError where an operation or distribution does not go with the field."""
+  values = getattr(mj_model, term.field, None)
+  is_switch = values is not None and values.dtype == bool
+  if is_switch != (term.distribution == "bernoulli") or (is_switch and term.operation != "set"):
+    needs = "is a switch: it needs operation set, distribution bernoulli" if is_switch else "is no switch"
+    raise ConfigError(f"{key}: field {term.field!r} {needs}, not {term.operation} and {term.distribution}.")
+  turns = values is not None and values.ndim == 2 and values.shape[1] in (3, 4) and term.column is None
+  if term.operation == "rotate" and not turns:
+    raise ConfigError(f"{key}.operation='rotate' needs a whole field of directions or quaternions, not {term.field!r}.")
+
+
+def _turn(row: jax.Array, by: jax.Array) -> jax.Array:
+  """A direction [3] or quaternion [4] after a turn by a rotation vector, rad, in the frame that it is given in."""
+  angle = jnp.linalg.norm(by)
+  half = jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sinc(angle / (2 * jnp.pi)) / 2 * by])
+  return rotate(row, half) if len(row) == 3 else quat_mul(half, row)
+
+
 def _randomizable(mj_model: mujoco.MjModel) -> list[str]:
-  """Float fields that are arrays (not constants) of an `mjx.Model`, with a row per object."""
+  """Fields of numbers or switches that are arrays (not constants) of an `mjx.Model`, with a row per object."""
   fields = dataclasses.fields(mjx.Model)  # pyright: ignore[reportArgumentType]  # MJX's own dataclass decorator
   names = [field.name for field in fields if field.type in (jax.Array, "jax.Array")]
   arrays = {name: getattr(mj_model, name, None) for name in names if _prefix(name) in _OBJECTS}
-  return [n for n, a in arrays.items() if isinstance(a, np.ndarray) and a.dtype.kind == "f" and a.ndim in (1, 2)]
+  return [n for n, a in arrays.items() if isinstance(a, np.ndarray) and a.dtype.kind in "fb" and a.ndim in (1, 2)]
 
 
 def _prefix(field: str) -> str:

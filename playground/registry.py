@@ -14,7 +14,7 @@ The folder is laid out like our `configs/`: `env/MyTask.yaml`, and whatever else
 import functools
 import importlib
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from ml_collections import ConfigDict
 
@@ -74,8 +74,14 @@ def load(
 
 
 def build(env_config: ConfigDict) -> "Env":
-  """Builds the task that a composed env section describes."""
-  return task_class(str(env_config.task))(env_config)
+  """Builds the task that a composed env section describes, with a camera if that says so (`env.vision`)."""
+  env = task_class(str(env_config.task))(env_config)
+  vision: Any = env_config.get("vision")
+  if vision is None or not vision.enable:
+    return env
+  from playground.envs.vision import Vision
+
+  return cast("Env", Vision(env))  # it is one in all but class
 
 
 def task_class(task: str) -> Callable[[ConfigDict], "Env"]:

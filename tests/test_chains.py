@@ -117,6 +117,11 @@ def test_every_chain_has_an_experiment():
       ("env.termination.power", "env.reward.scales.energy", "env.reward.scales.dof_acc"),
       [(None, 0.0, 0.0), *((watts, -0.003, -2.5e-7) for watts in (400.0, 300.0, 250.0, 200.0))],
     ),
+    (
+      "leap_reorient_chain",  # paper, Section IV-C.1
+      ("env.torque_limits", "env.noise.pose.injection", "agent.num_timesteps", "agent.learning_rate"),
+      [(False, 0.0, 200_000_000, 3e-4), (True, 0.1, 100_000_000, 1e-4)],
+    ),
     ("g1_rough_chain", ("choices.env",), [("G1JoystickFlatTerrain",), ("G1JoystickRoughTerrain",)]),
   ],
 )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import json
 import math
 import re
 import shutil
@@ -14,7 +15,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from playground import config
-from playground.config import compose
+from playground.config import compose, from_saved
 from playground.errors import ConfigError, UnknownNameError
 
 TUNED = ["experiment=cartpole_balance"]
@@ -229,7 +230,7 @@ def test_composing_needs_no_jax():
 ERRORS = {
   "env=Go1Joystic": ["env=Go1Joystic does not exist", "that `playground list` shows", "'Go1JoystickFlatTerrain'?"],
   "experiment=quickstar": ["experiment=quickstar", "that `playground-run --help` shows", "Did you mean 'quickstart'?"],
-  "hardware=tpu": ["hardware=tpu does not exist: choose from auto, cpu, gpu."],
+  "hardware=tpu": ["hardware=tpu does not exist: choose from the ", "`playground-run --help` shows"],
   "env=_cartpole": ["env=_cartpole does not exist", "Did you mean 'Cartpole"],
   "env=null": ["env=null does not exist: choose from the "],
   "experimen=foo": ["experimen does not exist", "Did you mean 'experiment'?"],
@@ -351,3 +352,25 @@ def test_override_section():
   assert changed["reward"]["scales"]["energy"] == -1.0
   assert changed["command"]["max"] == [1.0, 0.5, 0.5]
   assert not math.isclose(env.reward.scales.energy, -1)
+
+
+def test_a_run_saved_by_an_earlier_version_gets_todays_keys_but_keeps_its_choices() -> None:
+  now = compose(["env=Go1JoystickFlatTerrain", "agent.num_envs=512"])
+  saved = json.loads(json.dumps(now.resolved))
+  del saved["hardware"]["distributed"], saved["video"]["visuals"], saved["agent"]["network"]["value_dtype"]
+  del saved["env"]["pushes"]["kind"], saved["env"]["reward"]["scales"]["energy"]
+  saved["video"]["width"] = 320
+  again = from_saved(saved)
+  assert again.hardware.distributed == now.hardware.distributed
+  assert (again.video.visuals, again.video.width) == ("primitives", 320)
+  assert again.agent.network.value_dtype == "auto" and again.agent.num_envs == 512
+  assert again.env.pushes.kind == "kick"
+  assert "energy" not in again.env.reward.scales, "a term that the run did not have stays out"
+
+
+def test_a_saved_run_whose_task_is_gone_keeps_what_it_has() -> None:
+  saved = json.loads(json.dumps(compose(["env=CartpoleBalance"]).resolved))
+  saved["choices"]["env"] = "NoLongerThere"
+  del saved["hardware"]["distributed"]
+  again = from_saved(saved)
+  assert again.choices["env"] == "NoLongerThere" and "distributed" in again.hardware

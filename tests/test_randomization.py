@@ -16,7 +16,9 @@ from mujoco import mjx
 
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError
 from playground.randomization import Randomizer, domain_randomizer, parse_terms
+from playground.robots.in_hand import CUBES, build_in_hand_scene
 from playground.robots.scene import build_scene
+from playground.robots.tabletop import build_tabletop
 
 CONFIGS = Path(__file__).parents[1] / "configs/randomization"
 GO1 = yaml.safe_load((CONFIGS / "go1.yaml").read_text())["terms"]
@@ -120,13 +122,28 @@ DRAWN |= {
   "g1_strong": [1, 29, 29, 29, 3, 31, 1, 29, 29],
   "t1_strong": [1, 23, 23, 23, 3, 25, 1, 23, 23, 4],
 }
+# Hands: their terms are 0.2.0's, but each has a key of its own.
+DRAWN |= {
+  "leap_hand": [1, 1, 3, 16, 16, 16, 17, 16, 16],
+  "aero_hand": [1, 1, 1, 3, 16, 16, 16, 21, 7, 16],
+}
+
+
+DRAWN |= {"panda_vision": [1, 1, 1, 1, 1, 3, 1, 1, 3, 1]}
+
+
+def model_of(robot: str) -> mujoco.MjModel:
+  if robot == "panda_vision":
+    return build_tabletop("panda_single_cube_pixels").compile()
+  build = build_in_hand_scene if robot in CUBES else build_scene
+  return build(robot.removesuffix("_strong")).compile()
 
 
 def test_every_robots_terms_bind_to_its_model() -> None:
   assert set(DRAWN) == {path.stem for path in CONFIGS.glob("*.yaml")} - {"none"}
   for robot, drawn in DRAWN.items():
     terms = yaml.safe_load((CONFIGS / f"{robot}.yaml").read_text())["terms"]
-    rows = Randomizer(build_scene(robot.removesuffix("_strong")).compile(), terms).describe()
+    rows = Randomizer(model_of(robot), terms).describe()
     assert [int(row["values"]) for row in rows] == drawn, robot
 
 
@@ -186,6 +203,46 @@ def test_position_gain_moves_gain_and_bias(small: mujoco.MjModel) -> None:
     np.testing.assert_allclose(gain[:, 0], -bias[:, 1], rtol=1e-6)
     assert (gain[:, 0] != small.actuator_gainprm[:, 0]).all()
     np.testing.assert_allclose(bias[:, 2], small.actuator_biasprm[:, 2])
+
+
+def test_density_moves_mass_and_inertia_in_proportion(small: mujoco.MjModel) -> None:
+  term = {"field": "body_density", "target": ["hand", "base"], "operation": "scale", "range": [0.5, 2.0]}
+  sample = Randomizer(small, [term]).sample(jax.random.PRNGKey(1))
+  ratio = np.asarray(sample["body_mass"])[1:] / small.body_mass[1:]
+  np.testing.assert_allclose(sample["body_inertia"][1:], small.body_inertia[1:] * ratio[:, None], rtol=1e-6)
+  assert ratio[small.body("arm").id - 1] == pytest.approx(1) and len(np.unique(ratio)) == 3
+
+
+@pytest.mark.parametrize("hand", CUBES)
+def test_a_hands_terms_change_what_the_paper_lists(hand: str) -> None:
+  """Friction of the fingertips, cube's mass and centre, joints' calibration, friction and inertia, links, gains."""
+  model = model_of(hand)
+  randomizer = Randomizer(model, yaml.safe_load((CONFIGS / f"{hand}.yaml").read_text())["terms"])
+  batch = {name: np.asarray(value) for name, value in jax.jit(randomizer.sample_batch)(keys(32)).items()}
+  nominal = {name: getattr(model, name) for name in batch}
+  tips = [model.geom(i).id for i in range(model.ngeom) if model.geom(i).name.endswith("_tip")]
+  friction = batch["geom_friction"][:, tips, 0]
+  assert (friction == friction[:, :1]).all() and friction.min() >= 0.5 and friction.max() <= 1.0
+
+  cube, links = model.body("cube").id, slice(2, model.body("cube").id)  # after world and mount
+  for bodies, low, high in (([cube], 0.8, 1.2), (links, 0.9, 1.1)):
+    ratio = batch["body_mass"][:, bodies] / nominal["body_mass"][bodies]
+    assert low - 1e-5 <= ratio.min() < ratio.max() <= high + 1e-5 and (ratio.std(axis=0) > 0).all()
+    inertia = batch["body_inertia"][:, bodies] / nominal["body_inertia"][bodies]
+    np.testing.assert_allclose(inertia, np.repeat(ratio[..., None], 3, axis=2), rtol=1e-4)
+  np.testing.assert_allclose(batch["body_mass"][:, -1], nominal["body_mass"][-1], rtol=1e-6)  # the goal's
+  assert np.abs(batch["body_ipos"][:, cube] - nominal["body_ipos"][cube]).max() <= 0.005 + 1e-6
+
+  for field, low, high in (("dof_frictionloss", 0.5, 2.0), ("dof_armature", 1.0, 1.05), ("dof_damping", 0.8, 1.2)):
+    ratio = batch[field][:, :16] / nominal[field][:16]
+    assert low - 1e-5 <= ratio.min() < ratio.max() <= high + 1e-5 and (ratio.std(axis=0) > 0).all()
+    np.testing.assert_array_equal(batch[field][:, 16:], np.zeros((32, 6)))  # the cube's free joint
+  offset = batch["qpos0"] - nominal["qpos0"]
+  assert np.abs(offset[:, :16]).max() <= 0.05 + 1e-6 and (offset[:, :16].std(axis=0) > 0).all()
+  np.testing.assert_allclose(offset[:, 16:], 0, atol=1e-6)
+  kp = batch["actuator_gainprm"][:, :, 0] / nominal["actuator_gainprm"][:, 0]
+  np.testing.assert_allclose(batch["actuator_biasprm"][:, :, 1], -batch["actuator_gainprm"][:, :, 0], rtol=1e-6)
+  assert 0.8 - 1e-5 <= kp.min() < kp.max() <= 1.2 + 1e-5
 
 
 @pytest.mark.parametrize(
@@ -283,6 +340,7 @@ GOOD = {"field": "body_mass", "target": "hand", "operation": "scale", "range": [
     ({"range": [0.9]}, ConfigError, "not a pair"),
     ({"range": [0, float("nan")]}, ConfigError, "not two finite numbers"),
     ({"column": 0}, ConfigError, "has no columns"),
+    ({"field": "body_density", "operation": "set"}, ConfigError, "field 'body_density' can only be scaled"),
     ({"field": "body_ipos", "column": 3}, ConfigError, "has columns 0 to 2"),
     ({"rnage": [1, 2]}, UnknownNameError, "Did you mean 'range'?"),
   ],

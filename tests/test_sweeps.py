@@ -8,7 +8,7 @@ import pytest
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from playground.config import compose, expand, first_job, options, sweeps, task_names
+from playground.config import combinations, compose_all, compose_settings, expand, options, sweeps, task_names, varying
 from playground.errors import ConfigError, UnknownNameError
 
 
@@ -21,9 +21,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def jobs(overrides: list[str]) -> list[list[str]]:
-  """The runs that Hydra's sweeper makes of overrides."""
+  """The runs that overrides stand for, which are those that Hydra's sweeper makes of them."""
   (batch,) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(overrides), None)
-  return batch
+  found = combinations(overrides)
+  assert found == batch
+  return found
 
 
 @pytest.mark.parametrize("agent", ["ppo", "sac"])
@@ -45,15 +47,23 @@ def test_locomotion_is_19_tasks_with_5_seeds():
   assert set(map(tuple, found)) == expected
 
 
+def test_manipulation_is_10_tasks_with_5_seeds():
+  handled = {name for name in task_names() if re.match("(Aero|Aloha|Leap|Panda)(?!.*Vision)", name)}
+  expected = {(f"env={task}", "agent=ppo", f"seed={seed}") for task in handled for seed in range(5)}
+  found = jobs(expand(["sweep=manipulation_ppo"]))
+  assert len(found) == 10 * 5
+  assert set(map(tuple, found)) == expected
+
+
 def test_every_sweep_we_ship_starts():
   for name in sweeps.sweep_names():
-    compose(first_job(expand([f"sweep={name}", "debug=fast"])))
+    compose_all(combinations(expand([f"sweep={name}", "debug=fast"]))[:1])
 
 
 def test_a_file_spelt_out(folder: Path):
   env = ",".join(["CartpoleBalance", *(name for name in task_names() if name.startswith("Go1"))])
   assert expand(["sweep=mine"]) == [f"env={env}", "agent=ppo", "seed=range(2)"]
-  assert first_job(expand(["sweep=mine"])) == ["env=CartpoleBalance", "agent=ppo", "seed=0"]
+  assert combinations(expand(["sweep=mine"]))[0] == ["env=CartpoleBalance", "agent=ppo", "seed=0"]
 
 
 def test_the_command_line_replaces_what_the_file_says(folder: Path):
@@ -76,8 +86,8 @@ def test_a_list_in_a_file_is_its_values_one_by_one(folder: Path):
   {
     "env=glob(*)": task_names(),  # neither parts such as _cartpole nor generic tasks such as joystick
     "env=glob(Cartpole*)": [name for name in task_names() if name.startswith("Cartpole")],
-    "env=glob(Cartpole*,exclude=*Sparse)": ["CartpoleBalance", "CartpoleSwingup"],
-    "env=glob([*lanceSparse,CartpoleB*])": ["CartpoleBalance", "CartpoleBalanceSparse"],
+    "env=glob(Cartpole*,exclude=*Sparse)": ["CartpoleBalance", "CartpoleBalanceVision", "CartpoleSwingup"],
+    "env=glob([*lanceSparse,CartpoleS*])": ["CartpoleBalanceSparse", "CartpoleSwingup", "CartpoleSwingupSparse"],
     "env=CartpoleSwingup,glob(CartpoleS*)": ["CartpoleSwingup", "CartpoleSwingupSparse"],
     "hardware=glob(*pu)": ["cpu", "gpu"],
     "tuned=glob(ppo/*)": [name for name in options("tuned") if name.startswith("ppo/")],
@@ -129,7 +139,67 @@ def test_files_that_are_no_sweep(folder: Path, text: str, message: str):
   assert "\n" not in str(caught.value)
 
 
-def test_a_key_that_does_not_exist_is_found_in_the_first_job(folder: Path):
+def test_every_job_is_checked_and_named(folder: Path):
   (folder / "typo.yaml").write_text("params: {env: CartpoleBalance, agent.learning_rat: [1, 2]}\n")
   with pytest.raises(UnknownNameError, match=r"Did you mean 'agent\.learning_rate'\?"):
-    compose(first_job(expand(["sweep=typo"])))
+    compose_all(combinations(expand(["sweep=typo"])))
+  with pytest.raises(ConfigError, match=r"^Job env=CartpoleSwingup agent\.num_envs=7: agent\.num_envs=7 does not"):
+    compose_all(combinations(["env=CartpoleBalance,CartpoleSwingup", "agent.num_envs=256,7"])[2:])
+
+
+@pytest.mark.parametrize(
+  ("lines", "count", "keys"),
+  [
+    ("seed=range(3) env=CartpoleBalance,CheetahRun", 6, ["seed", "env"]),
+    ("agent.learning_rate=choice(0.1,0.2) seed=1", 2, ["agent.learning_rate"]),
+    ("seed=1,1", 1, ["seed"]),
+    ("tuned=null", 1, []),
+    ("tuned=null,ppo/CheetahRun", 2, ["tuned"]),
+    ("experiment=go1_joystick,spot_joystick env.reward.scales.energy=-0.001", 2, ["experiment"]),
+    ("agent.network.policy_hidden_layer_sizes=[8],[8,8]", 2, ["agent.network.policy_hidden_layer_sizes"]),
+  ],
+)
+def test_combinations(lines: str, count: int, keys: list[str]):
+  overrides = expand(lines.split())
+  assert (len(combinations(overrides)), varying(overrides)) == (count, keys)
+  compose_all(combinations(overrides))
+
+
+@pytest.mark.parametrize(
+  ("line", "message"),
+  {
+    "run_dir=x": "run_dir=x cannot be given with -m",
+    "resume=x": "resume=x cannot be given with -m",
+    "hydra.sweep.dir=x": "hydra.sweep.dir=x: -m does not use Hydra's",
+    "hydra/launcher=joblib": "hydra/launcher=joblib: -m does not use Hydra's",
+  }.items(),
+)
+def test_keys_that_jobs_cannot_have(line: str, message: str):
+  with pytest.raises(ConfigError) as caught:
+    sweeps.split(["seed=1", line])
+  assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+  ("line", "message"),
+  {
+    "launcher=slrm": "launcher=slrm does not exist: choose from local, ray, slurm. Did you mean 'slurm'?",
+    "launcher.timeot=3": "launcher.timeot does not exist",
+    "launcher.timeout=-3": "launcher.timeout=-3 must be a number above 0.",
+    "launcher.slots_per_gpu=many": "launcher.slots_per_gpu=many has the wrong type",
+    "on_error=halt": "on_error=halt is unknown: choose from continue, stop.",
+    "launcher=local,slurm": "launcher=local,slurm names several values",
+  }.items(),
+)
+def test_settings_are_checked(line: str, message: str):
+  with pytest.raises(ConfigError) as caught:
+    compose_settings([line])
+  assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize("launcher", options("launcher"))
+@pytest.mark.parametrize("search", options("search"))
+def test_settings(launcher: str, search: str):
+  settings = compose_settings([f"launcher={launcher}", f"search={search}", "launcher.timeout=90", "sweep_dir=x"])
+  assert (settings.launcher.name, settings.search.name) == (launcher, search)
+  assert (settings.launcher.timeout, settings.sweep_dir, settings.on_error) == (90, "x", "continue")

@@ -29,8 +29,9 @@ def test_contents(wheel: Path):
   names = set(zipfile.ZipFile(wheel).namelist())
   configs = {
     path.relative_to(REPOSITORY).as_posix()
-    for folder in ("configs", "sweeps")
-    for path in (REPOSITORY / folder).rglob("*.yaml")
+    for folder in ("configs", "sweeps", "benchmarks")
+    for pattern in ("*.yaml", "*.csv")
+    for path in (REPOSITORY / folder).rglob(pattern)
   }
   package = {
     path.relative_to(REPOSITORY).as_posix()

@@ -1,24 +1,21 @@
 """`playground eval <run>`: episodes of a trained policy, measured on this machine."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
 from rich.console import Console
 from rich.table import Table
 
-from playground import config as configs
-from playground import registry
+from playground.benchmark.suites import paper_table
 from playground.errors import ConfigError
-from playground.hardware.setup import setup, this_machine
-from playground.learning.algorithms import make_learner
-from playground.learning.checkpoints import Checkpoint, find_checkpoints
 from playground.learning.evaluation import make_evaluator
 from playground.rendering.video import render_video
 from playground.rendering.visuals import drawn_model
 from playground.runs.files import write_json
 from playground.runs.job import episodes_of
-from playground.runs.run_dir import RunDirectory
 from playground.runs.train import randomized_models
+from playground.runs.trained import load_trained
 
 
 def evaluate_run(
@@ -47,31 +44,26 @@ def evaluate_run(
     PlaygroundError: no such run or checkpoint, or one that does not fit.
   """
   console = console or Console()
-  checkpoint = Checkpoint(find_checkpoints(path)[0])
-  run_dir = RunDirectory.open(checkpoint.path.parents[1])
-  run = configs.from_dict(run_dir.config)
-  hardware = setup(this_machine(run.hardware))
+  trained = load_trained(path)
+  run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
   count = run.agent.num_eval_envs if episodes is None else episodes
   if count < 1:
     raise ConfigError(f"--episodes={count} must be above 0.")
-  env = registry.load(run.choices["env"], config=run.env)
   drawn = drawn_model(env, run.video.visuals)
   _, model = randomized_models(env, run, 1, count)
-  learner = make_learner(env, run.agent, hardware.mesh, hardware.network_precision)
-  policy = learner.place_policy(checkpoint.restore("policy", learner.policy_shape()))
-  act = lambda policy, obs, key: learner.act(policy, obs, key, deterministic or None)
+  act = lambda policy, obs, key: trained.learner.act(policy, obs, key, deterministic or None)
   evaluate = make_evaluator(env, act, count, hardware.mesh, 1 if video else 0)
-  scores, recording = evaluate(policy, jax.random.PRNGKey(seed), model)
+  scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model)
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
 
-  table = Table(title=f"{run.choices['env']}, {count} episodes, {checkpoint.step:,} steps trained")
-  table.add_column("per episode")
-  table.add_column("mean", justify="right")
-  for name, value in scores.items():
-    table.add_row(name.removeprefix("episode_"), f"{value:.4g}")
-  console.print(table)
+  title = f"{trained.task}, {count} episodes, {checkpoint.step:,} steps trained"
+  real = [row for row in paper_table("hardware") if row["task"] == trained.task]
+  console.print(_table(title, {name.removeprefix("episode_"): value for name, value in scores.items()}, real))
+  for row in real:
+    console.print(f"hardware, {row['metric']}: {row['what']}; {row['trials']} trials (paper, {row['where']})")
   report = {"checkpoint": str(checkpoint.path), "episodes": count, "seed": seed, "scores": scores} | hardware.facts
-  out = run_dir.path / "eval" / f"step_{checkpoint.step:012d}_seed_{seed}.json"
+  report |= {"hardware_in_paper": real} if real else {}
+  out = trained.run_dir.path / "eval" / f"step_{checkpoint.step:012d}_seed_{seed}.json"
   out.parent.mkdir(exist_ok=True)
   write_json(out, report)
   console.print(f"written to {out}", soft_wrap=True)
@@ -79,3 +71,16 @@ def evaluate_run(
     tape = episodes_of(recording, 1)
     render_video(drawn, out_path=Path(video), dt=env.dt * env.action_repeat, notify=console.print, **tape)
   return 0
+
+
+def _table(title: str, scores: Mapping[str, float], real: Sequence[Mapping[str, str]]) -> Table:
+  """Scores, beside what the paper measured on real robots (rows of benchmarks/paper/hardware.csv) where it did."""
+  table = Table(title=title)
+  table.add_column("per episode")
+  table.add_column("simulation, mean" if real else "mean", justify="right")
+  if real:
+    table.add_column("hardware, mean (paper)", justify="right")
+  on_hardware = {row["metric"]: f"{row['mean']} ± {row['ci95']}".removesuffix(" ± ") for row in real}
+  for name, value in scores.items():
+    table.add_row(name, f"{value:.4g}", *([on_hardware.get(name, "")] if real else []))
+  return table

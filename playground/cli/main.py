@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from playground import registry
 from playground.config import RunConfig, compose, format_value
-from playground.errors import PlaygroundError, UnknownNameError, nearest
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
 from playground.rendering.gl import withhold_gl
 
 if TYPE_CHECKING:
@@ -44,6 +44,8 @@ def _parser() -> argparse.ArgumentParser:
   show = add("show", _show, "Show what a task observes, does, is paid for and is trained with.")
   show.add_argument("task", help="a task, or randomization=<name> for what that draws")
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
+  show.add_argument("--views", metavar="FILE", help="instead, a picture of what its camera sees on randomised models")
+  show.add_argument("--num-views", type=int, default=16)
   add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
   evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
   evaluate.add_argument("run", help="run directory or checkpoint")
@@ -51,6 +53,25 @@ def _parser() -> argparse.ArgumentParser:
   evaluate.add_argument("--seed", type=int, default=0)
   evaluate.add_argument("--deterministic", action="store_true", help="act on the distribution's mode")
   evaluate.add_argument("--video", metavar="FILE", help="also render an episode")
+  export = add("export", _export, "Write a run's policy as ONNX, with the contract that a controller needs.")
+  export.add_argument("run", help="run directory or checkpoint")
+  export.add_argument("--out", metavar="FOLDER", help="by default export/ in the run's")
+  play = add("play", _play, "Run a policy in plain C MuJoCo: measure it, film it or watch it.")
+  play.add_argument("policy", help="run directory, checkpoint, or a policy.onnx beside its policy.yaml")
+  play.add_argument("--episodes", type=int, default=10)
+  play.add_argument("--seed", type=int, default=0)
+  play.add_argument("--video", metavar="FILE", help="also render an episode")
+  play.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
+  sweep = add("sweep", _sweep, "Look at a sweep, gather its result, or do what is missing of it.")
+  sweep.add_argument("action", choices=("status", "collect", "retry", "stop"))
+  sweep.add_argument("folder", help="the sweep's")
+  sweep.add_argument("overrides", nargs="*", help="for retry, such as launcher=slurm or launcher.slots_per_gpu=2")
+  tune = add("tune-buffers", _tune_buffers, "Measure how large Warp's buffers must be for a task.")
+  tune.add_argument("task")
+  tune.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or agent.num_envs=4096")
+  tune.add_argument("--run", help="a run or checkpoint whose policy acts, beside random actions")
+  tune.add_argument("--envs", type=int, default=256)
+  tune.add_argument("--steps", type=int, default=500, help="decisions in each environment")
   replay = add("replay", _replay, "Replay the step that was not finite.")
   replay.add_argument("dump", help="a run's nan_dump/step_*.npz")
   return parser
@@ -79,6 +100,32 @@ def _eval(args: argparse.Namespace) -> int:
   )
 
 
+def _export(args: argparse.Namespace) -> int:
+  from playground.deploy.export import export_run
+
+  return export_run(args.run, out=args.out)
+
+
+def _play(args: argparse.Namespace) -> int:
+  from playground.deploy.play import play
+
+  return play(args.policy, episodes=args.episodes, seed=args.seed, video=args.video, viewer=args.viewer)
+
+
+def _sweep(args: argparse.Namespace) -> int:
+  from playground.cli import sweep
+
+  if args.overrides and args.action != "retry":
+    raise ConfigError(f"{args.overrides[0]}: only `playground sweep retry` takes overrides.")
+  return getattr(sweep, args.action)(args.folder, *args.overrides)
+
+
+def _tune_buffers(args: argparse.Namespace) -> int:
+  from playground.cli.tune_buffers import tune_buffers
+
+  return tune_buffers(args.task, args.overrides, run=args.run, envs=args.envs, steps=args.steps)
+
+
 def _replay(args: argparse.Namespace) -> int:
   from playground.cli.replay import replay
 
@@ -94,6 +141,12 @@ def _show(args: argparse.Namespace) -> int:
     return 0
   config = compose([f"env={args.task}", *args.overrides])
   env = registry.build(config.env)
+  if args.views:
+    from playground.rendering.views import save_views
+
+    terms = config.resolved["randomization"]["terms"]
+    console.print(f"wrote {save_views(env, terms, args.views, args.num_views, config.seed)}")
+    return 0
   for part in describe(config, env):
     console.print(part)
   return 0
@@ -109,7 +162,8 @@ def describe(config: RunConfig, env: "Env") -> "Iterable[RenderableType]":
   Randomizer(env.mj_model, config.resolved["randomization"]["terms"])  # a term without a target is said before anything
   state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
   ctrl = [f"[{low:g}, {high:g}]" for low, high in dict.fromkeys(map(tuple, env.mj_model.actuator_ctrlrange))]
-  auto = f"auto: jax on CPU, {section['cuda_impl']} on an NVIDIA GPU"
+  renders = section.get("vision", {}).get("enable")
+  auto = "auto: warp, to render" if renders else f"auto: jax on CPU, {section['cuda_impl']} on an NVIDIA GPU"
   facts = {
     "class": section["task"],
     "robot": choices.get("robot") or "its own",

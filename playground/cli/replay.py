@@ -21,7 +21,7 @@ def replay(path: str, console: Console | None = None) -> int:
   """
   console = console or Console()
   dump = Dump(path)
-  run = configs.from_dict(dump.config)
+  run = configs.from_saved(dump.config)
   hardware = setup(this_machine(run.hardware))
   env = registry.load(run.choices["env"], config=run.env)
   before = dump.state(env)

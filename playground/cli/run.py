@@ -1,7 +1,7 @@
 """`playground-run`: composes a run's configuration, checks it, trains.
 
 Our check comes first, so that a mistake is one sentence; the rest is a Hydra app, with its flags (`--cfg job`,
-`--help`, `--info`, `-m`).
+`--help`, `--info`). `-m` is ours: a sweep of jobs, each a process of its own (`playground.sweep`).
 """
 
 import os
@@ -12,22 +12,19 @@ from collections.abc import Sequence
 
 import hydra
 from hydra._internal.utils import get_args_parser  # Hydra has no public name for its own flags
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 
 from playground.config import (
   RunConfig,
   compose,
   config_roots,
-  expand,
-  first_job,
   is_hydras,
   search_path_override,
   to_yaml,
   tree,
   with_default_experiment,
 )
-from playground.errors import PlaygroundError
+from playground.errors import ConfigError, PlaygroundError
 from playground.rendering.gl import withhold_gl
 
 
@@ -44,8 +41,8 @@ def main() -> None:
     code = 0
   except KeyboardInterrupt:  # before training listens for signals
     code = 128 + signal.SIGINT
-  if any(thread.name.startswith("compiler") for thread in threading.enumerate()):
-    # Interrupted while compiling: a normal exit would wait for the compiler, minutes perhaps.
+  if any(thread.name.startswith(("compiler", "preflight")) for thread in threading.enumerate()):
+    # Interrupted while compiling, or other machines did not answer: a normal exit would wait for them, minutes perhaps.
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
@@ -59,9 +56,8 @@ def _main(argv: Sequence[str]) -> int:
   config = None
   if args.help:
     overrides = with_default_experiment(overrides)
-  elif args.multirun:
-    overrides = with_default_experiment(expand(overrides))
-    compose(first_job(overrides))  # what is wrong with it is mostly wrong with all; the others are checked as they come
+  elif args.multirun and not (args.hydra_help or args.info or args.shell_completion):
+    return _sweep(overrides, args.cfg)
   elif not (args.hydra_help or args.info or args.shell_completion):
     config = compose(overrides)
     overrides = [*config.overrides, *filter(is_hydras, overrides)]
@@ -72,28 +68,42 @@ def _main(argv: Sequence[str]) -> int:
   codes = []
 
   def job(_: object) -> None:
-    codes.append(_train(config, list(HydraConfig.get().overrides.task)))
+    assert config is not None, "composed above unless Hydra only shows something"
+    codes.append(_train(config))
 
   roots = config_roots()
   sys.argv[1:] = [*flags, *overrides, *search_path_override(roots)]
   hydra.main(config_path=str(roots[0]), config_name="config", version_base="1.3")(job)()
-  return next((code for code in codes if code), 0)
+  return next(iter(codes), 0)
 
 
-def _train(config: RunConfig | None, overrides: Sequence[str]) -> int:
-  try:
-    config = config or compose(overrides)
-    from rich.console import Console
+def _train(config: RunConfig) -> int:
+  from rich.console import Console
 
-    Console().print(tree(config))
-    from playground.runs.train import train  # imports JAX
+  Console().print(tree(config))
+  from playground.runs.train import train  # imports JAX
 
-    return train(config)
-  except PlaygroundError as error:
-    return _report(error)
+  return train(config)
+
+
+def _sweep(overrides: Sequence[str], show: str | None) -> int:
+  from playground.sweep.plan import compose_jobs, plan
+
+  if show is not None:
+    if show != "job":
+      raise ConfigError(f"--cfg {show} shows one run: leave -m out; --cfg job shows all jobs of a sweep.")
+    print("---\n".join(f"# {' '.join(config.overrides)}\n{to_yaml(config)}" for config in compose_jobs(overrides)))
+    return 0
+  from playground.sweep.runner import run_sweep
+
+  return run_sweep(*plan(overrides))
 
 
 def _report(error: Exception) -> int:
   sys.stdout.flush()
   print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
   return 2
+
+
+if __name__ == "__main__":
+  main()

@@ -17,11 +17,11 @@ exist, and what they have fixes each value's type, wherever that value is set.
 """
 
 from playground.config.chains import in_stage, stage_folders
-from playground.config.composition import compose, override_section
+from playground.config.composition import compose, compose_all, compose_settings, from_saved, override_section
 from playground.config.files import ENTRY_POINTS, config_roots, options, search_path_override, task_names
-from playground.config.overrides import DEFAULT_EXPERIMENT, is_hydras, with_default_experiment
+from playground.config.overrides import DEFAULT_EXPERIMENT, is_hydras, is_of_sweep, with_default_experiment
 from playground.config.run_config import RunConfig, Section, from_dict, load, to_yaml, tree
-from playground.config.sweeps import expand, first_job
+from playground.config.sweeps import combinations, expand, split, varying
 from playground.config.text import format_value
 
 __all__ = [
@@ -29,21 +29,27 @@ __all__ = [
   "ENTRY_POINTS",
   "RunConfig",
   "Section",
+  "combinations",
   "compose",
+  "compose_all",
+  "compose_settings",
   "config_roots",
   "expand",
-  "first_job",
   "format_value",
   "from_dict",
+  "from_saved",
   "in_stage",
   "is_hydras",
+  "is_of_sweep",
   "load",
   "options",
   "override_section",
   "search_path_override",
+  "split",
   "stage_folders",
   "task_names",
   "to_yaml",
   "tree",
+  "varying",
   "with_default_experiment",
 ]

@@ -19,13 +19,23 @@ from yaml import YAMLError
 from playground.config.chains import SINGLE_RUN, budget, check_chain, in_stage, stage_folders, stage_overrides
 from playground.config.files import DELTAS, config_roots, groups, options, search_path_override
 from playground.config.limits import check_limits
-from playground.config.overrides import Override, canonical, group_overrides, is_hydras, parse, with_default_experiment
+from playground.config.overrides import (
+  Override,
+  canonical,
+  group_overrides,
+  is_hydras,
+  is_of_sweep,
+  parse,
+  with_default_experiment,
+)
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, Section, from_dict, load
 from playground.config.schema import check_key, fit
 from playground.config.text import first_line
-from playground.errors import ConfigError, nearest
+from playground.errors import ConfigError, PlaygroundError, nearest
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
+_DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that say which keys a run has, in this order
+_BY_NAME = ("scales", "functions", "obs", "history", "termination")  # mappings whose keys are a task's choice
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
 
@@ -40,16 +50,51 @@ def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> Ru
     ConfigError: whatever cannot work, in one sentence.
     UnknownNameError: a group, option or key that does not exist.
   """
+  return compose_all([overrides], config_dir)[0]
+
+
+def compose_all(runs: Iterable[Sequence[str]], config_dir: Path | None = None) -> list[RunConfig]:
+  """Composes many runs as `compose` does one; files that several of them choose are composed once.
+
+  Raises:
+    ConfigError: as `compose`, for the first run that cannot work; of several runs the message names it.
+  """
+  roots, runs = config_roots(config_dir), list(runs)
+  files = functools.cache(functools.partial(_compose_files, roots))
+  configs = []
+  for run in runs:
+    try:
+      configs.append(_compose(with_default_experiment(run, config_dir), files, roots))
+    except PlaygroundError as error:
+      raise error if len(runs) == 1 else type(error)(f"Job {' '.join(run)}: {error}") from error
+  return configs
+
+
+def compose_settings(overrides: Sequence[str], config_dir: Path | None = None) -> Section:
+  """Composes what a sweep is told of itself: `sweep_dir`, `on_error`, and the sections `launcher` and `search`.
+
+  Raises:
+    ConfigError: as `compose`.
+  """
   roots = config_roots(config_dir)
-  ours = [text for text in overrides if not is_hydras(text)]
-  parsed = [parse(text, roots) for text in with_default_experiment(ours, config_dir)]
+  parsed = [parse(text, roots) for text in overrides]
+  config, _ = _hydra(group_overrides(parsed), roots, "sweep")
+  resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], _plain(config))
+  check_limits(resolved)
+  return ConfigDict(resolved)
+
+
+def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Sequence[Path]) -> RunConfig:
+  parsed = [parse(text, roots) for text in overrides if not is_hydras(text)]
+  if about := [o.text for o in parsed if is_of_sweep(o.key)]:
+    what = "stands for many runs" if about[0].startswith("sweep=") else "is about a sweep"
+    raise ConfigError(f"{about[0]} {what}: add -m, as in `playground-run -m {about[0]}`.")
   given = {o.key: o.value for o in parsed}
   for key in ("resume", "init_from"):
     if given.get(key) is not None:
       _check_path(key, given[key])
   if given.get("resume") is not None:
     return _compose_resumed(Path(given["resume"]), parsed, roots)
-  files = functools.cache(functools.partial(_compose_files, roots))  # stages of one task differ in values only
   config = _compose_new(parsed, files, roots)
   stages = stage_overrides(config.resolved["curriculum"], parsed, roots)
   composed = tuple(_compose_stage(config, name, theirs, files, roots) for name, theirs in stages)
@@ -64,6 +109,36 @@ def override_section(section: str, default: Section, overrides: Mapping[str, Any
   resolved = _apply(OmegaConf.create(schema), parsed, schema)
   check_limits(resolved)
   return resolved[section]
+
+
+def from_saved(resolved: Mapping[str, Any], config_dir: Path | None = None) -> RunConfig:
+  """Rebuilds the configuration of a run that an earlier version may have saved: keys that it lacks have today's defaults.
+
+  What a task chooses by name (reward terms, observations, noise) stays what it was.
+
+  Raises:
+    ConfigError: a part is missing, so this is not a run's configuration.
+  """
+  saved = from_dict(resolved)
+  roots = config_roots(config_dir)
+  chosen = [
+    f"{group}={saved.choices[group]}"
+    for group in _DEFAULTING
+    if saved.choices.get(group) in options(group, roots)  # an option that is gone has no defaults
+  ]
+  today = _plain(_hydra(chosen, roots)[0])
+  filled = {section: _fill(saved.resolved[section], today[section]) for section in SECTIONS}
+  return from_dict({**saved.resolved, **filled}, saved.overrides)
+
+
+def _fill(saved: Mapping[str, Any], default: Mapping[str, Any]) -> dict[str, Any]:
+  filled = dict(saved)
+  for key, value in default.items():
+    if key not in saved:
+      filled[key] = value
+    elif isinstance(value, Mapping) and isinstance(saved[key], Mapping) and key not in _BY_NAME:
+      filled[key] = _fill(saved[key], value)
+  return filled
 
 
 class _Files(NamedTuple):
@@ -111,18 +186,20 @@ def _compose_stage(
   return from_dict({**stage.resolved, **own}, stage.overrides)
 
 
-def _hydra(overrides: Sequence[str], roots: Sequence[Path]) -> tuple[DictConfig, dict[str, str | None]]:
-  """Hydra's composition, and what it chose for each group."""
-  outer = GlobalHydra.instance().hydra  # the app's, when this is a job of a sweep: Hydra allows one at a time
+def _hydra(
+  overrides: Sequence[str], roots: Sequence[Path], name: str = "config"
+) -> tuple[DictConfig, dict[str, str | None]]:
+  """Hydra's composition of `<name>.yaml`, and what it chose for each group."""
+  outer = GlobalHydra.instance().hydra  # the app's, if this is called within it: Hydra allows one at a time
   GlobalHydra.instance().clear()
   try:
     with hydra.initialize_config_dir(str(roots[0]), version_base="1.3"):
       lines = [*overrides, *search_path_override(roots)]
-      config = hydra.compose("config", overrides=lines, return_hydra_config=True)
+      config = hydra.compose(name, overrides=lines, return_hydra_config=True)
       chosen = dict(config.hydra.runtime.choices)
   except (HydraException, YAMLError, OmegaConfBaseException) as error:
     files = " ".join(o for o in overrides if not o.startswith("~"))
-    raise ConfigError(f"The files of {files or 'config.yaml'} do not compose: {first_line(error)}.") from None
+    raise ConfigError(f"The files of {files or f'{name}.yaml'} do not compose: {first_line(error)}.") from None
   finally:
     GlobalHydra.instance().hydra = outer
   OmegaConf.set_struct(config, False)
@@ -155,7 +232,7 @@ def _plain(config: Any) -> Any:
 def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path]) -> RunConfig:
   """The configuration of a run that goes on: its own, but for the sections that may differ."""
   _check_resumable(run, parsed)
-  saved = load(run / "config.yaml").resolved
+  saved = from_saved(load(run / "config.yaml").resolved).resolved
   fresh, choices = _hydra(group_overrides(parsed), roots)
   schema = _plain(fresh)
   chosen = {o.key for o in parsed if o.is_group}

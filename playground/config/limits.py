@@ -10,11 +10,16 @@ from playground.errors import ConfigError, nearest
 _PRECISIONS = ("default", "high", "highest", "bfloat16", "tensorfloat32", "float32")
 _CHOICES = {
   "env.impl": ("auto", "jax", "warp"),
+  "env.vision.image": ("rgb", "gray", "depth"),
   "hardware.platform": ("auto", "cpu", "gpu"),
   "hardware.matmul_precision": _PRECISIONS,
   "hardware.network_precision": _PRECISIONS,
+  "on_error": ("continue", "stop"),
+  "search.direction": ("maximize", "minimize"),
+  "search.metric": ("final_return", "best_return", "steps_per_second", "wall_clock_s"),
+  "search.sampler": ("tpe", "random", "cmaes"),
 }
-_PATHS = ("run_dir", "resume", "init_from", "hardware.cache_dir")
+_PATHS = ("run_dir", "resume", "init_from", "sweep_dir", "hardware.cache_dir")
 _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
   (
     "above 0",
@@ -23,13 +28,17 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     "agent.num_minibatches agent.num_updates_per_batch agent.learning_rate agent.max_grad_norm agent.clipping_epsilon "
     "agent.clipping_epsilon_value agent.grad_updates_per_step agent.max_replay_size "
     "agent.alpha_learning_rate env.ctrl_dt env.sim_dt env.episode_length env.action_repeat checkpoint.keep "
-    "video.every_evals video.episodes video.width video.height hardware.devices profile.steps",
+    "video.every_evals video.episodes video.width video.height hardware.devices profile.steps "
+    "env.vision.width env.vision.height env.vision.frames env.vision.farthest "
+    "launcher.timeout launcher.slots_per_gpu launcher.cores_per_job launcher.minutes launcher.memory_gb "
+    "launcher.max_parallel search.trials search.parallel",
   ),
   (
     "0 or more",
     lambda x: x >= 0,
     "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient agent.min_replay_size "
-    "curriculum.scale",
+    "agent.augment_pixels curriculum.scale launcher.grace launcher.gpus launcher.gpus_per_job launcher.requeues "
+    "launcher.retries search.seed",
   ),
   (
     "between 0 and 1",

@@ -1,4 +1,4 @@
-"""Many runs at once, `playground-run -m`: sweep files and globs, spelt out for Hydra's sweeper.
+"""Many runs at once, `playground-run -m`: sweep files and globs, and the jobs that they stand for.
 
 A file of sweeps/ says what varies, in the syntax of the command line; a list stands for its values one by one:
 
@@ -10,6 +10,7 @@ params:
 ```
 """
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,11 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from playground.config.files import config_roots, groups, listed_options, shipped
-from playground.config.overrides import is_hydras, parse, parse_with_hydra
+from playground.config.overrides import is_hydras, is_of_sweep, parse, parse_with_hydra
 from playground.config.text import first_line, format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
+
+_HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper")
 
 
 def expand(overrides: Sequence[str], config_dir: Path | None = None) -> list[str]:
@@ -50,9 +53,41 @@ def expand(overrides: Sequence[str], config_dir: Path | None = None) -> list[str
   return [*lines, *filter(is_hydras, overrides)]
 
 
-def first_job(overrides: Iterable[str]) -> list[str]:
-  """The first of the runs that Hydra's sweeper makes of overrides."""
-  return [value for text in overrides if not is_hydras(text) for value in _values(text)[:1]]
+def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
+  """Divides what `expand` returns into what is said of the sweep itself and what is said of its jobs.
+
+  Raises:
+    ConfigError: a key that a sweep's jobs cannot have.
+  """
+  settings, ours = [], []
+  for line in lines:
+    key = parse_with_hydra(line).key_or_group
+    if key in ("run_dir", "resume"):
+      instead = "sweep_dir=<path> says where a sweep lies, the same command again continues it"
+      raise ConfigError(f"{line} cannot be given with -m, whose jobs lie in the sweep's folder: {instead}.")
+    if line.lstrip("+~").startswith(_HYDRAS_OWN):
+      raise ConfigError(f"{line}: -m does not use Hydra's launchers and sweepers, launcher=<name> is ours.")
+    (settings if is_of_sweep(key) else ours).append(line)
+  return settings, ours
+
+
+def combinations(lines: Sequence[str]) -> list[list[str]]:
+  """The overrides of each job that a sweep's lines stand for: every combination of their values.
+
+  Raises:
+    ConfigError: an interval, which has no values to combine.
+  """
+  for line in lines:
+    override = parse_with_hydra(line)
+    if override.is_sweep_override() and not override.is_discrete_sweep():
+      raise ConfigError(f"{line} is a range to draw from: add search=optuna, or list values.")
+  return [list(job) for job in dict.fromkeys(itertools.product(*map(_values, lines)))]
+
+
+def varying(lines: Iterable[str]) -> list[str]:
+  """The keys and groups that have more than one value."""
+  parsed = [(parse_with_hydra(line), line) for line in lines]
+  return [o.key_or_group for o, line in parsed if o.is_sweep_override() and len(_values(line)) != 1]
 
 
 def sweep_names() -> list[str]:
@@ -65,7 +100,7 @@ def _values(text: str) -> list[str]:
   override = parse_with_hydra(text)
   if not override.is_sweep_override():
     return [text]
-  if not override.is_discrete_sweep():  # an interval: the sweeper draws from it
+  if not override.is_discrete_sweep():  # an interval: a search draws from it
     return []
   return [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
 

@@ -13,6 +13,7 @@ from playground.envs.physics import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.errors import ConfigError
 
 Observation = jax.Array | dict[str, jax.Array]
+PIXELS = "pixels/"  # what entries of an observation that are pictures begin with: [height, width, channels] uint8
 
 
 class State(struct.PyTreeNode):
@@ -20,7 +21,8 @@ class State(struct.PyTreeNode):
 
   Attributes:
     data: simulator state.
-    obs: observation, one vector or a dict of vectors ("state" for the actor, "privileged_state" for the critic).
+    obs: observation, one vector or a dict of vectors ("state" for the actor, "privileged_state" for the critic) and
+      pictures ("pixels/<camera>").
     reward: scalar reward of the step just taken.
     done: scalar 0/1 float, the episode ended in this step.
     metrics: scalars logged each step; the key set is the same at reset and step.
@@ -72,7 +74,8 @@ class Env(abc.ABC):
     self.action_repeat: int = config.action_repeat
     mj_model.opt.timestep = self.sim_dt
     self.mj_model = mj_model
-    self.impl = choose_impl(config.impl, config.cuda_impl)
+    renders = "vision" in config and config.vision.enable
+    self.impl = choose_impl(config.impl, config.cuda_impl, renders)
     self.physics = Physics(
       mj_model,
       impl=self.impl,
@@ -141,20 +144,28 @@ class Env(abc.ABC):
     return self
 
 
-def choose_impl(impl: str, cuda_impl: str) -> str:
+def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
   """Resolves `impl: auto` to the backend that was measured faster on this kind of device.
 
+  Args:
+    impl: auto, jax or warp.
+    cuda_impl: what auto means on an NVIDIA GPU.
+    renders: whether the task sees through a camera, which only Warp renders.
+
   Raises:
-    ConfigError: unknown name, or Warp asked for where it is not installed.
+    ConfigError: unknown name, Warp asked for where it is not installed, or another asked to render.
   """
   if impl == "auto":
-    impl = cuda_impl if jax.default_backend() == "gpu" else "jax"
+    impl = "warp" if renders else cuda_impl if jax.default_backend() == "gpu" else "jax"
   if impl not in ("jax", "warp"):
     raise ConfigError(f"env.impl={impl!r} must be one of auto, jax, warp.")
+  if renders and impl != "warp":
+    raise ConfigError(f"env.impl={impl} renders no pictures, which env.vision.enable=true asks for: leave it auto.")
   if impl == "warp":
     try:
       import warp  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
-      remedy = "pip install 'mujoco-mjx[warp]', or set env.impl=jax"
+      instead = "leave env.vision.enable=false" if renders else "set env.impl=jax"
+      remedy = f"pip install 'mujoco-mjx[warp]', or {instead}"
       raise ConfigError(f"env.impl=warp needs MuJoCo-Warp, which is not installed: {remedy}.") from None
   return impl

@@ -30,8 +30,29 @@ DERIVED_FIELDS = (
 )  # fmt: skip
 
 
+class BufferUse(struct.PyTreeNode):
+  """What the last control step needed of Warp's buffers, the most of any of its physics steps; each shape [].
+
+  Attributes:
+    constraints: constraint rows of the environment (`njmax` bounds them).
+    contacts: contacts and pairs that might touch, over all environments together (`naconmax` bounds both).
+    overflow: mujoco_warp's `OverflowType` bits of the buffers that were too small, 0 if none was.
+  """
+
+  constraints: jax.Array
+  contacts: jax.Array
+  overflow: jax.Array
+
+  def join(self, other: "BufferUse") -> "BufferUse":
+    """What two physics steps needed."""
+    constraints, contacts = (jnp.maximum(getattr(self, k), getattr(other, k)) for k in ("constraints", "contacts"))
+    return BufferUse(constraints, contacts, self.overflow | other.overflow)
+
+
 class PhysicsData(struct.PyTreeNode):
   """One environment's simulator state, named as in `mujoco.MjData`; derived fields a task does not read are None.
+
+  `buffers` (Warp only, else None) is no part of the state: it says what the last step needed.
 
   After a step the derived fields belong to the state before the last integration, `qpos` and `qvel` to the one after
   it (`mj_step` is forward, then integrate).
@@ -65,6 +86,7 @@ class PhysicsData(struct.PyTreeNode):
   subtree_com: Any = None
   cvel: Any = None
   ten_length: Any = None
+  buffers: BufferUse | None = None
 
 
 class Physics:
@@ -103,20 +125,28 @@ class Physics:
 
   def forward(self, model: mjx.Model, data: PhysicsData) -> PhysicsData:
     """Computes the derived fields of the present state, without advancing it."""
-    return self._keep(mjx.forward(model, self._full(data)))
+    return self._keep(self.present(model, data))
+
+  def present(self, model: mjx.Model, data: PhysicsData) -> mjx.Data:
+    """MJX's own data of the present state, all that follows from it computed."""
+    return mjx.forward(model, self._full(data))
 
   def step(self, model: mjx.Model, data: PhysicsData, ctrl: jax.Array, num_substeps: int) -> PhysicsData:
     """Advances by `num_substeps` physics steps under a constant `ctrl` (shape [nu])."""
-    data = data.replace(ctrl=ctrl)
+    data = data.replace(ctrl=ctrl, buffers=None if data.buffers is None else jax.tree.map(jnp.zeros_like, data.buffers))
 
-    def substep(data: PhysicsData, _: None) -> tuple[PhysicsData, None]:
-      return self._keep(mjx.step(model, self._full(data)), derived=()), None
+    def advance(data: PhysicsData, derived: tuple[str, ...]) -> PhysicsData:
+      after = self._keep(mjx.step(model, self._full(data)), derived)
+      if data.buffers is None or after.buffers is None:
+        return after
+      return after.replace(buffers=data.buffers.join(after.buffers))
 
     # Only the last substep's derived fields are read, so the others need not compute them (sensors, say): 9 % faster
     # training of the Go1 on an H200, for four seconds more of compiling.
     if num_substeps > 1:
-      data = jax.lax.scan(substep, data.replace(**dict.fromkeys(self.derived)), None, num_substeps - 1)[0]
-    return self._keep(mjx.step(model, self._full(data)))
+      data = data.replace(**dict.fromkeys(self.derived))
+      data = jax.lax.scan(lambda data, _: (advance(data, ()), None), data, None, num_substeps - 1)[0]
+    return advance(data, self.derived)
 
   def _template(self) -> mjx.Data:
     return mjx.make_data(self.mj_model, impl=self.impl, **self._sizes)
@@ -126,19 +156,27 @@ class Physics:
 
   def _keep(self, data: mjx.Data, derived: tuple[str, ...] | None = None) -> PhysicsData:
     derived = self.derived if derived is None else derived
-    return PhysicsData(**{name: getattr(data, name) for name in (*STATE_FIELDS, *derived)})
+    kept = {name: getattr(data, name) for name in (*STATE_FIELDS, *derived)}
+    return PhysicsData(**kept, buffers=_buffer_use(data) if self.impl == "warp" else None)
 
 
 def _put_on_warp(mj_model: mujoco.MjModel) -> mjx.Model:
-  """The model on Warp, without its messages on loading kernels and on solvers that used up their iterations.
+  """The model on Warp, without its messages on loading kernels, and on solvers and buffers at their limits.
 
-  Few iterations are what these tasks ask for, and one line for each solve is slower than the solve. Messages about
-  buffers that are too small stay on.
+  Few solver iterations are what these tasks ask for, and one line for each solve is slower than the solve. Buffers that
+  are too small are in `PhysicsData.buffers`, which the trainers count.
   """
   import warp
-  from mujoco.mjx.third_party.mujoco_warp import OverflowType
 
   warp.config.log_level = warp.LOG_WARNING
   model = mjx.put_model(mj_model, impl="warp")
-  silent = int(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)
-  return model.tree_replace({"opt._impl.warn_overflow": model.opt._impl.warn_overflow & ~silent})  # pyright: ignore[reportReturnType]
+  return model.tree_replace({"opt._impl.warn_overflow": 0})  # pyright: ignore[reportReturnType]
+
+
+def _buffer_use(data: mjx.Data) -> BufferUse:
+  from mujoco.mjx.third_party.mujoco_warp import OverflowType
+
+  impl: Any = data._impl
+  iterations = int(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)  # reached often, and meant to be
+  contacts = jnp.maximum(impl.nacon, impl.ncollision).reshape(())
+  return BufferUse(impl.nefc.reshape(()), contacts, impl.overflow.reshape(()) & ~iterations)

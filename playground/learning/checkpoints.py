@@ -41,8 +41,14 @@ class CheckpointStore:
       for path in Path(folder).glob("*"):
         if path.name.isdigit() and int(path.name) > continued:
           shutil.rmtree(path)
+    Path(folder).mkdir(parents=True, exist_ok=True)  # Orbax does not where it is told to work alone
     options = ocp.CheckpointManagerOptions(
-      max_to_keep=keep, step_format_fixed_length=12, enable_async_checkpointing=False, cleanup_tmp_directories=True
+      create=False,
+      max_to_keep=keep,
+      step_format_fixed_length=12,
+      enable_async_checkpointing=False,
+      cleanup_tmp_directories=True,
+      multiprocessing_options=_alone(),
     )
     self._manager = ocp.CheckpointManager(Path(folder).absolute(), options=options)
     self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
@@ -142,7 +148,9 @@ class Checkpoint:
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
   def _read(self, item: str, args: Any) -> Any:
-    options = ocp.CheckpointManagerOptions(read_only=True, step_format_fixed_length=12)
+    options = ocp.CheckpointManagerOptions(
+      read_only=True, step_format_fixed_length=12, multiprocessing_options=_alone()
+    )
     manager = ocp.CheckpointManager(self.path.parent, options=options)
     try:
       return manager.restore(int(self.path.name), args=ocp.args.Composite(**{item: args}))[item]
@@ -186,6 +194,14 @@ def checksum(leaves: Arrays) -> str:
   for leaf in leaves:
     digest.update(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8).data)
   return digest.hexdigest()
+
+
+def _alone() -> ocp.options.MultiprocessingOptions:
+  """Orbax is to wait for no other process of this training: one writes, each reads for itself."""
+  if jax.process_count() == 1:
+    return ocp.options.MultiprocessingOptions()
+  index = jax.process_index()
+  return ocp.options.MultiprocessingOptions(index, {index}, barrier_sync_key_prefix=f"process{index}")
 
 
 def _numbered(leaves: Arrays) -> dict[str, np.ndarray]:

@@ -2,7 +2,6 @@
 
 import abc
 from collections.abc import Callable
-from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -11,14 +10,16 @@ import numpy as np
 import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
-from jax.sharding import Mesh, NamedSharding
+from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from playground.envs.base import Env, Observation, State
 from playground.envs.wrappers import ModelFields, wrap_for_training
 from playground.errors import ConfigError
-from playground.hardware.mesh import AXIS, jit_on_mesh
+from playground.hardware.distributed import several
+from playground.hardware.mesh import AXIS, gather_on_mesh, jit_on_mesh, put
 from playground.learning.checkpoints import Checkpoint
+from playground.learning.cnn import CNNConfig
 from playground.learning.networks import Actor, Normalizer
 from playground.learning.rollout import NonfiniteCapture
 
@@ -83,7 +84,7 @@ class Learner(abc.ABC):
     self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS)), spec)
     self.reset = jit_on_mesh(self._reset, mesh, (spec, P(), P(AXIS)), spec, donate_argnums=0)
     self.train = jit_on_mesh(self._train, mesh, (spec, P(AXIS), P()), (spec, P()), donate_argnums=0)
-    self.copy = jit_on_mesh(partial(jax.tree.map, jnp.copy), mesh, (spec,), spec)
+    self.copy = self._make_copy()
 
   @abc.abstractmethod
   def _init(self, key: jax.Array, model: ModelFields) -> Any:
@@ -146,13 +147,27 @@ class Learner(abc.ABC):
     Raises:
       CheckpointError: damaged, or made for other shapes.
     """
+    state, elsewhere = self.read(checkpoint, template)
+    what = f"the whole training state of {checkpoint.path} ({checkpoint.step:,} steps)"
+    return self.place(state), f"Resuming {what}.{elsewhere}"
+
+  def read(self, checkpoint: Checkpoint, template: Any) -> tuple[Any, str]:
+    """A checkpoint's state on the host, for these devices, and what to say if it was written on others."""
     policy, rest = self.split(template)
-    state = self.join(checkpoint.restore("policy", policy), checkpoint.restore("state", rest))
-    return self.place(state), f"Resuming the whole training state of {checkpoint.path} ({checkpoint.step:,} steps)."
+    leaves = {name: shape for name, shape, _ in checkpoint.meta["leaves"]["state"]}
+    there, here = leaves.get(".capture.found", [self.mesh.size])[0], self.mesh.size
+    theirs = jax.tree.map(lambda x: jax.ShapeDtypeStruct((there, *x.shape[1:]), x.dtype), rest.capture)
+    rest = checkpoint.restore("state", rest.replace(capture=theirs))
+    state = self.join(checkpoint.restore("policy", policy), rest.replace(capture=rest.capture.on_devices(here)))
+    elsewhere = (
+      f" It was written on {there} device{'s' * (there > 1)}: on {here}, all of it goes on, but random numbers and "
+      "rounding differ from here on."
+    )
+    return state, elsewhere * (there != here)
 
   def place(self, state: Any) -> Any:
     """Puts a state's host arrays on the devices, each its share."""
-    return jax.device_put(state, jax.tree.map(lambda s: NamedSharding(self.mesh, s), self._spec), may_alias=False)
+    return put(state, self.mesh, self._spec)
 
   def with_policy(self, state: Any, policy: Policy) -> Any:
     """A state that acts with `policy` (host arrays), all else unchanged."""
@@ -160,7 +175,14 @@ class Learner(abc.ABC):
 
   def place_policy(self, policy: Policy) -> Policy:
     """Puts a policy's host arrays on every device."""
-    return jax.device_put(policy, NamedSharding(self.mesh, P()), may_alias=False)
+    return put(policy, self.mesh, P())
+
+  def _make_copy(self, keep: Callable[[Any], Any] = lambda state: state) -> Any:
+    """`copy`, of what `keep` leaves of a state; whole on every device where no process can see all of them."""
+    copy = lambda state: jax.tree.map(jnp.copy, keep(state))
+    if several():
+      return gather_on_mesh(copy, self.mesh, self._spec)
+    return jit_on_mesh(copy, self.mesh, (self._spec,), keep(self._spec))
 
   def _reset(self, state: Any, key: jax.Array, model: ModelFields) -> Any:
     return state.replace(env_state=self._fresh(key, model))
@@ -196,7 +218,13 @@ def check_divisible(config: Any, num_devices: int) -> None:
 def from_config(config_class: Callable[..., Any], network_class: Callable[..., Any], config: Any) -> Any:
   """Builds hyperparameters from the `agent` config (a mapping); `name` is not one of them."""
   values = {k: v for k, v in dict(config).items() if k not in ("name", "network")}
-  return config_class(**values, network=network_class(**dict(config["network"])))
+  network = dict(config["network"])
+  if "cnn" in network:
+    network["cnn"] = CNNConfig(**dict(network["cnn"]))
+  return config_class(**values, network=network_class(**network))
+
+
+_COUNTS = ("episodes", "nonfinite", "nonfinite_updates", "overflows")
 
 
 def _report(total: Metrics) -> Metrics:
@@ -209,5 +237,5 @@ def _report(total: Metrics) -> Metrics:
     if name.startswith("episode_"):
       report[{"episode_sum_reward": "episode_reward"}.get(name, name)] = value / total["episodes"]
     else:
-      report[name] = value if name in ("episodes", "nonfinite", "nonfinite_updates") else value / learned
+      report[name] = value if name in _COUNTS else value / learned
   return report

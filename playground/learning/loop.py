@@ -13,10 +13,11 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from playground.envs.wrappers import ModelFields
+from playground.hardware.distributed import agree, several
+from playground.hardware.mesh import put
 from playground.learning.learner import Learner
 
 Metrics = dict[str, float]
@@ -163,14 +164,13 @@ class Loop:
     self._model = model
     self._eval_model = eval_model
     self._save_every_s = save_every_s
-    self._replicated = NamedSharding(learner.mesh, P())
     self._init_key, self._eval_key, self._reset_key = jax.random.split(jax.random.PRNGKey(seed), 3)
     self.train_s = 0.0  # device time of training alone
     self.first_update_s: float | None = None
 
   def init(self) -> Any:
     """The state of a new run."""
-    return self._program.init(jax.device_put(self._init_key, self._replicated), self._model)
+    return self._program.init(self._place(self._init_key), self._model)
 
   def run(self, state: Any, update: int | None = None) -> tuple[Any, bool]:
     """Runs to the end of the schedule, or until the hooks say stop.
@@ -191,9 +191,9 @@ class Loop:
         at = mark.update
         if reported:
           reported.result()  # one row is in flight; what went wrong with it stops the run here
-        stop = self._hooks.should_stop() and mark is not marks[-1]
+        stop = agree(self._hooks.should_stop()) and mark is not marks[-1]
         if stop:
-          done.snapshot = state
+          done.snapshot = self._program.copy(state) if several() else state
         reported = reports.submit(self._report, done)
         if stop:
           break
@@ -212,7 +212,8 @@ class Loop:
       self.train_s += done.train_s
       self.first_update_s = self.first_update_s or done.train_s / num_updates
       if done.trained["nonfinite"] > 0:
-        done.capture = jax.device_get(state.capture)
+        capture = self._program.copy(state).capture if several() else state.capture
+        done.capture = jax.device_get(capture)
     if mark.evaluate:
       start = time.perf_counter()
       policy = self._learner.policy(state)
@@ -221,7 +222,8 @@ class Loop:
       done.eval_s = time.perf_counter() - start
     if mark.reset:
       state = self._program.reset(state, self._key(self._reset_key, mark), self._model)
-    due = mark.evaluate or mark is self._marks[-1] or time.perf_counter() - self._last_save > self._save_every_s
+    late = agree(time.perf_counter() - self._last_save > self._save_every_s)
+    due = late or mark.evaluate or mark is self._marks[-1]
     if due and mark.update:
       # A copy, because the next training call takes the state's buffers over while this one is written to disk.
       done.snapshot = self._program.copy(state)
@@ -246,4 +248,7 @@ class Loop:
       self._hooks.on_save(done.mark.update, step, done.snapshot, done.mark is self._marks[-1])
 
   def _key(self, key: jax.Array, mark: Mark) -> jax.Array:
-    return jax.device_put(jax.random.fold_in(key, mark.update), self._replicated)
+    return self._place(jax.random.fold_in(key, mark.update))
+
+  def _place(self, key: jax.Array) -> jax.Array:
+    return put(key, self._learner.mesh, P())

@@ -13,8 +13,9 @@ from brax.training.acme import running_statistics, specs
 from brax.training.distribution import NormalTanhDistribution
 from flax import linen, struct
 
-from playground.envs.base import Observation
+from playground.envs.base import PIXELS, Observation
 from playground.errors import ConfigError, nearest
+from playground.learning.cnn import CNNConfig, PixelNetwork
 
 ACTIVATIONS = {"swish": linen.swish, "relu": linen.relu, "elu": linen.elu, "tanh": linen.tanh, "gelu": linen.gelu}
 
@@ -25,7 +26,8 @@ ObservationSize = int | Mapping[str, tuple[int, ...]]
 class Actor:
   """A tanh-squashed Gaussian actor, and what it shares with its critics: observation entries, normaliser, precision.
 
-  Observations are dicts of arrays with any leading axes; a task's flat observation counts as {"state": obs}.
+  Observations are dicts of arrays with any leading axes; a task's flat observation counts as {"state": obs}. Pictures
+  among them (`pixels/...`, [..., H, W, C] uint8) are read by actor and critic alike, by CNNs of their own.
   """
 
   def __init__(
@@ -55,26 +57,33 @@ class Actor:
       allowed = ", ".join(ACTIVATIONS) + "." + nearest(config.activation, ACTIVATIONS)
       raise ConfigError(f"agent.network.activation={config.activation!r} must be one of {allowed}")
     sizes = obs_size if isinstance(obs_size, Mapping) else {"state": (obs_size,)}
+    self.pixel_sizes = {key: sizes[key] for key in sorted(sizes) if key.startswith(PIXELS)}
     for name in ("policy_obs_key", "value_obs_key"):
       key = getattr(config, name)
-      if key not in sizes:
+      if key not in sizes.keys() - self.pixel_sizes.keys() and not (key == "" and self.pixel_sizes):
         entries = ", ".join(sizes) + "." + nearest(key, sizes)
         raise ConfigError(f"agent.network.{name}={key!r} must be an entry of the task's observation: {entries}")
     self.precision = precision
     self.action_size = action_size
     self.activation = ACTIVATIONS[config.activation]
     self.policy_obs_key, self.value_obs_key = config.policy_obs_key, config.value_obs_key
-    self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key}))
+    self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key} - {""}))
     self.obs_sizes = {key: sizes[key] for key in self.obs_keys}
     self.distribution = NormalTanhDistribution(event_size=action_size)
-    self.policy_network = brax_networks.make_policy_network(
-      self.distribution.param_size,
-      dict(sizes),
-      hidden_layer_sizes=tuple(hidden_layer_sizes),
-      activation=self.activation,
-      layer_norm=layer_norm,
-      obs_key=config.policy_obs_key,
-    )
+    if self.pixel_sizes:
+      assert isinstance(config, NetworkConfig)
+      init = linen.initializers.orthogonal(0.2)
+      sizes = tuple(hidden_layer_sizes)
+      self._actor = self._on_pixels(config.cnn, sizes, self.distribution.param_size, output_init=init)
+    else:
+      self.policy_network = brax_networks.make_policy_network(
+        self.distribution.param_size,
+        dict(sizes),
+        hidden_layer_sizes=tuple(hidden_layer_sizes),
+        activation=self.activation,
+        layer_norm=layer_norm,
+        obs_key=config.policy_obs_key,
+      )
 
   def init_normalizer(self) -> Normalizer:
     shapes = {key: specs.Array(size, jnp.dtype("float32")) for key, size in self.obs_sizes.items()}
@@ -86,11 +95,17 @@ class Actor:
   def select(self, obs: Observation) -> dict[str, jax.Array]:
     """The entries of an observation that actor or critic reads."""
     entries = obs if isinstance(obs, Mapping) else {"state": obs}
-    return {key: entries[key] for key in self.obs_keys}
+    return {key: entries[key] for key in (*self.obs_keys, *self.pixel_sizes)}
+
+  def vectors(self, obs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    """The entries of a selected observation that are no pictures: those that are normalised."""
+    return {key: obs[key] for key in self.obs_keys}
 
   def logits(self, policy_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
     """Parameters of the action distribution, [..., 2 * action_size], for normalised observations."""
     with self.at_precision():
+      if self.pixel_sizes:
+        return self._actor.apply(policy_params, *self._seen(obs, self.policy_obs_key))  # pyright: ignore[reportReturnType]
       return self.policy_network.apply(None, policy_params, obs[self.policy_obs_key])
 
   def act(
@@ -99,6 +114,19 @@ class Actor:
     """Actions in [-1, 1], [..., action_size], sampled or (deterministic) the mode."""
     logits = self.logits(policy, normalize(self.select(obs), normalizer))
     return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
+
+  def _on_pixels(self, cnn: CNNConfig, sizes: Sequence[int], output_size: int, **how: Any) -> PixelNetwork:
+    cnn.check(ACTIVATIONS)
+    return PixelNetwork(cnn, ACTIVATIONS[cnn.activation], tuple(sizes), self.activation, output_size, **how)
+
+  def _seen(self, obs: Mapping[str, jax.Array], key: str) -> tuple[dict[str, jax.Array], jax.Array | None]:
+    """What a network on pixels is applied to: pictures, and the vector `key` unless that is empty."""
+    return {name: obs[name] for name in self.pixel_sizes}, obs[key] if key else None
+
+  def _example(self) -> dict[str, jax.Array]:
+    """An observation of zeros, a batch of one."""
+    pictures = {key: jnp.zeros((1, *size), jnp.uint8) for key, size in self.pixel_sizes.items()}
+    return pictures | {key: jnp.zeros((1, *size)) for key, size in self.obs_sizes.items()}
 
   def at_precision(self) -> AbstractContextManager[Any]:
     """A context in which matrix products have the networks' precision."""
@@ -112,9 +140,10 @@ class NetworkConfig:
   policy_hidden_layer_sizes: Sequence[int] = (32, 32, 32, 32)
   value_hidden_layer_sizes: Sequence[int] = (256, 256, 256, 256, 256)
   activation: str = "swish"
-  policy_obs_key: str = "state"  # entry of a dict observation that the actor sees
+  policy_obs_key: str = "state"  # entry of a dict observation that the actor sees; "" is none, beside pictures
   value_obs_key: str = "state"  # entry that the critic sees, "privileged_state" for an asymmetric pair
   value_dtype: str = "auto"  # of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere
+  cnn: CNNConfig = dataclasses.field(default_factory=CNNConfig)  # for pictures, if the observation has any
 
 
 class ActorCriticParams(struct.PyTreeNode):
@@ -154,16 +183,25 @@ class ActorCritic(Actor):
     super().__init__(obs_size, action_size, config.policy_hidden_layer_sizes, config, precision)
     auto = "bfloat16" if jax.default_backend() == "gpu" else "float32"
     self.value_dtype = auto if config.value_dtype == "auto" else config.value_dtype
-    self._critic = Critic(tuple(config.value_hidden_layer_sizes), self.activation, jnp.dtype(self.value_dtype))
+    sizes, dtype = tuple(config.value_hidden_layer_sizes), jnp.dtype(self.value_dtype)
+    if self.pixel_sizes:
+      self._critic = self._on_pixels(config.cnn, sizes, 1, dtype=dtype)
+    else:
+      self._critic = Critic(sizes, self.activation, dtype)
 
   def init(self, key: jax.Array) -> ActorCriticParams:
     policy, value = jax.random.split(key)
+    if self.pixel_sizes:
+      actor, critic = (self._seen(self._example(), key) for key in (self.policy_obs_key, self.value_obs_key))
+      return ActorCriticParams(self._actor.init(policy, *actor), self._critic.init(value, *critic))
     obs = jnp.zeros((1, *self.obs_sizes[self.value_obs_key]))
     return ActorCriticParams(self.policy_network.init(policy), self._critic.init(value, obs))
 
   def value(self, value_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
     """State values, [...], for normalised observations."""
     with self.at_precision():
+      if self.pixel_sizes:
+        return self._critic.apply(value_params, *self._seen(obs, self.value_obs_key))[..., 0]  # pyright: ignore
       return self._critic.apply(value_params, obs[self.value_obs_key])  # pyright: ignore[reportReturnType]
 
 
@@ -205,6 +243,8 @@ class SoftActorCritic(Actor):
     self, obs_size: ObservationSize, action_size: int, config: SoftNetworkConfig, precision: str | None = None
   ):
     """Builds the networks; see `Actor` for the arguments and errors."""
+    if isinstance(obs_size, Mapping) and any(key.startswith(PIXELS) for key in obs_size):
+      raise ConfigError("agent=sac reads no pictures: choose agent=ppo, or env.vision.enable=false.")
     self.batched = jax.default_backend() == "gpu"
     sizes, norm = tuple(config.hidden_layer_sizes), config.policy_network_layer_norm
     super().__init__(obs_size, action_size, sizes, config, precision, norm)
@@ -236,9 +276,9 @@ class SoftActorCritic(Actor):
 
 
 def normalize(obs: Mapping[str, jax.Array], normalizer: Normalizer | None) -> dict[str, jax.Array]:
-  """Subtracts the running mean and divides by the running deviation; None leaves the observation as it is."""
+  """Subtracts the running mean and divides by the running deviation; pictures stay, and with None all of it does."""
   if normalizer is None:
     return dict(obs)
   mean: Any = normalizer.mean
   std: Any = normalizer.std
-  return {k: (v - mean[k]) / std[k] for k, v in obs.items()}
+  return {k: (v - mean[k]) / std[k] if k in mean else v for k, v in obs.items()}

@@ -19,6 +19,7 @@ from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
 from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
+from playground.learning.cnn import random_shift
 from playground.learning.learner import SPEC, Learner, Metrics, TrainState, check_divisible, from_config
 from playground.learning.losses import Batch, ppo_loss
 from playground.learning.networks import ActorCritic, ActorCriticParams, NetworkConfig, Normalizer, normalize
@@ -51,6 +52,7 @@ class PPOConfig:
   normalize_advantage: bool = True
   bootstrap_on_timeout: bool = False  # a time-out pays the discounted value of its state instead of being masked out
   deterministic_eval: bool = False
+  augment_pixels: int = 0  # largest random shift of a trajectory's pictures in an update, pixels
   network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
 
   @classmethod
@@ -133,8 +135,8 @@ class PPO(Learner):
     env_state, capture, data, last_obs, episodes = repeat_unroll(one, state.env_state, state.capture, keys)
 
     # Normalise once for all passes, with statistics that include this data.
-    if config.normalize_observations:
-      normalizer = running_statistics.update(state.normalizer, data.obs, pmap_axis_name=AXIS)
+    if config.normalize_observations and self.networks.obs_keys:
+      normalizer = running_statistics.update(state.normalizer, self.networks.vectors(data.obs), pmap_axis_name=AXIS)
     obs, last_obs = normalize(data.obs, normalizer), normalize(self.networks.select(last_obs), normalizer)
 
     batch = Batch(obs, last_obs, data.raw_action, data.log_prob, data.reward, data.termination, data.truncation)
@@ -155,8 +157,9 @@ class PPO(Learner):
     metrics = jax.tree.map(lambda x: jax.lax.pmean(x.mean(), AXIS), losses) | jax.lax.psum(episodes, AXIS)
     metrics["nonfinite_updates"] *= config.num_updates_per_batch * config.num_minibatches
     metrics["learned"] = jnp.ones(())
-    farthest = jnp.stack([jnp.abs(entry).max() for entry in jax.tree.leaves(obs)]).max()
-    metrics["obs_farthest"] = jax.lax.pmax(farthest, AXIS)  # of any number from its mean, in standard deviations
+    if vectors := jax.tree.leaves(self.networks.vectors(obs)):
+      farthest = jnp.stack([jnp.abs(entry).max() for entry in vectors]).max()
+      metrics["obs_farthest"] = jax.lax.pmax(farthest, AXIS)  # of any number from its mean, in standard deviations
     metrics["policy_std"] = jax.lax.pmean(self._mean_std(params, obs), AXIS)
     after = TrainState(
       params=params,
@@ -174,6 +177,11 @@ class PPO(Learner):
     columns, key = x
     last_obs = jax.tree.map(lambda x: x[columns], batch.last_obs)
     minibatch = jax.tree.map(lambda x: x[:, columns], batch.replace(last_obs=None)).replace(last_obs=last_obs)
+    if pad := self.config.augment_pixels:
+      key, shift_key = jax.random.split(key)
+      shifts = jax.random.randint(shift_key, (len(columns), 2), 0, 2 * pad + 1)
+      shift = lambda obs: random_shift(obs, shifts, pad)
+      minibatch = minibatch.replace(obs=shift(minibatch.obs), last_obs=shift(minibatch.last_obs))
     (_, parts), grads = jax.value_and_grad(self.loss, has_aux=True)(params, minibatch, key)
     grads = jax.lax.pmean(grads, AXIS)
     norm = jnp.linalg.norm(ravel_pytree(grads)[0])  # as one vector: a reduction for each array costs 3 % of a run

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from playground.envs.base import State
@@ -46,6 +47,13 @@ class NonfiniteCapture(struct.PyTreeNode):
     after = first(state.info["nonfinite_state"])
     return cls(jnp.zeros(1, bool), first(state), jnp.zeros((1, action_size)), first(dict(model)), after)
 
+  def on_devices(self, count: int) -> "NonfiniteCapture":
+    """The same (on the host) for another number of devices: what was found goes first."""
+    if len(self.found) == count:
+      return self
+    order = np.argsort(~self.found, kind="stable")[np.arange(count) % len(self.found)]
+    return jax.tree.map(lambda x: x[order], self)
+
   def look(self, before: State, action: jax.Array, model: ModelFields, after: State) -> "NonfiniteCapture":
     """Keeps the step from `before` to `after` of the first environment that it broke, if none was kept before."""
     bad = after.info["nonfinite"]
@@ -65,10 +73,15 @@ EpisodeSums = dict[str, jax.Array]
 
 
 def episode_sums(state: State) -> EpisodeSums:
-  """Sums over the batch of what ended in this step: episodes, their returns, lengths and metrics, and bad numbers."""
+  """Sums over the batch of what ended in this step: episodes, their returns, lengths and metrics, and bad numbers.
+
+  On Warp also of the environments that needed more than its buffers hold, which drops contacts or constraints.
+  """
   ended = state.info["episode_done"]
   sums = {f"episode_{name}": (ended * total).sum() for name, total in state.info["episode_metrics"].items()}
-  return sums | {"episodes": ended.sum(), "nonfinite": state.info["nonfinite"].sum()}
+  sums |= {"episodes": ended.sum(), "nonfinite": state.info["nonfinite"].sum()}
+  buffers = state.data.buffers
+  return sums if buffers is None else sums | {"overflows": (buffers.overflow != 0).sum().astype(ended.dtype)}
 
 
 def unroll(

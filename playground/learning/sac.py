@@ -21,7 +21,8 @@ from jax.sharding import Mesh
 from playground.envs.base import Env, State
 from playground.envs.wrappers import ModelFields
 from playground.errors import ConfigError
-from playground.hardware.mesh import AXIS, device_memory, jit_on_mesh
+from playground.hardware.distributed import several
+from playground.hardware.mesh import AXIS, device_memory
 from playground.learning.checkpoints import Checkpoint
 from playground.learning.learner import SPEC, Learner, Metrics, Policy, TrainState, check_divisible, from_config
 from playground.learning.networks import SoftActorCritic, SoftActorCriticParams, SoftNetworkConfig, normalize
@@ -113,8 +114,9 @@ class SAC(Learner):
     example = Transition(obs, obs, action, reward=scalar, discount=scalar, truncation=scalar)  # pyright: ignore
     self.buffer = ReplayBuffer(config.max_replay_size, config.num_envs, example)
     if not config.checkpoint_replay:
-      light = lambda state: state.replace(replay=state.replay.replace(data=None))
-      self.copy = jit_on_mesh(lambda state: jax.tree.map(jnp.copy, light(state)), mesh, (spec,), light(spec))
+      self.copy = self._make_copy(lambda state: state.replace(replay=state.replay.replace(data=None)))
+    elif several():
+      raise ConfigError("agent.checkpoint_replay=true needs one process for all devices: set it to false.")
 
   def _init(self, key: jax.Array, model: ModelFields) -> SACState:
     key, net_key, env_key = jax.random.split(key, 3)
@@ -244,8 +246,7 @@ class SAC(Learner):
     return policy, rest.replace(replay=rest.replay.replace(data=None))
 
   def restore(self, checkpoint: Checkpoint, template: SACState) -> tuple[SACState, str]:
-    policy, rest = self.split(template)
-    state = self.join(checkpoint.restore("policy", policy), checkpoint.restore("state", rest))
+    state, elsewhere = self.read(checkpoint, template)
     shape = template.replay.data.shape
     data, inserted, what = np.zeros(shape, np.float32), state.replay.inserted, "the whole training state"
     if checkpoint.has("replay"):
@@ -255,7 +256,7 @@ class SAC(Learner):
       refill = f"{self.config.prefill_updates * self.config.num_envs:,} transitions are collected before it learns on"
       inserted, what = np.zeros_like(inserted), f"the training state without its replay buffer ({refill})"
     state = state.replace(replay=Replay(data, inserted))
-    return self.place(state), f"Resuming {what} of {checkpoint.path} ({checkpoint.step:,} steps)."
+    return self.place(state), f"Resuming {what} of {checkpoint.path} ({checkpoint.step:,} steps).{elsewhere}"
 
   def experience(self, state: SACState) -> np.ndarray | None:
     if not self.config.checkpoint_replay:

@@ -12,6 +12,7 @@ import numpy as np
 
 from playground.envs.base import Env
 from playground.errors import PlaygroundError
+from playground.hardware.mesh import own_share
 from playground.learning.checkpoints import CheckpointStore, checksum
 from playground.learning.learner import Learner
 from playground.learning.loop import Loop, Metrics
@@ -23,6 +24,7 @@ from playground.runs.progress import Progress
 from playground.runs.provenance import process_age_s
 from playground.runs.run_dir import RunDirectory
 from playground.runs.start import Start
+from playground.runs.top_ops import format_ops, write_top_ops
 from playground.runs.trackers import make_trackers
 
 if TYPE_CHECKING:
@@ -69,7 +71,9 @@ class Job:
     self._rates: list[float] = []  # steps per second, by row
     self._start_to_first_update_s: float | None = None
     self._dumped = any(run_dir.nan_dump.glob("*.npz"))  # by an earlier start of this run
+    self._warned_of_buffers = False
     self._closed = False
+    self._profile = run_dir.path / "profile"
     self._trace = "due" if config.profile.enable else "off"  # then "on", for one row, then "off"
 
   @property
@@ -90,6 +94,7 @@ class Job:
       if every and self._evaluations % every == 0:
         self._start_video(step, recording)
     self._advance_trace(metrics)
+    self._check_buffers(taken, metrics)
     self._check_numbers(step, taken, metrics, capture)
 
   def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
@@ -119,6 +124,9 @@ class Job:
       self._video.result()
     self.close("finished" if completed else "preempted")
     plot_learning_curve(self._run_dir.metrics_csv, self._run_dir.plots)
+    if self._config.profile.enable and self._profile.is_dir():  # a run of one row has traced nothing
+      for line in format_ops(write_top_ops(self._profile)):
+        self._progress.print(line)
     timings = {
       "start_to_first_update_s": self._start_to_first_update_s,
       "first_update_s": loop.first_update_s,
@@ -193,10 +201,19 @@ class Job:
       jax.profiler.stop_trace()
       self._trace = "off"
     elif self._trace == "due" and "time/steps_per_second" in metrics:
-      folder = self._run_dir.path / "profile"
-      jax.profiler.start_trace(str(folder))
+      jax.profiler.start_trace(str(self._profile))
       self._trace = "on"
-      self._progress.print(f"tracing into {folder}")
+      self._progress.print(f"tracing into {self._profile}")
+
+  def _check_buffers(self, taken: int, metrics: Metrics) -> None:
+    """Says, once, that Warp's buffers are too small for the task."""
+    overflows = metrics.get("training/overflows", 0.0)
+    if overflows and not self._warned_of_buffers:
+      self._warned_of_buffers = True
+      self._progress.print(
+        f"{overflows:.0f} of {taken:,} steps needed more than Warp's buffers hold, and lost contacts or constraints: "
+        f"`playground tune-buffers {self._config.choices['env']}` says what env.njmax and env.naconmax should be."
+      )
 
   def _check_numbers(self, step: int, taken: int, metrics: Metrics, capture: Any) -> None:
     """Dumps the first non-finite step, and stops the run when there are too many of them."""
@@ -209,17 +226,21 @@ class Job:
       dump = write_dump(self._run_dir.nan_dump, step, capture, self._config.resolved)
       where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
       self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or absurd.{where}")
-    fraction = bad * self._env.action_repeat / max(taken, 1)
-    if fraction > self._config.on_nonfinite.max_fraction:
-      raise NonfiniteError(
-        f"{fraction:.1%} of the environment steps before step {step:,} went NaN, infinite or absurd, more than "
-        f"on_nonfinite.max_fraction={self._config.on_nonfinite.max_fraction:g}.{where}"
-      )
+    check_fraction(bad * self._env.action_repeat / max(taken, 1), self._config.on_nonfinite.max_fraction, step, where)
+
+
+def check_fraction(fraction: float, allowed: float, step: int, where: str = "") -> None:
+  """Raises NonfiniteError when more than a share of the environment steps before `step` was not finite."""
+  if fraction > allowed:
+    raise NonfiniteError(
+      f"{fraction:.1%} of the environment steps before step {step:,} went NaN, infinite or absurd, more than "
+      f"on_nonfinite.max_fraction={allowed:g}.{where}"
+    )
 
 
 def episodes_of(recording: Any, count: int) -> dict[str, Any]:
   """The first `count` episodes of an evaluation's recording, one after the other: `qpos` [T, nq] and mocap poses."""
-  tape = {name: np.asarray(value) for name, value in jax.device_get(recording).items()}
+  tape = {name: own_share(value, axis=1) for name, value in recording.items()}
   active = tape.pop("active")[:, :count] > 0
   columns, rows = np.nonzero(active.T)
   return {name: value[rows, columns] for name, value in tape.items() if value.size}

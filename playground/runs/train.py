@@ -2,19 +2,25 @@
 
 import contextlib
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 
 from playground import registry
 from playground.envs.base import Env
+from playground.errors import ConfigError
+from playground.hardware.distributed import is_main, leaving_at_once, preflight
+from playground.hardware.mesh import divide
+from playground.hardware.scaling import describe_division, scale_envs
 from playground.hardware.setup import setup
 from playground.learning.algorithms import algorithm
 from playground.learning.evaluation import make_evaluator
+from playground.learning.learner import Learner
 from playground.learning.loop import Loop, compile_program, schedule
 from playground.randomization import Randomizer
 from playground.rendering.visuals import drawn_model
 from playground.runs.chain import train_chain
+from playground.runs.follower import Follower
 from playground.runs.interrupts import Interrupted, Interrupts, exit_code
 from playground.runs.job import Job
 from playground.runs.progress import Progress
@@ -37,8 +43,13 @@ def train(config: "RunConfig") -> int:
   Raises:
     PlaygroundError: what the user can act on; a run directory that exists by then says failed and why.
   """
-  with Interrupts() as interrupts:
+  if config.hardware.distributed.enable and config.stages:
+    raise ConfigError("hardware=multi_node trains single runs: give a chain's stages one by one, with init_from.")
+  with leaving_at_once(), Interrupts() as interrupts:
     try:
+      if config.hardware.scale_envs:
+        config, notice = scale_envs(config, setup(config.hardware).mesh.size)
+        print(notice)
       return train_chain(config, interrupts, _train) if config.stages else _train(config, interrupts)
     except Interrupted as interrupt:
       print(f"Interrupted by {interrupt}.")
@@ -52,18 +63,29 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
     print(f"{config.resume} is finished: nothing to resume (init_from={config.resume} trains on from its weights).")
     return 0
   hardware = setup(config.hardware)
+  preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
   algorithm_class = algorithm(config.agent.name)
   agent = algorithm_class.Config.from_config(config.agent)
   agent.check(hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
-  model, eval_model = randomized_models(env, config, agent.num_envs, agent.num_eval_envs)
+  model, eval_model = divide(randomized_models(env, config, agent.num_envs, agent.num_eval_envs), hardware.mesh)
   learner = algorithm_class(env, agent, hardware.mesh, model, hardware.network_precision)
   start.notices += learner.notices()
+  if hardware.mesh.size > 1:
+    start.notices.append(describe_division(config.agent, hardware.mesh.size))
   start.restore(learner, config.agent.name, model)
 
   num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
   marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
+  num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
+  evaluate = make_evaluator(env, learner.act, agent.num_eval_envs, hardware.mesh, num_recorded)
+  if not is_main():
+    program = compile_program(learner, evaluate, model, eval_model)
+    follower = Follower(config, env, interrupts, start.step)
+    loop = Loop(learner, program, marks, config.seed, follower, model, eval_model)
+    _, completed = _run(loop, learner, start, interrupts)
+    return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
   run_dir = start.run_dir or RunDirectory.create(
     str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
   )
@@ -75,8 +97,6 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
     for notice in start.notices:
       progress.print(notice)
     progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
-    num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
-    evaluate = make_evaluator(env, learner.act, agent.num_eval_envs, hardware.mesh, num_recorded)
     program = compile_program(learner, evaluate, model, eval_model)
     to_compiled_s = process_age_s() - began_s
     timings = {"start_to_compiled_s": to_compiled_s, "trace_s": program.trace_s, "compile_s": program.compile_s}
@@ -85,14 +105,19 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
     job = Job(config, run_dir, env, learner, progress, interrupts, start, drawn)
     with contextlib.closing(job):
       loop = Loop(learner, program, marks, config.seed, job, model, eval_model)
-      interrupts.start_saving()
-      state = loop.init() if start.state is None else start.state
-      if start.policy is not None:
-        state = learner.with_policy(state, start.policy)
-      state, completed = loop.run(state, start.update)
+      state, completed = _run(loop, learner, start, interrupts)
       job.finish(loop, state, completed)
   _say_where(run_dir)
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+
+
+def _run(loop: Loop, learner: Learner, start: Start, interrupts: Interrupts) -> tuple[Any, bool]:
+  """Trains from where the run begins; returns the last state, and whether the schedule was completed."""
+  interrupts.start_saving()
+  state = loop.init() if start.state is None else start.state
+  if start.policy is not None:
+    state = learner.with_policy(state, start.policy)
+  return loop.run(state, start.update)
 
 
 def randomized_models(

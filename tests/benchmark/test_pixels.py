@@ -54,4 +54,4 @@ def test_a_real_one(tmp_path: Path) -> None:
   assert done.returncode == 0, done.stdout + done.stderr
   rows = pd.read_csv(tmp_path / "out.csv")
   parts = ["physics", "task", "episodes", "pixels", "inference", "storing", "update"]
-  assert [text.split("part=")[1] for text in rows["setting"]] == parts and (rows["value"] > 0).all()
+  assert [text.split("part=")[1] for text in rows["setting"]] == parts and min(rows["value"]) > 0

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from playground import registry
+from playground.cli import eval as eval_command
 from playground.cli.main import main
 from playground.config import compose
 from playground.learning.checkpoints import find_checkpoints
@@ -73,6 +74,20 @@ def test_one_checkpoint_with_more_episodes_and_another_seed(command: Command, tr
   assert command(str(older), "--episodes", "6", "--seed", "3") == 0
   written = report(trained, 2000, seed=3)
   assert (written["checkpoint"], written["episodes"], written["seed"]) == (str(older), 6, 3)
+
+
+def test_what_the_paper_measured_on_a_real_robot_stands_beside(
+  command: Command, trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+  row = {"task": "CartpoleBalance", "metric": "length", "median": "3", "mean": "4", "ci95": "0.5", "trials": "9"}
+  rows = [row | {"what": "seconds upright", "where": "Section X"}, row | {"task": "Other"}]
+  monkeypatch.setattr(eval_command, "paper_table", lambda name: rows)
+  assert command(str(trained)) == 0
+  out = capsys.readouterr().out
+  assert "simulation, mean" in out and "hardware, mean (paper)" in out
+  assert re.search(r"length\W+20\W+4 ± 0.5\b", out)
+  assert "hardware, length: seconds upright; 9 trials (paper, Section X)" in out
+  assert report(trained, 4000)["hardware_in_paper"] == rows[:1]
 
 
 def test_the_mode_of_the_policy_is_another_score(command: Command, trained: Path) -> None:

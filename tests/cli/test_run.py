@@ -5,12 +5,15 @@ import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from playground.cli.run import main
 from playground.config import RunConfig, compose, to_yaml
 from playground.errors import HardwareError
+from playground.sweep.folder import SweepDirectory
 
 Command = Callable[..., int]
 
@@ -82,7 +85,7 @@ def test_resumes(command: Command, trained: list[RunConfig], tmp_path: Path, cap
     (["agent.num_timesteps=2e6", "--cfg", "job", "agent.num_envs=64"], ["num_envs: 64\n", "num_timesteps: 2000000\n"]),
     (["env=CartpoleBalance", "--cfg", "job", "--package", "agent"], ["num_envs: 2048\n"]),
     (["experiment=go1_joystick_chain", "--cfg", "job"], ["stages:\n    slow_turns:\n", "    rough:\n"]),
-    (["--help"], ["hardware: auto, cpu, gpu", "num_envs: 256\n"]),
+    (["--help"], ["hardware: a100_x1, ", "num_envs: 256\n"]),
     (["--info", "searchpath"], ["configs"]),
   ],
 )
@@ -106,6 +109,10 @@ def test_shows_and_does_not_train(
     (["-m", "seed=1", "env=Gone"], "error: "),
     (["-m", "agent.num_envs=0"], "error: agent.num_envs=0 must be a number above 0."),
     (["-m", "sweep=dm_control_pop"], "error: sweep=dm_control_pop does not exist: choose from dm_control_ppo,"),
+    (["launcher=ray"], "launcher=ray is about a sweep: add -m"),
+    (["-m", "agent.num_envs=128,7"], "error: Job experiment=quickstart agent.num_envs=7: agent.num_envs=7 does not"),
+    (["-m", "agent.learning_rate=interval(0,1)"], "is a range to draw from: add search=optuna"),
+    (["-m", "seed=1,2", "--cfg", "all"], "--cfg all shows one run: leave -m out"),
     (["sweep=dm_control_ppo"], "add -m, as in `playground-run -m sweep=dm_control_ppo`."),
   ],
 )
@@ -128,18 +135,27 @@ def test_exit_code_is_trainings(command: Command, trained: list[RunConfig]):
   assert command("seed=97") == 143
 
 
-def test_multirun(command: Command, trained: list[RunConfig], capsys: pytest.CaptureFixture[str]):
-  assert command("-m", "seed=1,99,3", "agent.num_timesteps=1e6") == 2
-  assert [config.seed for config in trained] == [1, 99, 3]
-  assert {config.name for config in trained} == {"quickstart"}
-  assert "error: hardware.devices=9" in capsys.readouterr().err
+def test_multirun_shows_every_job(command: Command, trained: list[RunConfig], capsys: pytest.CaptureFixture[str]):
+  assert command("-m", "tuned=null", "seed=1,2", "--cfg", "job") == 0
+  jobs = list(yaml.safe_load_all(capsys.readouterr().out))
+  assert [(job["name"], job["seed"]) for job in jobs] == [("quickstart", 1), ("quickstart", 2)]
+  assert {job["choices"]["tuned"] for job in jobs} == {None}
+  assert trained == []
 
 
-def test_a_sweep_and_what_the_command_line_says_instead(command: Command, trained: list[RunConfig]):
-  assert command("-m", "sweep=dm_control_ppo", "env=glob(Cartpole*Sparse)", "seed=range(2)", "debug=fast") == 0
-  jobs = [(config.choices["env"], config.seed) for config in trained]
-  assert jobs == [(f"Cartpole{name}Sparse", seed) for name in ("Balance", "Swingup") for seed in (0, 1)]
-  assert {config.agent.num_timesteps for config in trained} == {320}
+def test_multirun_is_a_sweep(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+  swept: list[tuple[SweepDirectory, Any]] = []
+  monkeypatch.setattr("playground.sweep.runner.run_sweep", lambda sweep, settings: swept.append((sweep, settings)) or 3)
+  monkeypatch.chdir(tmp_path)
+  line = ["sweep=dm_control_ppo", "env=glob(Cartpole*Sparse)", "seed=range(2)", "debug=fast", "launcher.timeout=9"]
+  assert command("-m", *line) == 3
+  ((sweep, settings),) = swept
+  assert settings.launcher.timeout == 9
+  assert [job.overrides[:2] for job in sweep.jobs[:2]] == [["agent=ppo", "env=CartpoleBalanceSparse"]] * 2
+  assert [job.varies["seed"] for job in sweep.jobs] == [0, 1, 0, 1]
+  assert sweep.path.parent == Path("results/sweeps/dm_control_ppo")
+  assert command("-m", *line) == 3
+  assert swept[1][0].path == sweep.path, "not finished, so it goes on"
 
 
 def test_a_mistake_is_reported_before_jax_is_imported():

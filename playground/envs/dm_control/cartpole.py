@@ -2,13 +2,16 @@
 
 import functools
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from playground.envs.base import State
 from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
 from playground.envs.physics import PhysicsData
+from playground.errors import ConfigError
 from playground.mdp.tolerance import tolerance
 
 _SLIDER, _HINGE = 0, 1
@@ -76,3 +79,39 @@ def _sparse(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> Terms:
     "cart_in_bounds": tolerance(data.qpos[_SLIDER], (-0.25, 0.25)),
     "angle_in_bounds": tolerance(cosine, (0.995, 1.0)),
   }
+
+
+class CartpoleVision(Cartpole):
+  """Keeps the pole upright, made for learning from pixels: what is paid is what a glance shows, and a fall ends it.
+
+  The reward of a step is 0.1 less small penalties (pole and cart off the middle, motion, action), so that 25 is the
+  most of 250 steps. An episode ends when the pole lies, or the cart is 3 m out.
+
+  A control step is `env.ctrl_dt`. Playground 0.2.0 sets the same 0.02 s after its base class has read the task's 0.01:
+  with `env.parity=true` a step is one physics step, and an episode half as long.
+  """
+
+  def __init__(self, config: Any):
+    """Loads the model. `config`: see `configs/env/CartpoleBalanceVision.yaml`."""
+    super().__init__(config)
+    if config.swing_up or config.sparse:
+      raise ConfigError("env.swing_up and env.sparse must be false here: a hanging pole ends the episode.")
+    if self.parity:
+      self.dt, self.n_substeps = self.sim_dt, 1
+
+  def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
+    (x, _), (x_speed, angle_speed) = data.qpos, data.qvel
+    terms = {
+      "alive": jnp.full((), 0.1),
+      "pole_pos_penalty": -jnp.square(1 - data.xmat[self._pole, 2, 2]),
+      "cart_pos_penalty": -0.02 * jnp.square(x),
+      "cart_vel_penalty": -0.01 * jnp.abs(x_speed),
+      "pole_vel_penalty": -0.005 * jnp.abs(angle_speed),
+      "action_penalty": -0.01 * jnp.square(action).sum(),
+    }
+    return sum(terms.values(), jnp.zeros(())), terms
+
+  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+    state = super().evaluate(data, info, action)
+    failed = (jnp.abs(data.qpos[_SLIDER]) > 3) | (jnp.abs(data.qpos[_HINGE]) > jnp.pi / 2)
+    return state.replace(done=jnp.maximum(state.done, failed))

@@ -1,0 +1,97 @@
+"""How large Warp's buffers must be for a task: the most that a policy makes it need."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from ml_collections import ConfigDict
+
+from playground import registry
+from playground.envs.base import Env
+from playground.envs.physics import BufferUse
+from playground.envs.wrappers import wrap_for_training
+from playground.errors import ConfigError
+
+ROOM = 1.25  # buffers are advised to be so much larger than what was needed
+_TRIES = 8
+
+Act = Callable[[Any, jax.Array], jax.Array]  # (observation [N, ...], key) -> actions [N, action_size]
+
+
+@dataclasses.dataclass(frozen=True)
+class BufferSizes:
+  """Sizes of Warp's buffers: constraint rows of one environment, and contacts or candidate pairs of each on average."""
+
+  constraints: int
+  contacts: float
+
+  def advised(self, num_envs: int) -> dict[str, int]:
+    """`njmax` and `naconmax` for `num_envs` environments on one device, with some room."""
+    return {
+      "njmax": _round_up(self.constraints * ROOM, 4),
+      "naconmax": _round_up(self.contacts * num_envs * ROOM, 1024),
+    }
+
+
+def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_steps: int, seed: int = 0) -> BufferSizes:
+  """Rolls a task out on Warp and returns the most that any step needed.
+
+  Args:
+    config: the task's configuration; its own sizes are where the search for sufficient ones begins.
+    act: the policy; uniformly random actions if None.
+    num_envs: environments.
+    num_steps: decisions; episodes that end begin anew.
+    seed: of starts and actions.
+
+  Raises:
+    ConfigError: Warp is not installed, or some buffer that cannot be set overflowed.
+  """
+  rows, pairs = max(config.njmax or 0, 32), 32
+  for _ in range(_TRIES):
+    sizes = {"impl": "warp", "njmax": rows, "naconmax": pairs * num_envs, "naccdmax": None}
+    env = registry.build(ConfigDict(config.to_dict() | sizes))
+    use = _roll(env, act, num_envs, num_steps, seed)
+    if not use.overflow:
+      return BufferSizes(int(use.constraints), int(use.contacts) / num_envs)
+    grew = False
+    if use.constraints > rows:
+      rows, grew = _round_up(int(use.constraints) * ROOM, 4), True
+    if use.contacts > pairs * num_envs:
+      pairs, grew = 2 * pairs, True
+    if not grew:
+      break
+  bits = _overflow_names(int(use.overflow))
+  raise ConfigError(f"env.impl=warp: buffers overflowed that njmax={rows} and naconmax do not bound ({bits}).")
+
+
+def _roll(env: Env, act: Act | None, num_envs: int, num_steps: int, seed: int) -> BufferUse:
+  wrapped = wrap_for_training(env)
+  reset_key, act_key = jax.random.split(jax.random.PRNGKey(seed))
+  uniform = lambda obs, key: jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
+
+  @jax.jit
+  def roll() -> BufferUse:
+    def step(carry: tuple[Any, BufferUse], key: jax.Array) -> tuple[tuple[Any, BufferUse], None]:
+      state, most = carry
+      state = wrapped.step(state, (act or uniform)(state.obs, key), {})
+      return (state, most.join(state.data.buffers)), None
+
+    state = wrapped.reset(jax.random.split(reset_key, num_envs), {})
+    most = jax.tree.map(jnp.zeros_like, state.data.buffers)
+    (_, most), _ = jax.lax.scan(step, (state, most), jax.random.split(act_key, num_steps))
+    overflow = jax.lax.reduce_or(most.overflow, (0,))
+    return BufferUse(most.constraints.max(), most.contacts.max(), overflow)
+
+  return jax.device_get(roll())
+
+
+def _overflow_names(bits: int) -> str:
+  from mujoco.mjx.third_party.mujoco_warp import OverflowType
+
+  return ", ".join(flag.name or str(flag.value) for flag in OverflowType if flag & bits and flag != OverflowType.ALL)
+
+
+def _round_up(value: float, multiple: int) -> int:
+  return -(-int(-(-value // 1)) // multiple) * multiple

@@ -1,0 +1,65 @@
+"""A trained policy and all that it needs to act: read from a run, on this machine."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import jax
+
+from playground import config as configs
+from playground import registry
+from playground.envs.base import Env
+from playground.hardware.setup import Hardware, setup, this_machine
+from playground.learning.algorithms import make_learner
+from playground.learning.checkpoints import Checkpoint, find_checkpoints
+from playground.learning.learner import Learner, Policy
+from playground.runs.run_dir import RunDirectory
+
+if TYPE_CHECKING:
+  from playground.config import RunConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+  """A checkpoint's policy.
+
+  Attributes:
+    run_dir: the run's directory.
+    config: the run's configuration.
+    checkpoint: where the policy is from.
+    env: the task, as the run trained it.
+    hardware: this machine's devices.
+    learner: the algorithm, whose `act(policy, obs, key, deterministic)` gives actions.
+    policy: networks and normaliser, on the devices.
+  """
+
+  run_dir: RunDirectory
+  config: "RunConfig"
+  checkpoint: Checkpoint
+  env: Env
+  hardware: Hardware
+  learner: Learner
+  policy: Policy
+
+  @property
+  def task(self) -> str:
+    return self.config.choices["env"]
+
+  def act(self, obs: Any, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
+    """Actions in [-1, 1], [..., action_size]."""
+    return self.learner.act(self.policy, obs, key, deterministic)
+
+
+def load_trained(path: str) -> Trained:
+  """Reads a run's newest checkpoint, or the checkpoint given.
+
+  Raises:
+    PlaygroundError: no such run or checkpoint, or one that is damaged or does not fit.
+  """
+  checkpoint = Checkpoint(find_checkpoints(path)[0])
+  run_dir = RunDirectory.open(checkpoint.path.parents[1])
+  config = configs.from_saved(run_dir.config)
+  hardware = setup(this_machine(config.hardware))
+  env = registry.load(config.choices["env"], config=config.env)
+  learner = make_learner(env, config.agent, hardware.mesh, hardware.network_precision)
+  policy = learner.place_policy(checkpoint.restore("policy", learner.policy_shape()))
+  return Trained(run_dir, config, checkpoint, env, hardware, learner, policy)
