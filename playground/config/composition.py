@@ -112,7 +112,7 @@ def override_section(section: str, default: Section, overrides: Mapping[str, Any
 
 
 def from_saved(resolved: Mapping[str, Any], config_dir: Path | None = None) -> RunConfig:
-  """Rebuilds the configuration of a run that an earlier version may have saved: keys that it lacks have today's defaults.
+  """Rebuilds the configuration of a run that an earlier version may have saved: keys it lacks get today's defaults.
 
   What a task chooses by name (reward terms, observations, noise) stays what it was.
 

@@ -46,7 +46,7 @@ class Env(abc.ABC):
   """
 
   spec: mujoco.MjSpec | None = None  # the scene as it was composed, where a task keeps it: to draw it otherwise
-  # How an evaluation makes one number of a metric's values in an episode: `sum` (unless named here), `mean`, `max` or
+  # How an episode's values of a metric become one number for the log: `sum` (unless named here), `mean`, `max` or
   # `last`. A success in any step is a `max`, one that must hold at the end a `last`, an error in metres a `mean`.
   summaries: ClassVar[Mapping[str, str]] = {}
   derived: ClassVar[tuple[str, ...]] = DERIVED_FIELDS  # narrow it to what the task reads: what is not kept is not moved

@@ -97,8 +97,20 @@ class FiniteGuard(Wrapper):
     )
 
 
+# One more value of an episode: (so far, new, how many with it) -> so far.
+_SUMMARIES: dict[str, Callable[[jax.Array, jax.Array, jax.Array], jax.Array]] = {
+  "sum": lambda old, new, n: old + new,
+  "mean": lambda old, new, n: old + (new - old) / n,
+  "max": lambda old, new, n: jnp.where(n > 1, jnp.maximum(old, new), new),
+  "last": lambda old, new, n: new,
+}
+
+
 class Episode(Wrapper):
-  """Ends episodes after `length` control steps, repeats each action and sums the rewards and metrics of an episode.
+  """Ends episodes after `length` control steps and repeats each action.
+
+  `info["episode_metrics"]` holds the episode's `sum_reward`, `length` and, of each metric, the sum over its decisions
+  or what the task's `summaries` says; a step that is not finite counts in sums only, with 0.
 
   A time-out gives done = 1 with `info["truncation"]` = 1, kept apart from the task's own termination. With repeats an
   episode that terminates in an earlier one stays done and earns nothing in the later ones.
@@ -134,12 +146,15 @@ class Episode(Wrapper):
     timed_out = steps >= self.length
     done = jnp.where(timed_out, 1.0, ended)
     sums = {k: jnp.where(was_done > 0, 0.0, v) for k, v in state.info["episode_metrics"].items()}
-    step_values = {"sum_reward": reward, "length": jnp.full_like(reward, self.repeat)} | after.metrics
+    values = {"sum_reward": reward, "length": jnp.full_like(reward, self.repeat)} | after.metrics
+    kinds: Mapping[str, str] = self.env.summaries
+    totals = {k: _SUMMARIES[kinds.get(k, "sum")](old, values[k], steps / self.repeat) for k, old in sums.items()}
+    totals |= {k: jnp.where(after.info["nonfinite"] > 0, sums[k], totals[k]) for k in kinds}
     info = after.info | {
       "steps": steps,
       "truncation": jnp.where(timed_out, 1 - ended, 0.0),
       "episode_done": done,
-      "episode_metrics": {k: sums[k] + step_values[k] for k in sums},
+      "episode_metrics": totals,
     }
     return after.replace(reward=reward, done=done, info=info)
 

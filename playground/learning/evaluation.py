@@ -17,14 +17,6 @@ Act = Callable[[Any, Any, jax.Array], jax.Array]  # (policy, obs [N, ...], key) 
 
 Evaluate = Callable[..., tuple[dict[str, jax.Array], dict[str, jax.Array]]]
 
-# One more value of an episode: (so far, new) -> so far. A mean is a sum until the end.
-_SUMMARIES: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
-  "sum": jnp.add,
-  "mean": jnp.add,
-  "max": jnp.maximum,
-  "last": lambda _, new: new,
-}
-
 
 def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: int = 0) -> Evaluate:
   """Builds a jitted evaluation of a policy over `num_envs` episodes, spread over the mesh.
@@ -39,12 +31,11 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
   Returns:
     A function (policy, key, model fields [num_envs, ...]) -> (scalars, recording). The scalars: `episode_reward` and
     `episode_length` with their deviation over episodes (`_std`), the mean over episodes of every metric
-    (`episode_<metric>`: of an episode its sum, or what `env.summaries` says), and `nonfinite`, the number of episodes
+    (`episode_<metric>`, see `wrappers.Episode`), and `nonfinite`, the number of episodes
     that ended in NaN. The recording: `qpos`, `mocap_pos`, `mocap_quat` and `active` (1 until the episode ended) before
     each decision, [decisions, episodes, ...].
   """
   wrapped = wrap_for_evaluation(env)
-  summaries = env.summaries
   decisions = -(-env.episode_length // env.action_repeat)
   per_device = num_envs // mesh.size
 
@@ -53,9 +44,7 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
     reset_key, act_key = jax.random.split(key)
     state = wrapped.reset(jax.random.split(reset_key, per_device), model)
     zeros = jnp.zeros(per_device)
-    totals = {"reward": zeros, "length": zeros, "nonfinite": zeros} | {
-      name: jnp.full_like(zeros, -jnp.inf if summaries.get(name) == "max" else 0.0) for name in state.metrics
-    }
+    totals = {name: zeros for name in ("nonfinite", *state.info["episode_metrics"])}
 
     def view(state: State, active: jax.Array) -> dict[str, jax.Array]:
       seen = {name: getattr(state.data, name) for name in ("qpos", "mocap_pos", "mocap_quat")}
@@ -73,15 +62,12 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
       step, state, active, totals, recording = carry
       recording = jax.tree.map(lambda tape, x: tape.at[step].set(x), recording, view(state, active))
       state = wrapped.step(state, act(policy, state.obs, jax.random.fold_in(act_key, step)), model)
-      values = {"reward": state.reward, "length": jnp.full_like(zeros, env.action_repeat)}
-      values |= {"nonfinite": state.info["nonfinite"]} | state.metrics
-      added = {k: _SUMMARIES[summaries.get(k, "sum")](total, values[k]) for k, total in totals.items()}
-      totals = {k: jnp.where(active > 0, added[k], total) for k, total in totals.items()}
+      now = state.info["episode_metrics"] | {"nonfinite": totals["nonfinite"] + state.info["nonfinite"]}
+      totals = {k: jnp.where(active > 0, now[k], total) for k, total in totals.items()}
       return step + 1, state, active * (1 - state.done), totals, recording
 
     totals, recording = jax.lax.while_loop(running, step, (0, state, active, totals, recording))[3:]
-    steps = totals["length"] / env.action_repeat
-    totals |= {k: totals[k] / steps for k, kind in summaries.items() if kind == "mean"}
+    totals["reward"] = totals.pop("sum_reward")
     everywhere = {k: jax.lax.all_gather(v, AXIS, tiled=True) for k, v in totals.items()}
     report = {f"episode_{k}": v.mean() for k, v in everywhere.items() if k != "nonfinite"}
     for name in ("reward", "length"):

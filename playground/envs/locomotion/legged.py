@@ -53,8 +53,8 @@ class LeggedTask(Env):
       UnknownNameError: a reward, observation, termination, robot, terrain or object that does not exist.
       ConfigError: a reward's parameter is missing.
     """
-    self.spec = self._scene(config)
-    mj_model = self.spec.compile()
+    spec = self.spec = self._scene(config)
+    mj_model = spec.compile()
     set_gains(mj_model, **config.robot.pd)
     super().__init__(config, mj_model)
     self.robot = LeggedRobot(mj_model, config.robot, self.parity)
