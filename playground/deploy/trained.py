@@ -10,7 +10,6 @@ import numpy as np
 import pandas
 from ml_collections import ConfigDict
 
-from playground import config as configs
 from playground import registry
 from playground.config import RunConfig
 from playground.deploy.contract import describe_policy
@@ -21,11 +20,9 @@ from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_training
 from playground.errors import ConfigError
 from playground.extras import need
-from playground.hardware.setup import setup, this_machine
-from playground.learning.algorithms import make_learner
-from playground.learning.checkpoints import Checkpoint, find_checkpoints
 from playground.learning.learner import Learner, Policy
 from playground.runs.run_dir import RunDirectory
+from playground.runs.trained import load_trained
 
 _EXACT = "highest"  # precision of matrix products: what the exported policy computes
 
@@ -57,16 +54,8 @@ class TrainedPolicy:
     Raises:
       PlaygroundError: no such run or checkpoint, one that does not fit, or a policy that sees pictures.
     """
-    checkpoint = Checkpoint(find_checkpoints(path)[0])
-    run_dir = RunDirectory.open(checkpoint.path.parents[1])
-    run = configs.from_saved(run_dir.config)
-    hardware_config = this_machine(run.hardware)
-    hardware_config.platform = "cpu"
-    hardware = setup(hardware_config)
-    env = load_on_c_physics(run.choices["env"], run.env)
-    learner = make_learner(env, run.agent, hardware.mesh, _EXACT)
-    policy = learner.place_policy(checkpoint.restore("policy", learner.policy_shape()))
-    return cls(run, run_dir, checkpoint.step, env, learner, policy)
+    found = load_trained(path, load_task=load_on_c_physics, platform="cpu", precision=_EXACT)
+    return cls(found.config, found.run_dir, found.checkpoint.step, found.env, found.learner, found.policy)
 
   def act(self, obs: Any) -> jax.Array:
     """The deterministic action."""

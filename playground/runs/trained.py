@@ -1,9 +1,12 @@
 """A trained policy and all that it needs to act: read from a run, on this machine."""
 
 import dataclasses
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+from ml_collections import ConfigDict
 
 from playground import config as configs
 from playground import registry
@@ -49,8 +52,20 @@ class Trained:
     return self.learner.act(self.policy, obs, key, deterministic)
 
 
-def load_trained(path: str) -> Trained:
+def load_trained(
+  path: str | Path,
+  *,
+  load_task: Callable[[str, ConfigDict], Env] | None = None,
+  platform: str | None = None,
+  precision: str | None = None,
+) -> Trained:
   """Reads a run's newest checkpoint, or the checkpoint given.
+
+  Args:
+    path: a run directory, or one of its checkpoints.
+    load_task: makes the task of a name and a configuration; `registry.load` if None.
+    platform: what to compute on; the run's, as far as this machine has it, if None.
+    precision: of the networks' matrix products; the run's if None.
 
   Raises:
     PlaygroundError: no such run or checkpoint, or one that is damaged or does not fit.
@@ -58,8 +73,10 @@ def load_trained(path: str) -> Trained:
   checkpoint = Checkpoint(find_checkpoints(path)[0])
   run_dir = RunDirectory.open(checkpoint.path.parents[1])
   config = configs.from_saved(run_dir.config)
-  hardware = setup(this_machine(config.hardware))
-  env = registry.load(config.choices["env"], config=config.env)
-  learner = make_learner(env, config.agent, hardware.mesh, hardware.network_precision)
+  hardware_config = this_machine(config.hardware)
+  hardware_config.platform = platform or hardware_config.platform
+  hardware = setup(hardware_config)
+  env = (load_task or registry.load)(config.choices["env"], config.env)
+  learner = make_learner(env, config.agent, hardware.mesh, precision or hardware.network_precision)
   policy = learner.place_policy(checkpoint.restore("policy", learner.policy_shape()))
   return Trained(run_dir, config, checkpoint, env, hardware, learner, policy)

@@ -1,15 +1,13 @@
 """`playground-bench`: what it says about mistakes, before anything is started."""
 
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from playground.benchmark import commands
 from playground.cli.bench import main
-
-Command = Callable[..., int]
+from tests.command import Command, caller
 
 
 @pytest.fixture
@@ -19,14 +17,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
 
   monkeypatch.setattr(commands, "probe", started)
 
-  def call(*args: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["playground-bench", *args])
-    with pytest.raises(SystemExit) as exit_:
-      main()
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
-
-  return call
+  return caller(monkeypatch, "playground-bench", main)
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,6 @@
 import json
 import re
 import shutil
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +15,8 @@ from playground.cli.main import main
 from playground.config import compose
 from playground.learning.checkpoints import find_checkpoints
 from playground.runs.train import train
+from tests.command import Command, caller
 from tests.dummy import Point
-
-Command = Callable[..., int]
 
 
 @pytest.fixture(autouse=True)
@@ -41,14 +38,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch) -> Command:
-  def call(*args: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["playground", "eval", *args])
-    with pytest.raises(SystemExit) as exit_:
-      main()
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
-
-  return call
+  call = caller(monkeypatch, "playground", main)
+  return lambda *args: call("eval", *args)
 
 
 def report(run: Path, step: int, seed: int = 0) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import sys
 import types
-from collections.abc import Callable
 from subprocess import run
 from typing import Any
 
@@ -10,20 +9,12 @@ import pytest
 
 from playground.cli.main import main
 from playground.errors import CheckpointError
-
-Command = Callable[..., int]
+from tests.command import Command, caller
 
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch) -> Command:
-  def call(*args: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["playground", *args])
-    with pytest.raises(SystemExit) as exit_:
-      main()
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
-
-  return call
+  return caller(monkeypatch, "playground", main)
 
 
 def _stub(monkeypatch: pytest.MonkeyPatch, module: str, name: str, result: Any) -> list[Any]:

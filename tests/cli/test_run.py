@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import types
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,7 @@ from playground.cli.run import main
 from playground.config import RunConfig, compose, to_yaml
 from playground.errors import HardwareError
 from playground.sweep.folder import SweepDirectory
-
-Command = Callable[..., int]
+from tests.command import Command, caller
 
 
 @pytest.fixture
@@ -40,14 +38,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[RunConfig]:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch) -> Command:
-  def run(*args: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["playground-run", *args])
-    with pytest.raises(SystemExit) as exit_:
-      main()
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
-
-  return run
+  return caller(monkeypatch, "playground-run", main)
 
 
 def test_trains_the_default_run_and_prints_it(

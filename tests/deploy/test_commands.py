@@ -2,8 +2,6 @@
 
 import json
 import re
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -21,8 +19,8 @@ from playground.learning.checkpoints import CheckpointStore
 from playground.learning.learner import Policy
 from playground.registry import load
 from playground.runs.run_dir import RunDirectory
+from tests.command import Command, caller
 
-Command = Callable[..., int]
 STEPS = 3000
 
 
@@ -48,14 +46,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch) -> Command:
-  def call(*args: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["playground", *args])
-    with pytest.raises(SystemExit) as exit_:
-      main()
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
-
-  return call
+  return caller(monkeypatch, "playground", main)
 
 
 def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
