@@ -69,7 +69,10 @@ def _main(argv: Sequence[str]) -> int:
 
   def job(_: object) -> None:
     assert config is not None, "composed above unless Hydra only shows something"
-    codes.append(_train(config))
+    try:
+      codes.append(_train(config))
+    except PlaygroundError as error:  # Hydra would say a line of its own about it
+      codes.append(_report(error))
 
   roots = config_roots()
   sys.argv[1:] = [*flags, *overrides, *search_path_override(roots)]

@@ -212,6 +212,11 @@ class Golden:
         yield _name(path), np.where(np.isnan(theirs), np.nan, np.asarray(a, np.float64)), theirs
 
 
+def terms(state: State) -> dict[str, jax.Array]:
+  """The weighted terms of a step's reward, by name."""
+  return {name: value for name, value in state.metrics.items() if name.startswith("reward/")}
+
+
 def recorded(name: str, **info: jax.Array) -> State:
   """A recorded state amid an episode, with some of its `info` replaced: any variant of the task may go on from it."""
   state = jax.tree.map(lambda x: x[4], golden(name).states)

@@ -11,7 +11,7 @@ from playground import registry
 from playground.config import compose
 from playground.envs.base import State
 from playground.envs.locomotion.getup import Getup
-from tests.envs.golden import golden, load_task
+from tests.envs.golden import golden, load_task, terms
 
 TASK = "Go1Getup"
 N = 256
@@ -91,7 +91,7 @@ def test_rewards_of_a_robot_that_stands(getup: Getup, state: State) -> None:
   up = state.data.sensordata.at[sensors : sensors + 3].set(jnp.array([0.0, 0.0, 1.0]))
   site = state.data.site_xpos.at[getup.robot.base_site, 2].set(0.275)
   after = evaluate(getup, state, sensordata=up, site_xpos=site, qpos=q, qvel=jnp.zeros(18), qacc=jnp.zeros(18))
-  rewards = {name.removeprefix("reward/"): float(value) for name, value in after.metrics.items()}
+  rewards = {name.removeprefix("reward/"): float(value) for name, value in terms(after).items()}
   best = {"orientation": 1.0, "torso_height": np.exp(0.275) - 1, "posture": 1.0, "stand_still": 1.0}
   np.testing.assert_allclose([rewards[name] for name in best], list(best.values()), rtol=1e-5)
   assert rewards["dof_vel"] == rewards["dof_acc"] == rewards["dof_pos_limits"] == 0

@@ -12,7 +12,7 @@ from playground.config import compose
 from playground.envs.base import State
 from playground.envs.locomotion.stand import Stand
 from playground.errors import UnknownNameError
-from tests.envs.golden import golden, load_task
+from tests.envs.golden import golden, load_task, terms
 
 FEET = ["FR", "FL", "RR", "RL"]
 
@@ -88,7 +88,7 @@ def test_rewards_of_a_robot_that_stands(task: str, down: float, state: State) ->
     "qpos": env.robot.init_qpos,
   }
   after = evaluate(env, state, **pose)
-  rewards = {name.removeprefix("reward/"): float(value) for name, value in after.metrics.items()}
+  rewards = {name.removeprefix("reward/"): float(value) for name, value in terms(after).items()}
   assert rewards == pytest.approx(
     {"height": 1.0, "orientation": 1.0, "contact": 0.0, "pose": 0.0, "dof_pos_limits": 0.0}, abs=1e-6
   )
