@@ -48,7 +48,7 @@ def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_step
   Raises:
     ConfigError: Warp is not installed, or some buffer that cannot be set overflowed.
   """
-  rows, pairs = max(config.njmax or 0, 32), 32
+  rows, pairs = max(int(config.njmax or 0), 32), 32
   for _ in range(_TRIES):
     sizes = {"impl": "warp", "njmax": rows, "naconmax": pairs * num_envs, "naccdmax": None}
     env = registry.build(ConfigDict(config.to_dict() | sizes))
@@ -76,6 +76,7 @@ def _roll(env: Env, act: Act | None, num_envs: int, num_steps: int, seed: int) -
     def step(carry: tuple[Any, BufferUse], key: jax.Array) -> tuple[tuple[Any, BufferUse], None]:
       state, most = carry
       state = wrapped.step(state, (act or uniform)(state.obs, key), {})
+      assert state.data.buffers is not None, "the task is on Warp"
       return (state, most.join(state.data.buffers)), None
 
     state = wrapped.reset(jax.random.split(reset_key, num_envs), {})

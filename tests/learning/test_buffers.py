@@ -1,7 +1,6 @@
 """Warp's buffers: what a task needs of them, and that a run says when they are too small."""
 
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from playground import registry
@@ -41,7 +40,7 @@ def simulated(monkeypatch):
     def roll(env, act, num_envs, num_steps, seed):
       tried.append((env.njmax, env.naconmax))
       overflow = stubborn | (rows > env.njmax) * 1 | (pairs > env.naconmax) * 8
-      return BufferUse(np.int32(rows), np.int32(pairs), np.int32(overflow))
+      return use(rows, pairs, overflow)
 
     monkeypatch.setattr(buffers, "_roll", roll)
     monkeypatch.setattr(registry, "build", lambda config: config)
