@@ -48,7 +48,8 @@ def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_step
   Raises:
     ConfigError: Warp is not installed, or some buffer that cannot be set overflowed.
   """
-  rows, pairs = max(int(config.njmax or 0), 32), 32
+  configured: int | None = config.njmax  # pyright: ignore[reportAssignmentType]
+  rows, pairs = max(configured or 0, 32), 32
   for _ in range(_TRIES):
     sizes = {"impl": "warp", "njmax": rows, "naconmax": pairs * num_envs, "naccdmax": None}
     env = registry.build(ConfigDict(config.to_dict() | sizes))
