@@ -42,7 +42,8 @@ class PointTask(Env):
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
     rng, key = jax.random.split(rng)
     fields: dict[str, Any] = {name: jnp.zeros(0) for name in STATE_FIELDS}
-    data = PhysicsData(**fields | {"qpos": jax.random.uniform(key, (2,), minval=-1), "qvel": jnp.zeros(2)})
+    fields |= {"qpos": jax.random.uniform(key, (2,), minval=-1), "qvel": jnp.zeros(2)}
+    data = PhysicsData(**fields)
     info = {"rng": rng, "age": jnp.zeros(()), "time": jnp.zeros(())}
     return State(data, self._obs(data), jnp.zeros(()), jnp.zeros(()), {"distance": jnp.zeros(())}, info)
 
