@@ -1,6 +1,8 @@
 """SIGINT and SIGTERM: finish the work in flight, save, leave."""
 
+import contextlib
 import signal
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Self
 
@@ -13,22 +15,31 @@ class Interrupted(BaseException):
     self.signum = signum
 
 
+@contextlib.contextmanager
+def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+  """While it lasts, `handle` gets SIGINT and SIGTERM; only for a main thread."""
+  before = {signum: signal.signal(signum, handle) for signum in (signal.SIGINT, signal.SIGTERM)}
+  try:
+    yield
+  finally:
+    for signum, handler in before.items():
+      signal.signal(signum, handler)
+
+
 class Interrupts:
   """Context that turns the first signal into a flag while `saving` is on, and into `Interrupted` otherwise."""
 
   def __init__(self) -> None:
     self.signum: int | None = None
     self.saving = False
-    self._before: dict[int, object] = {}
+    self._handlers = contextlib.ExitStack()
 
   def __enter__(self) -> Self:
-    for signum in (signal.SIGINT, signal.SIGTERM):
-      self._before[signum] = signal.signal(signum, self._handle)
+    self._handlers.enter_context(on_signals(self._handle))
     return self
 
   def __exit__(self, *exc: object) -> None:
-    for signum, handler in self._before.items():
-      signal.signal(signum, handler)  # pyright: ignore[reportArgumentType]
+    self._handlers.close()
 
   def start_saving(self) -> None:
     """From here on the first signal is a flag. Raises `Interrupted` if there was one already.

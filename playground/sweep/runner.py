@@ -5,10 +5,9 @@ still at work included.
 """
 
 import contextlib
-import signal
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ from rich.console import Console
 
 from playground.config import Section
 from playground.errors import CheckpointError
+from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
 from playground.sweep.launchers import Launcher, make_launcher
 from playground.sweep.results import write_result
@@ -99,7 +99,7 @@ class Runner:
     already += f", {len(self._open)} at work" if self._open else ""
     what = f"Search of {self._search.trials} trials" if self._search else f"Sweep of {len(sweep.jobs)} jobs"
     self._view.print(f"{what} in {sweep.path}{already}")
-    with self._signals(), self._view as view:
+    with on_signals(self._interrupt), self._view as view:
       while self._queue or self._open or self._may_search():
         self._start_some()
         if not self.waited or (self._signum is not None and launcher.outlives):
@@ -177,17 +177,7 @@ class Runner:
     again = f"the same command, or `playground sweep retry {self._sweep.path}`, goes on"
     return f"Its jobs go on by themselves; {again}." if self._launcher.outlives else f"Interrupted: {again}."
 
-  @contextlib.contextmanager
-  def _signals(self) -> Iterator[None]:
+  def _interrupt(self, signum: int, frame: FrameType | None) -> None:
     """SIGINT and SIGTERM ask for an end, a second one asks again."""
-
-    def handle(signum: int, frame: FrameType | None) -> None:
-      self._kill = self._signum is not None
-      self._signum = signum
-
-    before = {signum: signal.signal(signum, handle) for signum in (signal.SIGINT, signal.SIGTERM)}
-    try:
-      yield
-    finally:
-      for signum, handler in before.items():
-        signal.signal(signum, handler)
+    self._kill = self._signum is not None
+    self._signum = signum

@@ -11,13 +11,13 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from playground.runs.files import read_json
+from playground.runs.interrupts import on_signals
 from playground.sweep.folder import STOP_FILE, JobFolder, SweepDirectory, now
 
 COMMAND = (sys.executable, "-m", "playground.cli.run")
@@ -139,21 +139,6 @@ class Worker:
     return "failed", f"exit code {code}: {_last_line(self._folder.log)}"
 
 
-@contextlib.contextmanager
-def stopping_on_signals(worker: Worker) -> Iterator[None]:
-  """While it lasts, SIGTERM and SIGINT to this process ask the job to stop; only in a main thread."""
-  if threading.current_thread() is not threading.main_thread():
-    yield
-    return
-  handle = lambda *_: worker.stop()
-  before = {signum: signal.signal(signum, handle) for signum in (signal.SIGTERM, signal.SIGINT)}
-  try:
-    yield
-  finally:
-    for signum, handler in before.items():
-      signal.signal(signum, handler)
-
-
 def quoted(value: object) -> str:
   """A value for Hydra's command line, whatever characters it has."""
   return "'" + str(value).replace("\\", "\\\\").replace("'", "\\'") + "'"
@@ -174,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
   if args.cores:
     os.sched_setaffinity(0, args.cores)
   worker = Worker(args.folder, argv[cut + 1 :] or COMMAND, args.timeout, args.grace)
-  with stopping_on_signals(worker):
+  with on_signals(lambda *_: worker.stop()):
     return worker.run(args.where, slots=args.slots)
 
 
