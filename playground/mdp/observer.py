@@ -81,6 +81,12 @@ class Observer:
     self._shared = shared if parity else ()
     self._noise_in_histories: bool = noise.get("in_histories", True)
 
+  def parts(self, first: Callable[[jax.Array], Any]) -> dict[str, dict[str, int]]:
+    """`sizes` of the moment that `first` makes of a random key, which is only traced."""
+    found: dict[str, dict[str, int]] = {}
+    jax.eval_shape(lambda rng: found.update(self.sizes(first(rng))), jax.random.PRNGKey(0))
+    return found
+
   def sizes(self, now: Any) -> dict[str, dict[str, int]]:
     """Returns the length of each part, by observation; of frames the newest, with the others' under `past_frames`."""
     names = {part for parts in self._groups.values() for part in parts} - {ACTOR}

@@ -88,14 +88,11 @@ class InHand(Env):
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:
-    found: dict[str, dict[str, int]] = {}
-
-    def look(rng: jax.Array) -> None:
+    def first(rng: jax.Array) -> Context:
       state = self.reset(rng)
-      found.update(self._observer.sizes(self._context(state.data, state.info, jnp.zeros(self.action_size))))
+      return self._context(state.data, state.info, jnp.zeros(self.action_size))
 
-    jax.eval_shape(look, jax.random.PRNGKey(0))
-    return found
+    return self._observer.parts(first)
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
     model = self.mjx_model if model is None else model
