@@ -1,5 +1,6 @@
 """What each command measures: its options, and the jobs that they stand for."""
 
+import abc
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,7 +35,7 @@ COMPARED_CONDITIONS = [f"env.ctrl_dt={1 / 60}", f"env.sim_dt={1 / 120}", "env.ep
 
 
 @dataclasses.dataclass(frozen=True)
-class Measuring:
+class Measuring(abc.ABC):
   """Options of everything that measures."""
 
   out: str | None = option(None, "CSV that rows are added to; null is results/benchmarks/<command>.csv")
@@ -50,8 +51,9 @@ class Measuring:
   name = "measuring"
   alone = False  # whether it needs the machine to itself
 
+  @abc.abstractmethod
   def jobs(self, facts: dict[str, Any]) -> list[Job]:
-    raise NotImplementedError
+    """What is to be measured on a machine of which `facts` are known."""
 
   def check(self) -> None:
     """Raises PlaygroundError for what cannot be measured, before anything expensive."""
