@@ -212,6 +212,14 @@ class Golden:
         yield _name(path), np.where(np.isnan(theirs), np.nan, np.asarray(a, np.float64)), theirs
 
 
+def without_physics(name: str, **overrides: Any) -> Any:
+  """A task whose resets compute no kinematics and whose `evaluate` is compiled."""
+  env: Any = load_task(name, overrides)
+  env.physics.forward = lambda model, data: data
+  env.evaluate = jax.jit(env.evaluate)
+  return env
+
+
 def terms(state: State) -> dict[str, jax.Array]:
   """The weighted terms of a step's reward, by name."""
   return {name: value for name, value in state.metrics.items() if name.startswith("reward/")}

@@ -9,18 +9,10 @@ import pytest
 
 from playground.envs.base import State
 from tests.envs.dm_control.states import state_at
-from tests.envs.golden import golden, load_task
+from tests.envs.golden import golden, load_task, without_physics
 
 CUBE, TURNED, CABINET = "PandaPickCube", "PandaPickCubeOrientation", "PandaOpenCabinet"
 N = 256
-
-
-def without_physics(name: str, **overrides: Any) -> Any:
-  """A task whose resets compute no kinematics and whose `evaluate` is compiled."""
-  env = load_task(name, overrides)
-  env.physics.forward = lambda model, data: data
-  env.evaluate = jax.jit(env.evaluate)
-  return env
 
 
 @pytest.fixture(scope="module")

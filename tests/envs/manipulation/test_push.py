@@ -11,23 +11,16 @@ from playground.envs.base import State
 from playground.envs.wrappers import PRESERVE_INFO, wrap_for_training
 from playground.errors import ConfigError
 from tests.envs.dm_control.states import state_at
-from tests.envs.golden import golden, load_task
+from tests.envs.golden import golden, load_task, without_physics
 
 TASK = "PandaRobotiqPushCube"
 N = 256
 SILENT = {"noise.level": 0.0}
 
 
-def prepared(**overrides: Any) -> Any:
-  env = load_task(TASK, overrides)
-  env.physics.forward = lambda model, data: data
-  env.evaluate = jax.jit(env.evaluate)
-  return env
-
-
 @pytest.fixture(scope="module")
 def push() -> Any:
-  return prepared(**SILENT)
+  return without_physics(TASK, **SILENT)
 
 
 @pytest.fixture(scope="module")
