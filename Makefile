@@ -10,7 +10,7 @@ INSTALLED := .venv/.installed
 TEST_ENV := JAX_COMPILATION_CACHE_DIR="$(CURDIR)/.pytest_cache/xla" WARP_CACHE_PATH="$(CURDIR)/.pytest_cache/warp"
 
 .DEFAULT_GOAL := setup
-.PHONY: setup run test test-slow lint wheel
+.PHONY: setup run test test-slow test-rsl-rl lint wheel
 
 setup: $(INSTALLED)
 
@@ -29,6 +29,11 @@ test: setup
 
 test-slow: setup
 	$(TEST_ENV) $(BIN)/python -m pytest -q -m slow $(ARGS)
+
+# RSL-RL brings torch, which `setup` leaves out: without it these tests are skipped.
+test-rsl-rl: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[rsl_rl]'
+	$(TEST_ENV) $(BIN)/python -m pytest -q -m '' -k rsl_rl tests/adapters tests/learning tests/runs $(ARGS)
 
 lint: setup
 	$(BIN)/ruff check

@@ -1,11 +1,13 @@
 """A task without physics, so that trainers compile in seconds: move a point to the origin."""
 
+import importlib.util
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from playground.envs.base import Env, State
 from playground.envs.physics import STATE_FIELDS, PhysicsData, mjx
@@ -15,6 +17,8 @@ from playground.learning.learner import Learner
 from playground.learning.loop import Metrics
 from playground.learning.networks import NetworkConfig, SoftNetworkConfig
 from playground.learning.ppo import PPO, PPOConfig
+from playground.learning.rollout import Step
+from playground.learning.rsl_rl import RslRlNetworkConfig, RslRlPPO, RslRlPPOConfig
 from playground.learning.sac import SAC, SACConfig
 
 
@@ -29,7 +33,7 @@ class PointTask(Env):
     fast_at: int | None = None,
   ):  # pyright: ignore[reportMissingSuperCall]
     self.dt, self.episode_length, self.action_repeat, self.nan_at = 0.1, episode_length, action_repeat, nan_at
-    self.fast_at = fast_at
+    self.fast_at, self.impl = fast_at, "jax"
 
   @property
   def action_size(self) -> int:
@@ -89,10 +93,21 @@ SMALL_SAC = SACConfig(
   network=SoftNetworkConfig((16, 16), q_network_layer_norm=True, value_obs_key="privileged_state"),
 )  # fmt: skip
 
+SMALL_RSL_RL = RslRlPPOConfig(
+  num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, unroll_length=10, num_minibatches=2,
+  num_updates_per_batch=4, learning_rate=3e-3, schedule="adaptive", discounting=0.95,
+  network=RslRlNetworkConfig((16, 16), (16, 16), init_noise_std=0.5),
+)  # fmt: skip
+Config = PPOConfig | SACConfig | RslRlPPOConfig
+ALGORITHMS: dict[type[Any], type[Any]] = {PPOConfig: PPO, SACConfig: SAC, RslRlPPOConfig: RslRlPPO}
+needs_rsl_rl = pytest.mark.skipif(
+  importlib.util.find_spec("rsl_rl") is None, reason="needs the extra rsl_rl: `make test-rsl-rl`"
+)
 
-def point_learner(config: PPOConfig | SACConfig, num_devices: int = 1, nan_at: int | None = None) -> Learner:
+
+def point_learner(config: Config, num_devices: int = 1, nan_at: int | None = None) -> Learner:
   """The algorithm that a config is of, for the point."""
-  algorithm: type[Any] = PPO if isinstance(config, PPOConfig) else SAC
+  algorithm = ALGORITHMS[type(config)]
   return algorithm(PointTask(nan_at=nan_at), config, make_mesh(num_devices), {})
 
 
@@ -101,11 +116,13 @@ class Recorder:
 
   def __init__(self, stop_after: int | None = None):
     self.rows: list[tuple[int, Metrics]] = []
+    self.captured: list[Step | None] = []
     self.saved: list[tuple[int, Any]] = []
     self.stop_after = stop_after
 
-  def on_metrics(self, step: int, metrics: Metrics, capture: Any, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
     self.rows.append((step, {k: v for k, v in metrics.items() if not k.startswith("time/")}))
+    self.captured.append(captured)
 
   def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
     self.saved.append((update, jax.device_get(state)))

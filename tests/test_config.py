@@ -127,11 +127,11 @@ def test_several_debug_presets():
 # What a RunConfig is
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac"])
+@pytest.mark.parametrize("name", ["ppo", "sac", "rsl_rl_ppo"])
 def test_agent_is_what_its_algorithm_reads(name: str):
   from playground.learning.algorithms import ALGORITHMS
 
-  assert list(ALGORITHMS) == ["ppo", "sac"]
+  assert list(ALGORITHMS) == ["ppo", "sac", "rsl_rl_ppo"]
   agent = compose([f"agent={name}", "agent.num_envs=256"]).agent
   read = ALGORITHMS[name].Config.from_config(agent)
   assert set(agent) - {"name"} == {field.name for field in dataclasses.fields(read)}

@@ -1,1 +1,1 @@
-"""Tasks as the environments of other libraries: gymnasium, dm_env and code written for Playground 0.2.0."""
+"""Tasks as the environments of other libraries: gymnasium, dm_env, RSL-RL and code written for 0.2.0."""

@@ -61,7 +61,11 @@ def _parser() -> argparse.ArgumentParser:
   play.add_argument("--episodes", type=int, default=10)
   play.add_argument("--seed", type=int, default=0)
   play.add_argument("--video", metavar="FILE", help="also render an episode")
-  play.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
+  shown = play.add_mutually_exclusive_group()
+  shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
+  shown.add_argument("--web", action="store_true", help="show it in the browser instead")
+  play.add_argument("--host", default="127.0.0.1", help="of --web: the address to listen on; by default this machine's")
+  play.add_argument("--port", type=int, default=8080, help="of --web")
   sweep = add("sweep", _sweep, "Look at a sweep, gather its result, or do what is missing of it.")
   sweep.add_argument("action", choices=("status", "collect", "retry", "stop"))
   sweep.add_argument("folder", help="the sweep's")
@@ -109,7 +113,16 @@ def _export(args: argparse.Namespace) -> int:
 def _play(args: argparse.Namespace) -> int:
   from playground.deploy.play import play
 
-  return play(args.policy, episodes=args.episodes, seed=args.seed, video=args.video, viewer=args.viewer)
+  return play(
+    args.policy,
+    episodes=args.episodes,
+    seed=args.seed,
+    video=args.video,
+    viewer=args.viewer,
+    web=args.web,
+    host=args.host,
+    port=args.port,
+  )
 
 
 def _sweep(args: argparse.Namespace) -> int:

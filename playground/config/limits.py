@@ -9,6 +9,7 @@ from playground.errors import ConfigError, nearest
 
 _PRECISIONS = ("default", "high", "highest", "bfloat16", "tensorfloat32", "float32")
 _CHOICES = {
+  "agent.schedule": ("fixed", "adaptive"),
   "env.impl": ("auto", "jax", "warp"),
   "env.vision.image": ("rgb", "gray", "depth"),
   "hardware.platform": ("auto", "cpu", "gpu"),
@@ -27,7 +28,8 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     "agent.num_timesteps agent.num_evals agent.num_envs agent.num_eval_envs agent.unroll_length agent.batch_size "
     "agent.num_minibatches agent.num_updates_per_batch agent.learning_rate agent.max_grad_norm agent.clipping_epsilon "
     "agent.clipping_epsilon_value agent.grad_updates_per_step agent.max_replay_size "
-    "agent.alpha_learning_rate env.ctrl_dt env.sim_dt env.episode_length env.action_repeat checkpoint.keep "
+    "agent.alpha_learning_rate agent.desired_kl agent.network.init_noise_std "
+    "env.ctrl_dt env.sim_dt env.episode_length env.action_repeat checkpoint.keep "
     "video.every_evals video.episodes video.width video.height hardware.devices profile.steps "
     "env.vision.width env.vision.height env.vision.frames env.vision.farthest "
     "launcher.timeout launcher.slots_per_gpu launcher.cores_per_job launcher.minutes launcher.memory_gb "

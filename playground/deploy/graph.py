@@ -1,4 +1,4 @@
-"""A trained actor as an ONNX graph: normalise, the layers, the first half of the output, tanh."""
+"""A trained actor as an ONNX graph: normalise, the layers, the first half of the output, tanh (or all, clipped)."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -66,7 +66,10 @@ _ACTIVATIONS: dict[str, Callable[[_Chain], Any]] = {
 
 
 def policy_graph(
-  params: Mapping[str, Any], activation: str, normalization: tuple[np.ndarray, np.ndarray] | None
+  params: Mapping[str, Any],
+  activation: str,
+  normalization: tuple[np.ndarray, np.ndarray] | None,
+  squashed: bool = True,
 ) -> onnx.ModelProto:
   """Builds the graph of a deterministic policy.
 
@@ -75,6 +78,7 @@ def policy_graph(
       layers are normalised `LayerNorm_<i>` with `scale` and `bias`.
     activation: of the hidden layers, as in `agent.network.activation`.
     normalization: mean and deviation of the observation, [n] each; None if the actor sees it as it is.
+    squashed: whether the output is mean and deviation of actions before tanh; else it is their mean, to be clipped.
 
   Returns:
     The model: `obs` float32 [1, n] -> `continuous_actions` float32 [1, action_size] in [-1, 1].
@@ -94,7 +98,7 @@ def policy_graph(
   for i in range(count):
     layer = params[f"hidden_{i}"]
     kernel, bias = np.asarray(layer["kernel"]), np.asarray(layer["bias"])
-    if i == count - 1:  # mean and deviation of the actions before they are squashed: the mean is the mode
+    if i == count - 1 and squashed:  # mean and deviation of the actions before they are squashed: the mean is the mode
       kernel, bias = kernel[:, : len(bias) // 2], bias[: len(bias) // 2]
     graph.apply("Gemm", graph.constant(kernel), graph.constant(bias))
     if i < count - 1:
@@ -103,7 +107,10 @@ def policy_graph(
         norm = params[f"LayerNorm_{i}"]
         names = graph.constant(norm["scale"]), graph.constant(norm["bias"])
         graph.apply("LayerNormalization", *names, epsilon=_LAYER_NORM_EPSILON)
-  graph.apply("Tanh")
+  if squashed:
+    graph.apply("Tanh")
+  else:
+    graph.apply("Clip", graph.constant(-1.0), graph.constant(1.0))
   graph.nodes[-1].output[0] = OUTPUT
   ends = [(INPUT, len(params["hidden_0"]["kernel"])), (OUTPUT, len(bias))]
   source, sink = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, size]) for name, size in ends)

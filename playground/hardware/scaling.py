@@ -28,7 +28,8 @@ def scale_envs(config: "RunConfig", devices: int) -> "tuple[RunConfig, str]":
   if config.resume is not None:
     raise ConfigError(f"hardware.scale_envs=true would change the sizes of {config.resume}: they are fixed by now.")
   agents = [stage.agent for stage in config.stages] or [config.agent]
-  changes = ", ".join(f"agent.{key} {agents[0][key]} -> {agents[0][key] * devices}" for key in SCALED)
+  sizes = [key for key in SCALED if key in agents[0]]
+  changes = ", ".join(f"agent.{key} {agents[0][key]} -> {agents[0][key] * devices}" for key in sizes)
   stages = tuple(_scaled(stage, devices) for stage in config.stages)
   notice = f"hardware.scale_envs: {devices} device{'s' * (devices > 1)}, so {changes}."
   return dataclasses.replace(_scaled(config, devices), stages=stages), notice
@@ -41,7 +42,7 @@ def describe_division(agent: Any, devices: int) -> str:
 
 
 def _scaled(config: "RunConfig", devices: int) -> "RunConfig":
-  agent = {**config.resolved["agent"], **{key: config.resolved["agent"][key] * devices for key in SCALED}}
+  agent = {key: size * devices if key in SCALED else size for key, size in config.resolved["agent"].items()}
   resolved = {**config.resolved, "agent": agent, "hardware": {**config.resolved["hardware"], "scale_envs": False}}
   sections = {key: ConfigDict(resolved[key]) for key in ("agent", "hardware")}
   return dataclasses.replace(config, resolved=resolved, **sections)

@@ -8,12 +8,13 @@ from playground.envs.base import Env
 from playground.errors import UnknownNameError, nearest
 from playground.learning.learner import Learner
 from playground.learning.ppo import PPO
+from playground.learning.rsl_rl import RslRlPPO
 from playground.learning.sac import SAC
 
-ALGORITHMS: dict[str, type[PPO] | type[SAC]] = {"ppo": PPO, "sac": SAC}
+ALGORITHMS: dict[str, type[PPO] | type[SAC] | type[RslRlPPO]] = {"ppo": PPO, "sac": SAC, "rsl_rl_ppo": RslRlPPO}
 
 
-def algorithm(name: str) -> type[PPO] | type[SAC]:
+def algorithm(name: str) -> type[PPO] | type[SAC] | type[RslRlPPO]:
   """The class for an `agent.name`; raises UnknownNameError if there is none."""
   if name not in ALGORITHMS:
     known = ", ".join(ALGORITHMS)

@@ -204,7 +204,7 @@ class Learner(abc.ABC):
       return state, total + ravel_pytree(metrics)[0]  # one vector: an addition each costs a kernel each
 
     state, total = jax.lax.fori_loop(0, num_updates, body, (state, total))
-    return state, _report(unravel(total))
+    return state, report(unravel(total))
 
 
 def check_divisible(config: Any, num_devices: int) -> None:
@@ -227,7 +227,7 @@ def from_config(config_class: Callable[..., Any], network_class: Callable[..., A
 _COUNTS = ("episodes", "nonfinite", "nonfinite_updates", "overflows")
 
 
-def _report(total: Metrics) -> Metrics:
+def report(total: Metrics) -> Metrics:
   """Means over training steps that learned and, for what ended, over episodes; counts stay counts.
 
   A mean over nothing is NaN, which the log leaves out.

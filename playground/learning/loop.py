@@ -19,6 +19,7 @@ from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import agree, several
 from playground.hardware.mesh import put
 from playground.learning.learner import Learner
+from playground.learning.rollout import Step
 
 Metrics = dict[str, float]
 COMPILER = "compiler"  # name of the threads that compile
@@ -55,13 +56,13 @@ def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_upd
 class Hooks(Protocol):
   """What a run does with what happens; called on a thread of its own while the device works on."""
 
-  def on_metrics(self, step: int, metrics: Metrics, capture: Any, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
     """A row of the log.
 
     Args:
       step: control steps trained.
       metrics: its columns.
-      capture: the run's first non-finite step (on the host) if the row counts any, else None.
+      captured: the run's first non-finite step (on the host) if the row counts any, else None.
       recording: what the row's evaluation recorded (on the device), None for a row without one.
     """
     ...
@@ -128,7 +129,7 @@ class Done:
   train_s: float = 0.0
   evaluated: Any = None
   eval_s: float = 0.0
-  capture: Any = None
+  captured: Step | None = None
   snapshot: Any = None
 
 
@@ -213,7 +214,8 @@ class Loop:
       self.first_update_s = self.first_update_s or done.train_s / num_updates
       if done.trained["nonfinite"] > 0:
         capture = self._program.copy(state).capture if several() else state.capture
-        done.capture = jax.device_get(capture)
+        action_size = self._learner.env.action_size
+        done.captured = jax.device_get(capture).first(state.env_state, action_size, self._model)
     if mark.evaluate:
       start = time.perf_counter()
       policy = self._learner.policy(state)
@@ -243,7 +245,7 @@ class Loop:
       scores, recording = done.evaluated
       row |= {f"eval/{k}": float(v) for k, v in jax.device_get(scores).items()}
       row["time/eval_s"] = done.eval_s
-    self._hooks.on_metrics(step, row, done.capture, recording)
+    self._hooks.on_metrics(step, row, done.captured, recording)
     if done.snapshot is not None:
       self._hooks.on_save(done.mark.update, step, done.snapshot, done.mark is self._marks[-1])
 

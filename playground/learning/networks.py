@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,12 @@ class Actor:
 
   Observations are dicts of arrays with any leading axes; a task's flat observation counts as {"state": obs}. Pictures
   among them (`pixels/...`, [..., H, W, C] uint8) are read by actor and critic alike, by CNNs of their own.
+
+  Attributes:
+    squashed: whether actions are squashed into [-1, 1] by tanh; else they are clipped.
   """
+
+  squashed: ClassVar[bool] = True
 
   def __init__(
     self,
@@ -115,6 +120,11 @@ class Actor:
     logits = self.logits(policy, normalize(self.select(obs), normalizer))
     return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
 
+  def mlp(self, policy: Any, normalizer: Any) -> tuple[Mapping[str, Any], tuple[Any, Any] | None]:
+    """The actor's layers as Flax has them, with mean and deviation of what it sees (None if it does not normalise)."""
+    key = self.policy_obs_key
+    return policy["params"], None if normalizer is None else (normalizer.mean[key], normalizer.std[key])
+
   def _on_pixels(self, cnn: CNNConfig, sizes: Sequence[int], output_size: int, **how: Any) -> PixelNetwork:
     cnn.check(ACTIVATIONS)
     return PixelNetwork(cnn, ACTIVATIONS[cnn.activation], tuple(sizes), self.activation, output_size, **how)
@@ -156,8 +166,9 @@ class ActorCriticParams(struct.PyTreeNode):
 class Critic(linen.Module):
   """Brax's value MLP with its hidden layers computed in `dtype`; parameters and output are float32.
 
-  Writing and reading the hidden activations is most of what an update costs on a GPU. The actor stays in float32: the
-  loss compares its log-probabilities with those at acting time.
+  Writing and reading the hidden activations is most of what an update costs on a GPU. The first layer stays in float32:
+  advantages are differences of neighbouring states' values, which rounded observations would blur. So does the actor:
+  the loss compares its log-probabilities with those at acting time.
   """
 
   hidden_layer_sizes: Sequence[int]
@@ -168,7 +179,8 @@ class Critic(linen.Module):
   def __call__(self, obs: jax.Array) -> jax.Array:
     init, hidden = jax.nn.initializers.lecun_uniform(), obs
     for i, size in enumerate(self.hidden_layer_sizes):
-      hidden = self.activation(linen.Dense(size, dtype=self.dtype, kernel_init=init, name=f"hidden_{i}")(hidden))
+      dtype = jnp.float32 if i == 0 else self.dtype
+      hidden = self.activation(linen.Dense(size, dtype=dtype, kernel_init=init, name=f"hidden_{i}")(hidden))
     last = linen.Dense(1, dtype=jnp.float32, kernel_init=init, name=f"hidden_{len(self.hidden_layer_sizes)}")
     return last(hidden)[..., 0]
 

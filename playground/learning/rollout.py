@@ -24,28 +24,38 @@ class Transitions(struct.PyTreeNode):
   truncation: jax.Array
 
 
-class NonfiniteCapture(struct.PyTreeNode):
-  """The first step of a run in which some environment's numbers went NaN, infinite or absurd, for replay.
+class Step(struct.PyTreeNode):
+  """A step of one environment and all that is needed to take it again, every leaf [1, ...].
 
   Attributes:
-    found: whether there is one, [1] bool (one a device).
-    state: the last good state of that environment, every leaf [1, ...].
-    action: the action that broke it, [1, action_size].
-    model: its randomised model fields, each [1, ...].
-    after: the simulator's state after that step, by field.
+    state: the environment before it.
+    action: [1, action_size].
+    model: its randomised model fields.
+    after: the simulator's state after it, by field.
   """
 
-  found: jax.Array
   state: State
   action: jax.Array
   model: dict[str, jax.Array]
   after: dict[str, jax.Array]
 
+
+class NonfiniteCapture(struct.PyTreeNode):
+  """The first step of a run in which some environment's numbers went NaN, infinite or absurd, for replay.
+
+  Attributes:
+    found: whether there is one, [1] bool (one a device).
+    bits: the `Step` as one row of 32-bit words, [1, words]: on a GPU each array of its own would cost every step of
+      every run a copy or two.
+  """
+
+  found: jax.Array
+  bits: jax.Array
+
   @classmethod
   def empty(cls, state: State, action_size: int, model: ModelFields) -> "NonfiniteCapture":
-    first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
-    after = first(state.info["nonfinite_state"])
-    return cls(jnp.zeros(1, bool), first(state), jnp.zeros((1, action_size)), first(dict(model)), after)
+    bits = _to_bits(_example(state, action_size, model))
+    return cls(jnp.zeros(1, bool), jnp.zeros_like(bits))
 
   def on_devices(self, count: int) -> "NonfiniteCapture":
     """The same (on the host) for another number of devices: what was found goes first."""
@@ -59,14 +69,38 @@ class NonfiniteCapture(struct.PyTreeNode):
     bad = after.info["nonfinite"]
     which = jnp.argmax(bad)
     take = (bad[which] > 0) & ~self.found[0]
-    pick = lambda new, old: jnp.where(take, jax.lax.dynamic_slice_in_dim(new, which, 1), old)
-    return NonfiniteCapture(
-      found=self.found | take,
-      state=jax.tree.map(pick, before, self.state),
-      action=pick(action, self.action),
-      model=jax.tree.map(pick, dict(model), self.model),
-      after=jax.tree.map(pick, after.info["nonfinite_state"], self.after),
-    )
+    rows = _to_bits(Step(before, action, dict(model), after.info["nonfinite_state"]))
+    row = jax.lax.dynamic_slice_in_dim(rows, which, 1)
+    return NonfiniteCapture(self.found | take, jnp.where(take, row, self.bits))
+
+  def first(self, state: State, action_size: int, model: ModelFields) -> Step | None:
+    """The captured step on the host, or None; the arguments, or their shapes, say how to read it."""
+    found = np.flatnonzero(self.found)
+    if not len(found):
+      return None
+    example = jax.eval_shape(lambda state, model: _example(state, action_size, model), state, dict(model))
+    return _from_bits(np.asarray(self.bits[found[0]]), example)
+
+
+def _example(state: State, action_size: int, model: ModelFields) -> Step:
+  """A step's structure, shapes and dtypes."""
+  first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
+  return first(Step(state, jnp.zeros((1, action_size)), dict(model), state.info["nonfinite_state"]))
+
+
+def _to_bits(tree: Any) -> jax.Array:
+  """The leaves, each [N, ...], side by side: [N, words] uint32."""
+  words = lambda x: jax.lax.bitcast_convert_type(x, jnp.uint32) if x.dtype.itemsize == 4 else x.astype(jnp.uint32)
+  return jnp.concatenate([words(x).reshape(len(x), -1) for x in jax.tree.leaves(tree)], axis=1)
+
+
+def _from_bits(row: np.ndarray, example: Any) -> Any:
+  """One row of them, [words], as a structure with these shapes and dtypes."""
+  leaves, structure = jax.tree.flatten(example)
+  parts = np.split(row, np.cumsum([leaf.size for leaf in leaves])[:-1])
+  read = lambda part, dtype: part.view(dtype) if dtype.itemsize == 4 else part.astype(dtype)
+  values = [read(part, leaf.dtype).reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)]
+  return jax.tree.unflatten(structure, values)
 
 
 EpisodeSums = dict[str, jax.Array]

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from playground.envs.base import Env
 from playground.learning.loop import Metrics
+from playground.learning.rollout import Step
 from playground.runs.interrupts import Interrupts
 from playground.runs.job import check_fraction
 
@@ -20,7 +21,7 @@ class Follower:
     self._interrupts = interrupts
     self._step = step or 0
 
-  def on_metrics(self, step: int, metrics: Metrics, capture: Any, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
     taken, self._step = step - self._step, step
     bad = metrics.get("training/nonfinite", 0.0)
     check_fraction(bad * self._action_repeat / max(taken, 1), self._allowed, step)

@@ -16,6 +16,7 @@ from playground.hardware.mesh import own_share
 from playground.learning.checkpoints import CheckpointStore, checksum
 from playground.learning.learner import Learner
 from playground.learning.loop import Loop, Metrics
+from playground.learning.rollout import Step
 from playground.rendering.video import render_video
 from playground.runs.interrupts import Interrupts
 from playground.runs.nonfinite import write_dump
@@ -81,7 +82,7 @@ class Job:
     """Time the run has taken, over all its starts, without compiling."""
     return self._earlier_s + time.perf_counter() - self._began
 
-  def on_metrics(self, step: int, metrics: Metrics, capture: Any, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
     score = metrics.get("eval/episode_reward")
     self._trackers.log(step, metrics | {"time/wall_clock_s": self.wall_clock_s})
     self._progress.update(step, metrics.get("time/steps_per_second"), score)
@@ -95,7 +96,7 @@ class Job:
         self._start_video(step, recording)
     self._advance_trace(metrics)
     self._check_buffers(taken, metrics)
-    self._check_numbers(step, taken, metrics, capture)
+    self._check_numbers(step, taken, metrics, captured)
 
   def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
     policy, rest = self._learner.split(state)
@@ -212,10 +213,10 @@ class Job:
       self._warned_of_buffers = True
       self._progress.print(
         f"{overflows:.0f} of {taken:,} steps needed more than Warp's buffers hold, and lost contacts or constraints: "
-        f"`playground tune-buffers {self._config.choices['env']}` says what env.njmax and env.naconmax should be."
+        f"`playground tune-buffers {self._config.choices['env']}` says how large env.njmax and the like should be."
       )
 
-  def _check_numbers(self, step: int, taken: int, metrics: Metrics, capture: Any) -> None:
+  def _check_numbers(self, step: int, taken: int, metrics: Metrics, captured: Step | None) -> None:
     """Dumps the first non-finite step, and stops the run when there are too many of them."""
     bad = metrics.get("training/nonfinite", 0.0)
     if not bad:
@@ -223,7 +224,7 @@ class Job:
     where = ""
     if not self._dumped:
       self._dumped = True
-      dump = write_dump(self._run_dir.nan_dump, step, capture, self._config.resolved)
+      dump = write_dump(self._run_dir.nan_dump, step, captured, self._config.resolved)
       where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
       self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or absurd.{where}")
     check_fraction(bad * self._env.action_repeat / max(taken, 1), self._config.on_nonfinite.max_fraction, step, where)

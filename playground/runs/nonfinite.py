@@ -10,27 +10,25 @@ import numpy as np
 from playground.envs.base import Env, State
 from playground.envs.wrappers import MAX_VALUE, MAX_VELOCITY
 from playground.errors import CheckpointError
-from playground.learning.rollout import NonfiniteCapture
+from playground.learning.rollout import Step
 from playground.runs.files import replacing
 
 
-def write_dump(folder: Path, step: int, capture: NonfiniteCapture, config: dict[str, Any]) -> Path | None:
+def write_dump(folder: Path, step: int, captured: Step | None, config: dict[str, Any]) -> Path | None:
   """Writes the captured step as `step_<step>.npz`, with the run's config inside so that it can travel alone.
 
   Args:
     folder: where to; made if needed.
     step: control steps after which it was noticed.
-    capture: one entry a device; the first found is written.
+    captured: what to write.
     config: the run's resolved config.
 
   Returns:
     The file, or None if nothing was captured.
   """
-  capture = jax.device_get(capture)
-  found = np.flatnonzero(capture.found)
-  if not len(found):
+  if captured is None:
     return None
-  one = jax.tree.map(lambda x: x[found[0]], capture)
+  one = jax.tree.map(lambda x: x[0], captured)
   arrays = {f"state{name}": leaf for name, leaf in _named(one.state)}
   arrays |= {f"model/{name}": value for name, value in one.model.items()}
   arrays |= {f"after/{name}": value for name, value in one.after.items()}

@@ -19,6 +19,8 @@ PACKAGES = (
   "optax",
   "orbax-checkpoint",
   "hydra-core",
+  "torch",
+  "rsl-rl-lib",
 )
 
 

@@ -19,7 +19,7 @@ from playground.learning.loop import Loop
 from playground.runs.job import Job
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
-from tests.dummy import Point
+from tests.dummy import Point, needs_rsl_rl
 
 FAST = ["env=CartpoleBalance", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv"]
 STEPS = 1600
@@ -33,7 +33,7 @@ def point() -> Iterator[None]:
     yield
 
 
-@pytest.fixture(scope="module", params=["ppo", "sac"])
+@pytest.fixture(scope="module", params=["ppo", "sac", pytest.param("rsl_rl_ppo", marks=needs_rsl_rl)])
 def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
   """A run that nothing happens to."""
   run = tmp_path_factory.mktemp(request.param) / "run"
@@ -105,7 +105,7 @@ def test_a_new_run_starts_from_weights(
 
 
 def test_weights_of_another_algorithm_are_refused(whole: Path, tmp_path: Path) -> None:
-  other = {"ppo": "sac", "sac": "ppo"}[agent(whole)]
+  other = "ppo" if agent(whole) == "sac" else "sac"
   sentence = f"{find_checkpoints(whole)[0]} was trained by {agent(whole)}: agent={other} cannot start from it."
   with pytest.raises(CheckpointError, match=re.escape(sentence)):
     train(compose([*FAST, f"agent={other}", f"init_from={whole}", f"run_dir={tmp_path / 'run'}"]))
@@ -119,6 +119,6 @@ def test_evaluation(whole: Path) -> None:
 
 
 def test_an_unknown_algorithm_is_one_sentence(tmp_path: Path) -> None:
-  with pytest.raises(UnknownNameError, match=r"agent.name=sax .* choose from ppo, sac. Did you mean 'sac'"):
+  with pytest.raises(UnknownNameError, match=r"agent.name=sax .* choose from ppo, sac, rsl_rl_ppo. Did you mean 'sac'"):
     train(compose([*FAST, "agent.name=sax", f"run_dir={tmp_path / 'run'}"]))
   assert not (tmp_path / "run").exists()

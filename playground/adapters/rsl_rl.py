@@ -1,0 +1,145 @@
+"""A batch of environments for RSL-RL (rsl-rl-lib 5): `OnPolicyRunner(vec_env(task, num_envs=4096), config)`.
+
+Tensors are views of JAX's arrays and the other way round (DLPack), on a GPU as on a CPU: nothing is copied. Neither
+side may write to what it was given. DLPack orders the two libraries' work on a GPU; what JAX frees while torch still
+reads it is used again by the next step at the earliest, which waits for torch's actions.
+"""
+
+# torch is in an extra, which the type checker may not find
+# pyright: reportMissingImports=false
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import torch
+from rsl_rl import env as rsl_rl_env
+from tensordict import TensorDict
+
+from playground.envs.base import PIXELS, Env, State
+from playground.envs.wrappers import wrap_for_training
+from playground.errors import ConfigError
+from playground.learning.rollout import episode_sums
+from playground.randomization import Randomizer
+
+PRIVILEGED = "privileged_state"
+OBS_GROUPS = {"actor": ["policy"], "critic": ["critic"]}  # for RSL-RL's configuration: which model reads which group
+
+
+def to_torch(array: jax.Array) -> torch.Tensor:
+  """A tensor in the memory of an array."""
+  return torch.from_dlpack(array)
+
+
+def to_jax(tensor: torch.Tensor) -> jax.Array:
+  """An array in the memory of a tensor, which nobody may write to from then on."""
+  return jax.dlpack.from_dlpack(tensor.detach().contiguous())
+
+
+class VecEnv(rsl_rl_env.VecEnv):
+  """What RSL-RL steps: episodes that begin anew by themselves, one batch on one device.
+
+  Observations have the groups `policy` and `critic`. `extras["time_outs"]` is 1 where time ended the episode, and not
+  the task, so that RSL-RL adds the value of what would have come; `extras["log"]` has the means of reward, length and
+  the task's metrics over the episodes that ended in the step, if any did.
+
+  Attributes:
+    state: the present state, a batch.
+    max_episode_length: control steps; `episode_length_buf` counts those of the present episodes.
+  """
+
+  def __init__(
+    self,
+    env: Env,
+    state: State,
+    step: Callable[[State, jax.Array], State],
+    groups: Mapping[str, str] | None = None,
+    log: bool = True,
+  ):
+    """Takes a batch of environments; `vec_env` makes one.
+
+    Args:
+      env: the task.
+      state: where the batch stands.
+      step: advances it by actions [N, action_size].
+      groups: the entry of the task's observation that each group is; by default those that actor and critic are for.
+      log: whether there is an `extras["log"]`, which waits for the device.
+    """
+    self.state, self._step, self._log = state, step, log
+    self.groups = dict(groups or group_entries(env))
+    self.num_envs, self.num_actions = state.done.shape[0], env.action_size
+    self.max_episode_length = env.episode_length
+    self.device = to_torch(state.done).device
+    self.cfg = env.config.to_dict() if hasattr(env, "config") else {}
+    self._sums = jax.jit(episode_sums)
+
+  @property
+  def episode_length_buf(self) -> torch.Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+    return (to_torch(self.state.info["steps"]) * (1 - to_torch(self.state.done))).long()  # one that ended begins anew
+
+  @episode_length_buf.setter
+  def episode_length_buf(self, steps: torch.Tensor) -> None:
+    state = self.state
+    placed = jax.device_put(to_jax(steps.to(torch.float32, copy=True)), state.info["steps"].sharding)
+    self.state = state.replace(done=jnp.zeros_like(state.done), info=state.info | {"steps": placed})
+
+  def get_observations(self) -> TensorDict:
+    """The present observations."""
+    obs: Any = self.state.obs
+    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    return TensorDict({group: to_torch(entries[entry]) for group, entry in self.groups.items()}, [self.num_envs])
+
+  def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Applies actions, [num_envs, num_actions], clipped to [-1, 1]; see RSL-RL's `VecEnv.step` for what it returns."""
+    state = self.state = self._step(self.state, to_jax(actions.clamp(-1.0, 1.0)))
+    extras: dict[str, Any] = {"time_outs": to_torch(state.info["truncation"])}
+    if self._log:
+      sums = self._sums(state)
+      if ended := float(sums["episodes"]):
+        means = {name: float(sums[f"episode_{name}"]) / ended for name in state.info["episode_metrics"]}
+        means["reward"] = means.pop("sum_reward")
+        extras["log"] = {f"Episode/{name}": mean for name, mean in means.items()}
+    return self.get_observations(), to_torch(state.reward), to_torch(state.done), extras
+
+
+def vec_env(
+  env: Env,
+  num_envs: int,
+  *,
+  seed: int = 0,
+  terms: Sequence[Mapping[str, Any]] = (),
+  groups: Mapping[str, str] | None = None,
+) -> VecEnv:
+  """Makes a batch of environments of a task for RSL-RL.
+
+  Args:
+    env: the task, from `registry.load`.
+    num_envs: how many.
+    seed: of the episodes and the models.
+    terms: domain randomisation, drawn once for each environment (`compose(["env=..."]).randomization.terms`).
+    groups: see `VecEnv`.
+
+  Raises:
+    ConfigError: the task shows pictures.
+  """
+  batch, groups = wrap_for_training(env), dict(groups or group_entries(env))
+  reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
+  randomizer = Randomizer(env.mj_model, terms) if terms else None
+  model = jax.jit(randomizer.sample_batch)(jax.random.split(model_key, num_envs)) if randomizer else {}
+  state = jax.jit(batch.reset)(jax.random.split(reset_key, num_envs), model)
+  step = jax.jit(batch.step)
+  return VecEnv(env, state, lambda state, action: step(state, action, model), groups)
+
+
+def group_entries(env: Env) -> dict[str, str]:
+  """Which entry of the task's observation is for the policy, and which for the critic.
+
+  Raises:
+    ConfigError: the task shows pictures, which the bridge does not pass on.
+  """
+  sizes = env.observation_size
+  entries = list(sizes) if isinstance(sizes, Mapping) else ["state"]
+  if any(entry.startswith(PIXELS) for entry in entries):
+    raise ConfigError("RSL-RL gets no pictures from here: leave env.vision.enable=false.")
+  return {"policy": "state", "critic": PRIVILEGED if PRIVILEGED in entries else "state"}

@@ -1,0 +1,126 @@
+"""The bridge to RSL-RL: nothing is copied, time-outs are no terminations, and RSL-RL's own runner trains on it."""
+
+# torch is in an extra, which the type checker may not find
+# pyright: reportMissingImports=false
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from playground.envs.base import State
+from playground.envs.c_physics import on_c_physics
+from playground.errors import ConfigError
+from playground.learning.rsl_rl import RslRlPPOConfig
+from playground.registry import load
+from tests.dummy import Point
+
+torch = pytest.importorskip("torch", reason="needs the extra rsl_rl: `make test-rsl-rl`")
+runners = pytest.importorskip("rsl_rl.runners", reason="needs the extra rsl_rl: `make test-rsl-rl`")
+
+from playground.adapters.rsl_rl import OBS_GROUPS, VecEnv, group_entries, to_jax, to_torch, vec_env  # noqa: E402
+
+NUM_ENVS, LENGTH = 4, 40
+MODEL = {"class_name": "MLPModel", "hidden_dims": [8], "activation": "elu", "obs_normalization": True}
+RUNNER: dict[str, Any] = {
+  "num_steps_per_env": 5,
+  "save_interval": 10,
+  "actor": MODEL | {"distribution_cfg": {"class_name": "GaussianDistribution"}},
+  "critic": MODEL,
+  "algorithm": {"class_name": "PPO", "num_mini_batches": 2},
+}
+
+
+@pytest.fixture(scope="module")
+def made() -> tuple[VecEnv, State]:
+  env = vec_env(Point(episode_length=LENGTH), NUM_ENVS)
+  return env, env.state
+
+
+@pytest.fixture
+def env(made: tuple[VecEnv, State]) -> VecEnv:
+  """Environments at the beginning of their first episodes."""
+  env, env.state = made
+  return env
+
+
+def test_nothing_is_copied_either_way(env: VecEnv) -> None:
+  array, tensor = jnp.arange(6.0).reshape(2, 3), torch.rand(2, 3)
+  assert to_torch(array).data_ptr() == array.unsafe_buffer_pointer()
+  assert to_jax(tensor).unsafe_buffer_pointer() == tensor.data_ptr()
+  obs, rewards, dones, extras = env.step(torch.zeros(NUM_ENVS, 2))
+  state: Any = env.state
+  for seen, array in (
+    (obs["policy"], state.obs["state"]),
+    (obs["critic"], state.obs["privileged_state"]),
+    (rewards, state.reward),
+    (dones, state.done),
+    (extras["time_outs"], state.info["truncation"]),
+  ):
+    assert seen.data_ptr() == array.unsafe_buffer_pointer()
+
+
+def test_time_outs_are_no_terminations(env: VecEnv) -> None:
+  """Two points stay where they are until time is up, two leave the field before."""
+  actions = torch.tensor([[0.0, 0.0], [0.0, 0.0], [5.0, 5.0], [5.0, 5.0]])  # clipped to 1
+  ends, logs = torch.zeros(0, NUM_ENVS), []
+  timed_out = ends.clone()
+  for _ in range(LENGTH):
+    _, _, dones, extras = env.step(actions)
+    ends, timed_out = torch.vstack([ends, dones]), torch.vstack([timed_out, extras["time_outs"]])
+    logs.append(extras.get("log"))
+  assert ends.sum(0).tolist()[:2] == timed_out.sum(0).tolist()[:2] == [1, 1]
+  assert ends[-1, :2].all()
+  assert (ends.sum(0)[2:] > 0).all() and not timed_out[:, 2:].any()
+  assert [log is not None for log in logs] == ends.any(1).tolist()
+  first = int(ends.any(1).int().argmax())
+  assert set(logs[first]) == {"Episode/reward", "Episode/length", "Episode/distance"}
+  assert logs[first]["Episode/length"] == first + 1 < LENGTH
+
+
+def test_episodes_can_begin_at_any_length(env: VecEnv) -> None:
+  env.episode_length_buf = torch.tensor([LENGTH - 1, 0, 1, 2])
+  _, _, dones, extras = env.step(torch.zeros(NUM_ENVS, 2))
+  assert dones.tolist() == extras["time_outs"].tolist() == [1, 0, 0, 0]
+  assert env.episode_length_buf.tolist() == [0, 1, 2, 3]
+
+
+def test_rsl_rls_own_runner_trains(env: VecEnv, capsys: pytest.CaptureFixture[str]) -> None:
+  runner = runners.OnPolicyRunner(env, {**RUNNER, "obs_groups": dict(OBS_GROUPS)})
+  assert [model.obs_dim for model in (runner.alg.actor, runner.alg.critic)] == [2, 4]
+  before = [p.clone() for p in runner.alg.actor.parameters()]
+  runner.learn(2, init_at_random_ep_len=True)
+  assert all((a != b).any() for a, b in zip(before, runner.alg.actor.parameters(), strict=True))
+
+
+def test_groups_of_go1() -> None:
+  obs = vec_env(on_c_physics(load("Go1JoystickFlatTerrain")), 2).get_observations()
+  assert {name: tuple(group.shape) for name, group in obs.items()} == {"policy": (2, 48), "critic": (2, 123)}
+
+
+@pytest.mark.slow  # compiles a task's physics
+def test_each_environment_has_a_model_of_its_own() -> None:
+  terms = [{"field": "dof_damping", "target": "all", "operation": "set", "range": [0.0, 5.0]}]
+  env = vec_env(load("CartpoleBalance"), 2, terms=terms)
+  assert env.groups == {"policy": "state", "critic": "state"}, "a task without privileged observations"
+  env.state = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), env.state)
+  for _ in range(3):
+    obs, *_ = env.step(torch.ones(2, 1))
+  assert (obs["policy"][0] != obs["policy"][1]).any()
+
+
+def test_pictures_are_refused() -> None:
+  class Camera(Point):
+    @property
+    def observation_size(self) -> dict[str, tuple[int, ...]]:
+      return {"state": (2,), "pixels/view": (8, 8, 3)}
+
+  with pytest.raises(ConfigError, match="RSL-RL gets no pictures from here"):
+    group_entries(Camera())
+
+
+def test_several_devices_are_refused() -> None:
+  with pytest.raises(ConfigError, match=r"trains on one device and not on 2: give hardware.devices=1"):
+    RslRlPPOConfig(num_timesteps=1).check(2)
+  RslRlPPOConfig(num_timesteps=1).check(1)
