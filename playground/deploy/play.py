@@ -1,5 +1,6 @@
 """`playground play <run|policy.onnx>`: the exported policy in plain C MuJoCo, measured, filmed or watched."""
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from playground.deploy.policy import ExportedPolicy
 from playground.deploy.trained import TrainedPolicy, load_on_c_physics
 from playground.envs.base import Env
 from playground.errors import ConfigError
+from playground.extras import need
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
@@ -28,6 +30,9 @@ def play(
   seed: int = 0,
   video: str | None = None,
   viewer: bool = False,
+  web: bool = False,
+  host: str = "127.0.0.1",
+  port: int = 8080,
   console: Console | None = None,
 ) -> int:
   """Runs a policy, in ONNX Runtime, in C MuJoCo: at its rate, with its noise, pushes and delays, the model as it is.
@@ -38,13 +43,16 @@ def play(
     seed: of the episodes.
     video: where to render the first episode to (.mp4).
     viewer: whether to show the policy in MuJoCo's viewer instead of measuring it.
+    web: whether to show it in the browser instead.
+    host: the address that the browser's page is served at.
+    port: its port.
     console: for the output.
 
   Returns:
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run or policy, or no display for the viewer.
+    PlaygroundError: no such run or policy, no display for the viewer, or no port for the browser.
   """
   console = console or Console()
   if episodes < 1:
@@ -53,18 +61,31 @@ def play(
     from playground.deploy.viewer import need_display
 
     need_display()
-  exported, env, folder = open_policy(path)
+  if web:
+    need("web", "viser", "mjviser")
+    from playground.deploy.web.server import need_port
+
+    need_port(host, port)
+  opened = open_policy(path)
+  exported, env = opened.exported, opened.env
   if viewer:
     from playground.deploy.viewer import view
 
     view(env, exported, seed, console)
+    return 0
+  if web:
+    from playground.deploy.session import Session
+    from playground.deploy.web.server import watch
+
+    whole_run = Path(path).expanduser().parent.name != "checkpoints"
+    watch(Session(env, exported, seed, opened.trained, following=whole_run), host, port, console)
     return 0
   evaluate = make_evaluator(env, exported.act, episodes, make_mesh(1), 1 if video else 0)
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
   origin = exported.contract["origin"]
   console.print(_table(exported.contract, episodes, scores))
-  out = folder / f"play_step_{origin['steps']:012d}_seed_{seed}.json"
+  out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}.json"
   write_json(out, {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "scores": scores, "origin": origin})
   console.print(f"written to {out}", soft_wrap=True)
   if video:
@@ -73,8 +94,25 @@ def play(
   return 0
 
 
-def open_policy(path: str) -> tuple[ExportedPolicy, Env, Path]:
-  """The exported policy, its task on C MuJoCo, and the folder that results go to.
+@dataclasses.dataclass(frozen=True)
+class Opened:
+  """A policy to play.
+
+  Attributes:
+    exported: the policy.
+    env: its task on C MuJoCo.
+    folder: where results go.
+    trained: the checkpoint, if it came from a run.
+  """
+
+  exported: ExportedPolicy
+  env: Env
+  folder: Path
+  trained: TrainedPolicy | None = None
+
+
+def open_policy(path: str) -> Opened:
+  """Reads a run's policy, or an exported one.
 
   Raises:
     PlaygroundError: no such run or policy.
@@ -83,11 +121,11 @@ def open_policy(path: str) -> tuple[ExportedPolicy, Env, Path]:
     exported = ExportedPolicy.load(path)
     task = exported.contract["task"]
     setup(this_machine(configs.compose([f"env={task}", "hardware=cpu"]).hardware))
-    return exported, load_on_c_physics(task, exported.contract["env"]), Path(path).expanduser().parent
+    return Opened(exported, load_on_c_physics(task, exported.contract["env"]), Path(path).expanduser().parent)
   trained = TrainedPolicy.open(path)
   folder = trained.run_dir.path / "export"
   folder.mkdir(exist_ok=True)
-  return trained.export(), trained.env, folder
+  return Opened(trained.export(), trained.env, folder, trained)
 
 
 def _table(contract: Mapping[str, Any], episodes: int, scores: Mapping[str, float]) -> Table:

@@ -20,6 +20,7 @@ from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_training
 from playground.errors import ConfigError
 from playground.extras import need
+from playground.learning.checkpoints import Checkpoint
 from playground.learning.learner import Learner, Policy
 from playground.runs.run_dir import RunDirectory
 from playground.runs.trained import load_trained
@@ -57,6 +58,12 @@ class TrainedPolicy:
     found = load_trained(path, load_task=load_on_c_physics, platform="cpu", precision=_EXACT)
     return cls(found.config, found.run_dir, found.checkpoint.step, found.env, found.learner, found.policy)
 
+  def at(self, path: Path) -> "TrainedPolicy":
+    """The policy of another checkpoint of the run; raises CheckpointError if it is gone or damaged."""
+    found = Checkpoint(path)
+    policy = self.learner.place_policy(found.restore("policy", self.learner.policy_shape()))
+    return dataclasses.replace(self, step=found.step, policy=policy)
+
   def act(self, obs: Any) -> jax.Array:
     """The deterministic action."""
     return self.learner.act(self.policy, obs, jax.random.PRNGKey(0), deterministic=True)
@@ -89,11 +96,9 @@ class TrainedPolicy:
   def export(self, state: State | None = None) -> ExportedPolicy:
     """The policy as a controller has it; `state` is any of one environment (a fresh one if None)."""
     need("deploy", "onnx", "onnxruntime")
-    normalizer: Any = jax.device_get(self.policy.normalizer)
-    seen = (normalizer.mean[self.entry], normalizer.std[self.entry])
-    params = jax.device_get(self.policy.params.policy)["params"]
-    agent = self.run.agent
-    model = policy_graph(params, agent.network.activation, seen if agent.normalize_observations else None)
+    policy, agent, networks = jax.device_get(self.policy), self.run.agent, self.learner.networks
+    params, seen = networks.mlp(policy.params.policy, policy.normalizer if agent.normalize_observations else None)
+    model = policy_graph(params, agent.network.activation, seen, networks.squashed)
     origin = {
       "run": self.run_dir.path.absolute().name,
       "experiment": self.run.name,

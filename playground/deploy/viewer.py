@@ -7,12 +7,11 @@ import time
 import numpy as np
 from rich.console import Console
 
-from playground.deploy.player import Player
+from playground.deploy.player import STEP, Player
 from playground.deploy.policy import ExportedPolicy
 from playground.envs.base import Env
 from playground.errors import HardwareError
 
-_STEP = 0.1  # m/s and rad/s of the command, for each press
 # GLFW's codes of the keys -> component of the command, direction.
 _STEERING = {265: (0, 1), 264: (0, -1), 263: (2, 1), 262: (2, -1), ord(","): (1, 1), ord("."): (1, -1)}
 _AS_THE_TASK_DRAWS, _RESET = 259, 257  # backspace, enter
@@ -43,7 +42,7 @@ def view(env: Env, exported: ExportedPolicy, seed: int, console: Console) -> Non
     elif key in _STEERING and player.takes_commands:
       component, sign = _STEERING[key]
       player.command = np.zeros(3) if player.command is None else player.command.copy()
-      player.command[component] += sign * _STEP
+      player.command[component] += sign * STEP
       console.print(f"command {np.round(player.command, 1).tolist()}")
 
   console.print(_HELP, soft_wrap=True)

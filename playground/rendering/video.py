@@ -185,12 +185,18 @@ def choose_camera(model: Any, name: str | None = None) -> Any:
     return chosen
   view = mujoco.MjvCamera()
   mujoco.mjv_defaultFreeCamera(model, view)
-  roots = [model.body_rootid[b] for b in model.jnt_bodyid]
-  if roots and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and roots.count(roots[0]) > 1:
-    # A robot that walks out of the picture is no use; a free object on a table should not be followed.
+  if walks(model):
     view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, model.jnt_bodyid[0]
     view.distance = min(view.distance, 3.0)  # terrain makes the model's extent, and so the default, huge
   return view
+
+
+def walks(model: Any) -> bool:
+  """Whether to follow what moves first: a robot that walks out of the picture, but no free object on a table."""
+  import mujoco
+
+  roots = [model.body_rootid[b] for b in model.jnt_bodyid]
+  return bool(roots) and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and roots.count(roots[0]) > 1
 
 
 if __name__ == "__main__":

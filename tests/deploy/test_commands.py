@@ -2,24 +2,18 @@
 
 import json
 import re
+import socket
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 import yaml
 
 from playground.cli.main import main
-from playground.config import compose
 from playground.deploy.policy import ExportedPolicy
-from playground.envs.c_physics import on_c_physics
-from playground.hardware.mesh import make_mesh
-from playground.learning.algorithms import make_learner
-from playground.learning.checkpoints import CheckpointStore
-from playground.learning.learner import Policy
-from playground.registry import load
-from playground.runs.run_dir import RunDirectory
+from playground.deploy.web.server import Watch
 from tests.command import Command, caller
+from tests.deploy.untrained import UntrainedRun, free_port
 
 STEPS = 3000
 
@@ -28,19 +22,12 @@ STEPS = 3000
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
   """A run's directory as training leaves it."""
   path = tmp_path_factory.mktemp("deploy") / "run"
-  config = compose(["env=CartpoleBalance", "debug=fast", "hardware=cpu", "env.episode_length=40", f"run_dir={path}"])
-  run_dir = RunDirectory.create(path, config.resolved)
-  run_dir.update_manifest(git={"commit": "abc", "dirty": False})
-  run_dir.metrics_csv.write_text(
+  run = UntrainedRun(path, "CartpoleBalance", "debug=fast", "env.episode_length=40")
+  run.directory.update_manifest(git={"commit": "abc", "dirty": False})
+  run.directory.metrics_csv.write_text(
     "step,eval/episode_reward,eval/episode_length\n0,1.0,40\n2000,12.5,40\n2500,,\n4000,30.0,40\n"
   )
-  env = on_c_physics(load("CartpoleBalance", config=config.env))
-  learner = make_learner(env, config.agent, make_mesh(1), None)
-  rng = np.random.default_rng(0)
-  weights = jax.tree.map(lambda x: rng.uniform(0.1, 0.5, x.shape).astype(x.dtype), learner.policy_shape())
-  store = CheckpointStore(run_dir.checkpoints)
-  store.save(STEPS, Policy(weights.params, weights.normalizer), {"rest": np.zeros(1)}, {"env": "CartpoleBalance"})
-  store.close()
+  run.save(STEPS)
   return path
 
 
@@ -80,6 +67,33 @@ def test_a_policy_that_acts_otherwise_is_not_written(
   assert command("export", str(run), "--out", str(tmp_path / "out")) == 2
   assert "differ by 1.0e-03, more than 1e-05: nothing is written" in capsys.readouterr().err
   assert not (tmp_path / "out").exists()
+
+
+def test_play_in_the_browser(
+  command: Command, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  watched: list[Watch] = []
+  truly = Watch.frame
+
+  def frame(watch: Watch) -> None:
+    truly(watch)
+    watched.append(watch)
+    if len(watched) == 20:
+      raise KeyboardInterrupt
+
+  monkeypatch.setattr(Watch, "frame", frame)
+  port = free_port()
+  assert command("play", str(run / "checkpoints" / f"{STEPS:012d}"), "--web", "--port", str(port)) == 0
+  assert f"http://127.0.0.1:{port}" in capsys.readouterr().out
+  session, panel = watched[0].session, watched[0].panel
+  assert session.player.seconds > 0 and not session.following and panel.checkpoint.value == f"{STEPS:,}"
+  assert session.terrain is None and panel.command == []  # which this task has not
+  before = np.array(session.player.state.data.qvel)
+  session.player.push(2.0)
+  np.testing.assert_allclose(
+    np.abs(session.player.state.data.qvel - before), [2, 0], atol=1e-6
+  )  # the cart, not the pole
+  socket.create_server(("127.0.0.1", port)).close()  # it is free again
 
 
 def test_one_sentence_each(

@@ -58,6 +58,13 @@ def test_what_the_watcher_asks_for() -> None:
   assert (player.state.info["age"], player.episode_return) == (1, 0)
 
 
+def test_an_episode_that_breaks_begins_anew() -> None:
+  player = Player(Commanded(nan_at=2), NO_ACTION)
+  player.decide()
+  assert np.isnan(player.decide().data.qpos).all()
+  assert np.isfinite(player.decide().data.qpos).all() and player.state.info["age"] == 1
+
+
 def test_the_viewer_shows_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
   env = on_c_physics(load("CartpoleBalance"))
   shown: list[np.ndarray] = []

@@ -1,0 +1,130 @@
+"""What somebody watches from another thread or window: a player in time, and what the watcher asks for in between."""
+
+import queue
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from playground.deploy.player import Player
+from playground.deploy.policy import ExportedPolicy
+from playground.deploy.trained import TrainedPolicy, load_on_c_physics
+from playground.envs.base import Env
+from playground.learning.checkpoints import find_checkpoints
+
+
+class Session:
+  """A player that time passes for.
+
+  One thread lets time pass. Others may set `paused`, `speed` and the player's command, and `ask` for the rest.
+
+  Attributes:
+    player: who acts; another takes its place when the terrain changes.
+    trained: the run's policy that acts; None without a run.
+    following: whether the newest checkpoint is to act, as training goes on.
+    paused: whether time stands still.
+    speed: simulated seconds in one.
+    previous_qpos: the joints' positions at the decision before the last, [nq].
+  """
+
+  def __init__(
+    self, env: Env, exported: ExportedPolicy, seed: int, trained: TrainedPolicy | None = None, following: bool = True
+  ):
+    """Starts an episode of a policy; `trained` is the checkpoint that it is from, if a run is at hand."""
+    self._seed = seed
+    self.player = Player(env, exported, seed)
+    self.trained = trained
+    self.following = following
+    self.paused = False
+    self.speed = 1.0
+    self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+    self._tried: Path | None = None  # to follow: a checkpoint that cannot be read is said to be so once
+    self._due = 0.0  # simulated seconds for which nothing has been decided yet
+    self.previous_qpos = np.asarray(self.player.state.data.qpos)
+
+  def ask(self, request: Callable[[], None]) -> None:
+    """Has something done between two decisions."""
+    self._requests.put(request)
+
+  def carry_out(self) -> None:
+    """Does what was asked for, up to the first that fails; raises PlaygroundError for that."""
+    while not self._requests.empty():
+      self._requests.get()()
+
+  def advance(self, seconds: float) -> None:
+    """Lets so much time pass at the chosen speed."""
+    if self.paused:
+      return
+    self._due += seconds * self.speed
+    while self._due >= self.player.period:
+      self._due -= self.player.period
+      self.previous_qpos = np.asarray(self.player.state.data.qpos)
+      self.player.decide()
+      if self.player.seconds <= self.player.period:  # of a new episode: nothing lies between it and the last
+        self.previous_qpos = np.asarray(self.player.state.data.qpos)
+
+  def qpos(self) -> np.ndarray:
+    """The joints' positions at this instant, which lies between the last two decisions' [nq]."""
+    model = self.player.env.mj_model
+    now = np.asarray(self.player.state.data.qpos, float)
+    pose, change = self.previous_qpos.astype(float), np.empty(model.nv)
+    mujoco.mj_differentiatePos(model, change, 1.0, pose, now)
+    mujoco.mj_integratePos(model, pose, change, min(1.0, self._due / self.player.period))
+    return pose
+
+  def reset(self) -> None:
+    """Starts the next episode."""
+    self.player.reset()
+    self._begin()
+
+  @property
+  def terrain(self) -> str | None:
+    """What the robot stands on, if the task lets that be chosen."""
+    return self.player.env.config.get("scene", {}).get("terrain")
+
+  def choose_terrain(self, name: str) -> None:
+    """Builds the task on another terrain, which takes seconds; raises ConfigError if the task has none of it."""
+    old = self.player
+    config = old.env.config.copy_and_resolve_references()
+    config.scene.terrain = name
+    env = load_on_c_physics(old.exported.contract["task"], config)
+    self.player = Player(env, old.exported, self._seed)
+    self.player.command = old.command
+    self._begin()
+
+  def steps(self) -> list[int]:
+    """Control steps trained of the run's checkpoints, newest first; the one that acts is among them, though gone."""
+    if self.trained is None:
+      return []
+    return sorted({self.trained.step, *(int(path.name) for path in self._checkpoints())}, reverse=True)
+
+  def choose_checkpoint(self, step: int | None) -> None:
+    """Lets the policy of a checkpoint act, from now on the newest if None; raises CheckpointError if it is gone."""
+    self.following, self._tried = step is None, None
+    if step is not None and self.trained is not None:
+      self._act_as(self.trained.run_dir.checkpoints / f"{step:012d}")
+
+  def follow(self) -> None:
+    """Lets the newest checkpoint act, if that is asked for; raises CheckpointError if it cannot be read."""
+    if not self.following or self.trained is None:
+      return
+    newest = self._checkpoints()[0]
+    if newest != self._tried:
+      self._tried = newest
+      self._act_as(newest)
+
+  def _checkpoints(self) -> list[Path]:
+    assert self.trained is not None
+    return find_checkpoints(self.trained.run_dir.path)
+
+  def _act_as(self, path: Path) -> None:
+    assert self.trained is not None
+    if int(path.name) == self.trained.step:
+      return
+    self.trained = self.trained.at(path)
+    self.player.exported = self.trained.export(self.player.state)
+
+  def _begin(self) -> None:
+    self._due = 0.0
+    self.previous_qpos = np.asarray(self.player.state.data.qpos)

@@ -1,0 +1,1 @@
+"""`playground play --web`: a policy in the browser, drawn and steered through viser."""

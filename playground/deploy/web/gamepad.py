@@ -1,0 +1,97 @@
+"""A gamepad at the machine that the browser runs on.
+
+viser has no gamepads. The page is given a script, in a frame of its own, that notes the gamepad's state in the
+browser's local storage, and that is what viser can read.
+"""
+
+import dataclasses
+import html
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+
+import viser
+
+_ENTRY = "playground-gamepad"
+_SCRIPT = """<script>
+  const entry = Object.keys(localStorage).find(key => key.endsWith("ENTRY"));
+  setInterval(() => {
+    const pad = [...parent.navigator.getGamepads()].find(pad => pad && pad.connected && pad.axes.length > 2);
+    const note = pad ? JSON.stringify({axes: pad.axes, pressed: pad.buttons.map(button => button.pressed)}) : "";
+    localStorage.setItem(entry, note);
+  }, 20);
+</script>"""
+_DEADBAND = 0.1  # of a stick's way
+_OFTEN, _SELDOM = 0.03, 0.5  # s between two looks, with a gamepad and without
+_PATIENCE = 5.0  # s for a browser's answer
+
+
+@dataclasses.dataclass(frozen=True)
+class Pad:
+  """What a gamepad of the standard layout says.
+
+  Attributes:
+    sticks: left one forward, left one left, right one left, in [-1, 1].
+    pressed: numbers of the buttons that are down.
+  """
+
+  sticks: tuple[float, float, float] = (0.0, 0.0, 0.0)
+  pressed: frozenset[int] = frozenset()
+
+  @classmethod
+  def read(cls, note: str) -> "Pad":
+    """Reads what the script wrote."""
+    said = json.loads(note)
+    left_x, left_y, right_x = [-x if abs(x) > _DEADBAND else 0.0 for x in said["axes"][:3]]
+    return cls((left_y, left_x, right_x), frozenset(i for i, down in enumerate(said["pressed"]) if down))
+
+
+class Gamepads:
+  """Listens to the gamepad of each browser."""
+
+  def __init__(
+    self,
+    server: viser.ViserServer,
+    ask: Callable[[Callable[[], None]], None],
+    steer: Callable[[Sequence[float]], None],
+    buttons: Mapping[int, Callable[[], None]],
+  ):
+    """Begins to listen.
+
+    Args:
+      server: the browsers'.
+      ask: has the following done at a time that suits them.
+      steer: takes `Pad.sticks` when they have moved.
+      buttons: what to do when a button goes down, by its number.
+    """
+    self._server = server
+    self._ask, self._steer, self._buttons = ask, steer, buttons
+    self._closed = threading.Event()
+    server.on_client_connect(lambda client: threading.Thread(target=self._listen, args=(client,), daemon=True).start())
+
+  def close(self) -> None:
+    """Stops listening."""
+    self._closed.set()
+
+  def _listen(self, client: viser.ClientHandle) -> None:
+    client.local_storage.set_item(_ENTRY, "")
+    frame = f'<iframe hidden srcdoc="{html.escape(_SCRIPT.replace("ENTRY", _ENTRY))}"></iframe>'
+    client.gui.add_html(frame)
+    last, pause = Pad(), _SELDOM
+    while not self._closed.wait(pause) and client.client_id in self._server.get_clients():
+      try:
+        note = client.local_storage.get_item(_ENTRY, timeout=_PATIENCE)
+      except TimeoutError:  # the page sleeps in the background
+        continue
+      except RuntimeError:  # it is closed, or keeps no local storage
+        return
+      now = Pad.read(note) if note else Pad()
+      self._tell(last, now)
+      last, pause = now, _OFTEN if note else _SELDOM
+
+  def _tell(self, last: Pad, now: Pad) -> None:
+    if now.sticks != last.sticks:
+      self._ask(lambda: self._steer(now.sticks))
+    for number in now.pressed - last.pressed:
+      if number in self._buttons:
+        self._ask(self._buttons[number])

@@ -1,0 +1,160 @@
+"""What the watcher can do: sliders, buttons, menus, and keys for most of them.
+
+Keys move the sliders, and the sliders move the player, so that there is one way for a command to go.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from playground.deploy.player import STEP
+from playground.deploy.session import Session
+from playground.deploy.web.gamepad import Gamepads
+from playground.deploy.web.plots import Plots
+from playground.robots.terrain import TERRAINS
+
+LATEST = "latest"
+# Component of the command, key that adds to it, key that takes away; viser moves its camera with WASD, QE and arrows.
+AXES: tuple[tuple[str, Any, Any], ...] = (
+  ("forward, m/s", "I", "K"),
+  ("left, m/s", "U", "O"),
+  ("turn, rad/s", "J", "L"),
+)
+_ELSE = 1.0  # m/s and rad/s: the sliders' range for a task that does not tell one
+
+
+class Panel:
+  """The controls of a session."""
+
+  def __init__(self, server: viser.ViserServer, session: Session):
+    """Adds them."""
+    self._server, self._gui, self._session = server, server.gui, session
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+    self._status = self._gui.add_markdown("")
+    self.command = self._add_command() if session.player.takes_commands else []
+    self._add_time()
+    self._add_choices()
+    with self._gui.add_folder("Return"):
+      self.plots = Plots(self._gui, session.player)
+    self._gamepads = Gamepads(
+      server, session.ask, self._steer, {0: self._push, 1: session.reset, 9: self._toggle_pause}
+    )
+
+  def close(self) -> None:
+    """Lets go of the gamepads."""
+    self._gamepads.close()
+
+  def record(self) -> None:
+    """Notes the present state for the plots."""
+    self.plots.record(self._session.player)
+
+  def draw(self) -> None:
+    """Shows where the session stands."""
+    session, player = self._session, self._session.player
+    contract = player.exported.contract
+    steps = contract["origin"]["steps"] if session.trained is None else session.trained.step
+    lines = [
+      f"**{contract['task']}**, {steps:,} steps trained",
+      f"{player.seconds:.1f} s, return {player.episode_return:.2f}",
+    ]
+    if player.takes_commands:
+      who = "the task's" if player.command is None else "yours"
+      lines.append(f"command {' / '.join(f'{value:.2f}' for value in player.task_command)} ({who})")
+    self._status.content = "  \n".join(lines)
+    self.plots.draw()
+    if session.trained is not None:
+      options = (LATEST, *map(_label, session.steps()))
+      if options != self.checkpoint.options:
+        self.checkpoint.options = options
+
+  def say(self, title: str, body: str) -> None:
+    """Shows a sentence to all who watch."""
+    for client in self._server.get_clients().values():
+      client.add_notification(title, body, color="red", auto_close_seconds=10.0)
+
+  def _add_command(self) -> list[viser.GuiSliderHandle[float]]:
+    player = self._session.player
+    told = player.exported.contract.get("command") or {}
+    high = np.array(told.get("max") or [_ELSE] * len(AXES))
+    low = -high if told.get("min") is None else np.array(told["min"])
+    sliders: list[viser.GuiSliderHandle[float]] = []
+
+    def take(_: Any) -> None:
+      self._session.player.command = np.array([slider.value for slider in sliders])
+
+    def leave() -> None:
+      for slider in sliders:
+        _set(slider, 0.0)
+      self._session.player.command = None
+
+    with self._gui.add_folder("Command"):
+      for (label, more, less), least, most in zip(AXES, low.tolist(), high.tolist(), strict=True):
+        start = min(max(0.0, least), most)
+        slider = self._gui.add_slider(label, least, most, 0.01, start, hint=f"keys {more} and {less}")
+        slider.on_update(take)
+        sliders.append(slider)
+        for key, change in ((more, STEP), (less, -STEP)):
+          self._add_key(f"{label}: {change:+g}", key, lambda by=change, it=slider: _set(it, it.value + by))
+      self.leave = self._add_button("Leave it to the task", "T", leave)
+    return sliders
+
+  def _add_time(self) -> None:
+    session = self._session
+    with self._gui.add_folder("Episode"):
+      self.paused = self._gui.add_checkbox("Paused", False, hint="key space")
+      self.paused.on_update(lambda _: setattr(session, "paused", self.paused.value))
+      self._add_key("Pause", "space", self._toggle_pause)
+      self.speed = self._gui.add_slider("Speed", 0.05, 2.0, 0.05, 1.0, hint="simulated seconds in one")
+      self.speed.on_update(lambda _: setattr(session, "speed", self.speed.value))
+      self.push_speed = self._gui.add_slider("Push, m/s", 0.1, 3.0, 0.1, 0.5, hint="which the robot gains at once")
+      self.push = self._add_button("Push", "P", self._push)
+      self.reset = self._add_button("Begin anew", "R", session.reset)
+
+  def _add_choices(self) -> None:
+    session = self._session
+    if session.terrain is not None:
+      self.terrain = self._gui.add_dropdown("Terrain", tuple(TERRAINS), initial_value=session.terrain)
+      self.terrain.on_update(lambda _: self._ask(lambda name=self.terrain.value: session.choose_terrain(name)))
+    if session.trained is not None:
+      now = LATEST if session.following else _label(session.trained.step)
+      self.checkpoint = self._gui.add_dropdown("Checkpoint", (LATEST, *map(_label, session.steps())), initial_value=now)
+      self.checkpoint.on_update(lambda _: self._ask(lambda label=self.checkpoint.value: self._choose(label)))
+
+  def _steer(self, sticks: Sequence[float]) -> None:
+    """Sets the command from sticks in [-1, 1], whose ends are those of the sliders."""
+    for slider, stick in zip(self.command, sticks, strict=False):
+      _set(slider, stick * slider.max if stick > 0 else -stick * slider.min)
+
+  def _push(self) -> None:
+    self._session.player.push(self.push_speed.value)
+
+  def _toggle_pause(self) -> None:
+    self.paused.value = not self.paused.value
+
+  def _choose(self, label: str) -> None:
+    self._session.choose_checkpoint(None if label == LATEST else int(label.replace(",", "")))
+
+  def _add_button(self, label: str, key: Any, act: Callable[[], None]) -> viser.GuiButtonHandle:
+    button = self._gui.add_button(f"{label} ({key})")
+    button.on_click(lambda _: self._session.ask(act))
+    self._add_key(label, key, act)
+    return button
+
+  def _add_key(self, label: str, key: Any, act: Callable[[], None]) -> None:
+    """A key, and an entry in viser's palette of commands (ctrl K)."""
+    self._gui.add_command(label, hotkey=key).on_trigger(lambda _: self._session.ask(act))
+
+  def _ask(self, act: Callable[[], None]) -> None:
+    self._status.content = "one moment ..."
+    self._session.ask(act)
+
+
+def _label(step: int) -> str:
+  return f"{step:,}"
+
+
+def _set(slider: viser.GuiSliderHandle[float], value: float) -> None:
+  """Moves a slider as far as it goes."""
+  slider.value = round(min(max(value, slider.min), slider.max), 2)

@@ -1,0 +1,79 @@
+"""The viewer in the browser: a server, and the loop that lets time pass."""
+
+import socket
+import time
+
+import viser
+from rich.console import Console
+
+from playground.deploy.session import Session
+from playground.deploy.web.panel import Panel
+from playground.deploy.web.view import View
+from playground.errors import ConfigError, PlaygroundError
+
+_FRAME = 1 / 30  # s between two pictures: more than a browser without a GPU can draw
+_DRAW = 0.25  # s between two looks at what changes slowly: text, plots, the run's checkpoints
+_LONGEST = 0.1  # s that may pass at once; a machine that is too slow falls behind
+
+
+class Watch:
+  """A session in the browser."""
+
+  def __init__(self, session: Session, host: str, port: int):
+    """Starts serving.
+
+    Raises:
+      ConfigError: the port is taken, or is none of this machine's.
+    """
+    need_port(host, port)
+    self.session = session
+    self.server = viser.ViserServer(host, port, label="playground", verbose=False)
+    self.panel = Panel(self.server, session)
+    self._view = View(self.server)
+    self._now = time.perf_counter()
+    self._drawn = 0.0
+
+  def frame(self) -> None:
+    """Does what was asked for, lets the time since the last frame pass, and draws."""
+    session, last = self.session, self._now
+    time.sleep(max(0.0, last + _FRAME - time.perf_counter()))
+    self._now = time.perf_counter()
+    try:
+      session.carry_out()
+      if self._now - self._drawn > _DRAW:
+        session.follow()
+    except PlaygroundError as error:
+      self.panel.say("This did not work", str(error))
+    session.advance(min(self._now - last, _LONGEST))
+    self.panel.record()
+    self._view.show(session.player, session.qpos())
+    if self._now - self._drawn > _DRAW:
+      self.panel.draw()
+      self._drawn = self._now
+
+  def close(self) -> None:
+    """Stops serving."""
+    self.panel.close()
+    self.server.stop()
+
+
+def need_port(host: str, port: int) -> None:
+  """Raises ConfigError where nothing can be served."""
+  try:
+    socket.create_server((host, port)).close()
+  except (OSError, OverflowError) as error:
+    reason = getattr(error, "strerror", None) or str(error)
+    raise ConfigError(f"--web cannot listen on --host={host} --port={port}: {reason}; try another port.") from None
+
+
+def watch(session: Session, host: str, port: int, console: Console) -> None:
+  """Serves a session until it is interrupted."""
+  watching = Watch(session, host, port)
+  console.print("Watch it there; ctrl+c here ends it.")
+  try:
+    while True:
+      watching.frame()
+  except KeyboardInterrupt:
+    pass
+  finally:
+    watching.close()

@@ -1,0 +1,254 @@
+"""The viewer in the browser: its controls without one, then the page in a real Chromium."""
+
+import contextlib
+import importlib.util
+import shutil
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from playground.cli.main import main
+from playground.deploy.play import open_policy
+from playground.deploy.session import Session
+from playground.deploy.web.server import Watch
+from tests.command import caller
+from tests.deploy.untrained import UntrainedRun, free_port
+
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_WAIT = 60_000  # ms for the page to show something
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> UntrainedRun:
+  """A Go1 that hardly moves its joints."""
+  run = UntrainedRun(tmp_path_factory.mktemp("web") / "run", "Go1JoystickFlatTerrain", scale=1e-3)
+  run.save(1000, 2000)
+  return run
+
+
+@pytest.fixture(scope="module")
+def watch(run: UntrainedRun) -> Iterator[Watch]:
+  opened = open_policy(str(run.directory.path))
+  watch = Watch(Session(opened.env, opened.exported, 0, opened.trained), "127.0.0.1", free_port())
+  yield watch
+  watch.close()
+
+
+@pytest.fixture
+def session(watch: Watch) -> Iterator[Session]:
+  """The session, standing still at the start of an episode."""
+  session = watch.session
+  watch.panel.paused.value = True
+  session.reset()
+  yield session
+  watch.panel.paused.value = False
+
+
+def test_sliders_are_the_command(watch: Watch, session: Session) -> None:
+  forward, left, turn = watch.panel.command
+  assert [(s.min, s.max) for s in (forward, left, turn)] == [(-1.5, 1.5), (-0.8, 0.8), (-1.2, 1.2)]
+  forward.value, turn.value = 0.5, -0.2
+  np.testing.assert_array_equal(session.player.command, [0.5, 0, -0.2])
+  watch.panel.paused.value = False
+  session.advance(session.player.period)
+  np.testing.assert_allclose(session.player.state.info["command"], [0.5, 0, -0.2])
+  watch.panel.leave.value = True
+  watch.frame()
+  assert session.player.command is None and forward.value == 0
+
+
+def test_time(watch: Watch, session: Session) -> None:
+  player = session.player
+  session.advance(1.0)
+  assert player.seconds == 0
+  watch.panel.paused.value = False
+  session.advance(0.11)
+  assert player.seconds == pytest.approx(0.1)
+  watch.panel.speed.value = 0.25
+  session.advance(0.08)  # with the rest from before, one decision and a half
+  watch.panel.speed.value = 1.0
+  assert player.seconds == pytest.approx(0.12)
+  before, now = (np.asarray(qpos) for qpos in (session.previous_qpos, player.state.data.qpos))
+  np.testing.assert_allclose(session.qpos()[:3], (before + now)[:3] / 2, atol=1e-6)
+  watch.panel.reset.value = True
+  watch.frame()
+  assert player.seconds <= 0.12  # a frame passes at most 0.1 s
+
+
+def test_push(watch: Watch, session: Session) -> None:
+  before = np.array(session.player.state.data.qvel)
+  watch.panel.push_speed.value = 1.5
+  watch.panel.push.value = True
+  watch.frame()
+  change = session.player.state.data.qvel - before
+  assert np.linalg.norm(change[:2]) == pytest.approx(1.5, rel=1e-5) and not change[2:].any()
+
+
+def test_plots(watch: Watch, session: Session) -> None:
+  watch.panel.record()
+  watch.panel.paused.value = False
+  for _ in range(10):
+    session.advance(0.2)
+    watch.panel.record()
+  watch.panel.draw()
+  total, terms = watch.panel.plots.charts
+  assert terms.series[-1].get("label") == "tracking_lin_vel"
+  seconds, values = total.data
+  assert len(seconds) == 11 and seconds[-1] == pytest.approx(session.player.seconds)
+  assert values[-1] == pytest.approx(session.player.episode_return)
+  assert terms.data[-1][-1] == pytest.approx(session.player.term_sums["tracking_lin_vel"])
+  session.reset()
+  watch.panel.record()
+  watch.panel.draw()
+  assert len(total.data[0]) == 1
+
+
+def test_checkpoints_follow_the_training(watch: Watch, session: Session, run: UntrainedRun) -> None:
+  menu = watch.panel.checkpoint
+  acting = lambda: session.player.exported.contract["origin"]["steps"]
+  refresh = lambda: (session.carry_out(), session.follow(), watch.panel.draw())
+  assert (menu.value, menu.options, acting()) == ("latest", ("latest", "2,000", "1,000"), 2000)
+  run.save(3000)
+  refresh()
+  assert menu.options == ("latest", "3,000", "2,000", "1,000") and acting() == 3000
+  menu.value = "1,000"
+  refresh()
+  run.save(4000)  # three are kept: the one that acts is no more
+  refresh()
+  assert menu.options == ("latest", "4,000", "3,000", "2,000", "1,000") and acting() == 1000
+  menu.value = "latest"
+  refresh()
+  assert acting() == 4000 and menu.value == "latest"
+
+
+def test_a_checkpoint_that_is_gone(watch: Watch, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+  said: list[str] = []
+  monkeypatch.setattr(watch.panel, "say", lambda title, body: said.append(body))
+  session.ask(lambda: session.choose_checkpoint(77))
+  acting = session.player.exported
+  watch.frame()
+  assert len(said) == 1 and "000000000077" in said[0] and session.player.exported is acting
+  session.choose_checkpoint(None)
+
+
+def test_terrain(watch: Watch, session: Session) -> None:
+  watch.panel.command[0].value = 0.3
+  flat = session.player
+  watch.panel.terrain.value = "stairs"
+  watch.frame()
+  assert session.terrain == "stairs" and session.player.env.mj_model.nhfield == 1 and flat.env.mj_model.nhfield == 0
+  assert session.player.command is flat.command
+  watch.panel.leave.value = True
+
+
+def test_one_sentence_each(
+  run: UntrainedRun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  command = caller(monkeypatch, "playground", main)
+  path = str(run.directory.path)
+  with socket.create_server(("127.0.0.1", 0)) as taken:
+    port = str(taken.getsockname()[1])
+    assert command("play", path, "--web", "--port", port) == 2
+  assert f"--host=127.0.0.1 --port={port}: Address already in use" in capsys.readouterr().err
+  assert command("play", path, "--web", "--port", "70000") == 2
+  assert "--port=70000" in capsys.readouterr().err
+  truly = importlib.util.find_spec
+  monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "viser" else truly(name, *rest))
+  assert command("play", path, "--web") == 2
+  assert "This needs viser: pip install 'playground-run[web]'." in capsys.readouterr().err
+
+
+def test_page(watch: Watch) -> None:
+  with browser() as chromium, running(watch):
+    page = chromium.new_page(viewport={"width": 640, "height": 480})
+    complaints: list[str] = []
+    page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.add_init_script("window.pad = null; navigator.getGamepads = () => [window.pad]")
+    page.goto(f"http://127.0.0.1:{watch.server.get_port()}")
+    page.get_by_text("Go1JoystickFlatTerrain").wait_for(timeout=_WAIT)
+    session = watch.session
+    begun = session.player.seconds
+    eventually(page, lambda: session.player.seconds != begun)
+
+    slider = page.get_by_role("slider").first
+    slider.focus()
+    for _ in range(5):
+      slider.press("ArrowRight")
+    eventually(page, lambda: session.player.command is not None and session.player.command[0] > 0)
+    page.get_by_text("(yours)").wait_for(timeout=_WAIT)
+
+    page.locator("body").press("t")
+    eventually(page, lambda: asked(session) is None)
+    page.locator("body").press("j")
+    eventually(page, lambda: asked(session) == [0, 0, 0.1])
+
+    buttons = "buttons: [{pressed: true}]"
+    page.evaluate(f"window.pad = {{connected: true, axes: [0, -0.5, 0, 0], {buttons}}}")
+    eventually(page, lambda: asked(session) == [0.75, 0, 0])
+    page.evaluate("window.pad = null")
+
+    page.get_by_text("Paused").wait_for(timeout=_WAIT)
+    page.locator("body").press("Space")
+    eventually(page, lambda: session.paused)
+    page.locator("body").press("Space")
+    eventually(page, lambda: not session.paused)
+    assert complaints == []
+
+
+def asked(session: Session) -> list[float] | None:
+  """The watcher's command."""
+  return None if session.player.command is None else session.player.command.tolist()
+
+
+def eventually(page: Any, condition: Callable[[], bool]) -> None:
+  """Waits until the page's message has come through."""
+  for _ in range(_WAIT // 50):
+    if condition():
+      return
+    page.wait_for_timeout(50)
+  raise AssertionError("it never came to be")
+
+
+@contextlib.contextmanager
+def running(watch: Watch) -> Iterator[None]:
+  """Lets time pass on a thread of its own, as the command does on its only one."""
+  stop, failed = threading.Event(), []
+
+  def run() -> None:
+    try:
+      while not stop.is_set():
+        watch.frame()
+    except Exception as error:
+      failed.append(error)
+
+  thread = threading.Thread(target=run)
+  thread.start()
+  try:
+    yield
+  finally:
+    stop.set()
+    thread.join()
+  assert failed == []
+
+
+@contextlib.contextmanager
+def browser() -> Iterator[Any]:
+  """A headless Chromium that draws without a GPU."""
+  playwright = pytest.importorskip("playwright.sync_api")
+  with playwright.sync_playwright() as started:
+    found = [path for name in _BROWSERS if (path := shutil.which(name))]
+    own = Path(started.chromium.executable_path)
+    if not found and not own.is_file():
+      pytest.skip("there is no Chromium here: install one, or run `playwright install chromium`")
+    launched = started.chromium.launch(executable_path=found[0] if found else own, args=_SOFTWARE_GL)
+    try:
+      yield launched
+    finally:
+      launched.close()
