@@ -16,7 +16,7 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
 
   Args:
     task: its name.
-    overrides: as for playground-run; `agent.num_envs` is what the sizes are advised for.
+    overrides: as for playground-run.
     run: a run or checkpoint of the task whose policy acts, beside a random one.
     envs: environments.
     steps: decisions of each.
@@ -42,12 +42,9 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   found = [measure_buffers(config.env, act, envs, steps) for act in policies.values()]
   for name, sizes in zip(policies, found, strict=True):
     table.add_row(name, str(sizes.constraints), f"{sizes.contacts:.2f}")
-  count = config.agent.num_envs
-  advice = [sizes.advised(count) for sizes in found]
-  njmax, naconmax = (max(sizes[key] for sizes in advice) for key in ("njmax", "naconmax"))
-  table.add_row(f"advised, {ROOM:g} x the most", f"njmax: {njmax}", f"naconmax: {naconmax}")
-  table.add_row("configured", f"njmax: {config.env.njmax}", f"naconmax: {config.env.naconmax}")
-  console = Console()
-  console.print(table)
-  console.print(f"naconmax is for agent.num_envs={count} on one device and grows with them.")
+  advice = [sizes.advised() for sizes in found]
+  keys = ("njmax", "naconmax_per_env")
+  table.add_row(f"advised, {ROOM:g} x the most", *(f"{key}: {max(sizes[key] for sizes in advice)}" for key in keys))
+  table.add_row("configured", *(f"{key}: {config.env[key]}" for key in keys))
+  Console().print(table)
   return 0

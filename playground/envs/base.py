@@ -56,8 +56,9 @@ class Env(abc.ABC):
 
     Args:
       config: the task's ConfigDict: `ctrl_dt`, `sim_dt` in seconds, `episode_length` in control steps, `action_repeat`,
-        `impl` (auto, jax, warp), `cuda_impl` (what auto means on an NVIDIA GPU), `naconmax`, `naccdmax`, `njmax`
-        (Warp's buffer sizes, see `Physics`) and `parity` (reproduce playground 0.2.0, quirks included).
+        `impl` (auto, jax, warp), `cuda_impl` (what auto means on an NVIDIA GPU), `naconmax_per_env`,
+        `naccdmax_per_env`, `njmax` (Warp's buffer sizes, see `Physics`) and `parity` (reproduce playground 0.2.0,
+        quirks included).
       mj_model: the compiled model.
 
     Raises:
@@ -80,8 +81,8 @@ class Env(abc.ABC):
       mj_model,
       impl=self.impl,
       derived=self.derived,
-      naconmax=config.naconmax,
-      naccdmax=config.naccdmax,
+      naconmax_per_env=config.naconmax_per_env,
+      naccdmax_per_env=config.naccdmax_per_env,
       njmax=config.njmax,
     )
 

@@ -30,6 +30,10 @@ DERIVED_FIELDS = (
 )  # fmt: skip
 
 
+WORLDS = "worlds"  # the axis of the batch of environments, for `jax.vmap(axis_name=...)`: Warp's buffers grow with it
+_FEW = 64  # environments that few need not be like the average: they get the buffers of so many
+
+
 class BufferUse(struct.PyTreeNode):
   """What the last control step needed of Warp's buffers, the most of any of its physics steps; each shape [].
 
@@ -98,8 +102,8 @@ class Physics:
     *,
     impl: str = "jax",
     derived: tuple[str, ...] = DERIVED_FIELDS,
-    naconmax: int | None = None,
-    naccdmax: int | None = None,
+    naconmax_per_env: int | None = None,
+    naccdmax_per_env: int | None = None,
     njmax: int | None = None,
   ):
     """Puts the model on the device.
@@ -108,15 +112,18 @@ class Physics:
       mj_model: the compiled model; its `opt.timestep` is the physics step in seconds.
       impl: 'jax' or 'warp'.
       derived: the names out of `DERIVED_FIELDS` that the task reads.
-      naconmax: Warp only, contacts to allocate over all environments together.
-      naccdmax: Warp only, contacts of the convex collision routines over all environments together.
+      naconmax_per_env: Warp only, contacts to allocate for each environment of a batch, which share them all. The batch
+        is the axis named `WORLDS` of the `jax.vmap` around.
+      naccdmax_per_env: Warp only, likewise contacts of the convex collision routines; as many if None.
       njmax: Warp only, constraint rows to allocate for each environment.
     """
     self.mj_model = mj_model
     self.impl = impl
     self.derived = derived
     self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, impl=impl)
-    self._sizes: dict[str, Any] = {} if impl == "jax" else {"naconmax": naconmax, "naccdmax": naccdmax, "njmax": njmax}
+    self._naconmax_per_env = naconmax_per_env
+    self._naccdmax_per_env = naccdmax_per_env
+    self._njmax = njmax
 
   def make(self, **fields: jax.Array) -> PhysicsData:
     """Returns the model's default state with `fields` replaced; derived fields are those of fresh data."""
@@ -149,7 +156,17 @@ class Physics:
     return advance(data, self.derived)
 
   def _template(self) -> mjx.Data:
-    return mjx.make_data(self.mj_model, impl=self.impl, **self._sizes)
+    if self.impl == "jax":
+      return mjx.make_data(self.mj_model, impl="jax")
+    worlds = max(_batch_size(), _FEW)
+    shared = lambda each: None if each is None else each * worlds
+    return mjx.make_data(
+      self.mj_model,
+      impl="warp",
+      naconmax=shared(self._naconmax_per_env),
+      naccdmax=shared(self._naccdmax_per_env),
+      njmax=self._njmax,
+    )
 
   def _full(self, data: PhysicsData) -> mjx.Data:
     return self._template().replace(**{name: getattr(data, name) for name in STATE_FIELDS})
@@ -158,6 +175,13 @@ class Physics:
     derived = self.derived if derived is None else derived
     kept = {name: getattr(data, name) for name in (*STATE_FIELDS, *derived)}
     return PhysicsData(**kept, buffers=_buffer_use(data) if self.impl == "warp" else None)
+
+
+def _batch_size() -> int:
+  try:
+    return jax.lax.axis_size(WORLDS)
+  except NameError:  # no batch around
+    return 1
 
 
 def _put_on_warp(mj_model: mujoco.MjModel) -> mjx.Model:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.base import Env, State
-from playground.envs.physics import STATE_FIELDS, mjx
+from playground.envs.physics import STATE_FIELDS, WORLDS, mjx
 
 ModelFields = Mapping[str, jax.Array]
 # `info` keys that wrappers own; a fresh reset of a task never touches them.
@@ -52,12 +52,14 @@ class Vectorize(Wrapper):
   def __init__(self, env: Env):
     super().__init__(env)
     self._reset_one, self._step_one = env.jitted
+    # On MJX's own backend nothing depends on the batch's size, and one trace serves all sizes.
+    self._axis = WORLDS if env.impl == "warp" else None
 
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
-    return jax.vmap(self._reset_one)(rng, dict(model or {}))
+    return jax.vmap(self._reset_one, axis_name=self._axis)(rng, dict(model or {}))
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    return jax.vmap(self._step_one)(state, action, dict(model or {}))
+    return jax.vmap(self._step_one, axis_name=self._axis)(state, action, dict(model or {}))
 
 
 class FiniteGuard(Wrapper):

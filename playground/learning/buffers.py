@@ -27,12 +27,9 @@ class BufferSizes:
   constraints: int
   contacts: float
 
-  def advised(self, num_envs: int) -> dict[str, int]:
-    """`njmax` and `naconmax` for `num_envs` environments on one device, with some room."""
-    return {
-      "njmax": _round_up(self.constraints * ROOM, 4),
-      "naconmax": _round_up(self.contacts * num_envs * ROOM, 1024),
-    }
+  def advised(self) -> dict[str, int]:
+    """`njmax` and `naconmax_per_env`, with some room."""
+    return {"njmax": _round_up(self.constraints * ROOM, 4), "naconmax_per_env": _round_up(self.contacts * ROOM, 1)}
 
 
 def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_steps: int, seed: int = 0) -> BufferSizes:
@@ -51,7 +48,7 @@ def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_step
   configured: int | None = config.njmax  # pyright: ignore[reportAssignmentType]
   rows, pairs = max(configured or 0, 32), 32
   for _ in range(_TRIES):
-    sizes = {"impl": "warp", "njmax": rows, "naconmax": pairs * num_envs, "naccdmax": None}
+    sizes = {"impl": "warp", "njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": None}
     env = registry.build(ConfigDict(config.to_dict() | sizes))
     use = _roll(env, act, num_envs, num_steps, seed)
     if not use.overflow:
@@ -64,7 +61,7 @@ def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_step
     if not grew:
       break
   bits = _overflow_names(int(use.overflow))
-  raise ConfigError(f"env.impl=warp: buffers overflowed that njmax={rows} and naconmax do not bound ({bits}).")
+  raise ConfigError(f"env.impl=warp: buffers overflowed that njmax={rows} and naconmax_per_env do not bound ({bits}).")
 
 
 def _roll(env: Env, act: Act | None, num_envs: int, num_steps: int, seed: int) -> BufferUse:

@@ -5,6 +5,7 @@ Names, meaning and defaults of the hyperparameters are Brax's (paper, Appendix E
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -21,7 +22,7 @@ from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
 from playground.learning.cnn import random_shift
 from playground.learning.learner import SPEC, Learner, Metrics, TrainState, check_divisible, from_config
-from playground.learning.losses import Batch, ppo_loss
+from playground.learning.losses import LOSSES, Batch, ppo_loss
 from playground.learning.networks import ActorCritic, ActorCriticParams, NetworkConfig, Normalizer, normalize
 from playground.learning.rollout import NonfiniteCapture, repeat_unroll, unroll
 
@@ -114,7 +115,7 @@ class PPO(Learner):
     env_state = self._fresh(env_key, model)
     return TrainState(
       params=params,
-      opt_state=self.optimizer.init(params),
+      opt_state=self.optimizer.init(ravel_pytree(params)[0]),
       normalizer=self.networks.init_normalizer(),
       key=key,
       env_state=env_state,
@@ -143,18 +144,23 @@ class PPO(Learner):
     if config.bootstrap_on_timeout or config.clipping_epsilon_value is not None:
       batch = self._with_values(batch, state.params, normalize(data.obs, state.normalizer))
 
-    # Learn: several passes, each over its own shuffle of the trajectories.
-    def one_pass(carry: tuple[Any, Any], key: jax.Array) -> tuple[Any, Metrics]:
+    # Learn: several passes, each over its own shuffle of the trajectories. Parameters, Adam's moments and the log are a
+    # vector each: of their forty arrays each would cost a kernel or two in every step.
+    flat, unravel = ravel_pytree(state.params)
+
+    def one_pass(carry: tuple[jax.Array, Any], key: jax.Array) -> tuple[Any, jax.Array]:
       shuffle_key, loss_key = jax.random.split(key)
       columns = jax.random.permutation(shuffle_key, batch.reward.shape[1]).reshape(config.num_minibatches, -1)
       keys = jax.random.split(loss_key, config.num_minibatches)
-      return jax.lax.scan(partial(self._sgd_step, batch), carry, (columns, keys))
+      return jax.lax.scan(partial(self._sgd_step, batch, unravel), carry, (columns, keys))
 
-    start = (state.params, state.opt_state)
     passes = jax.random.split(update_key, config.num_updates_per_batch)
-    (params, opt_state), losses = jax.lax.scan(one_pass, start, passes)
+    (flat, opt_state), log = jax.lax.scan(one_pass, (flat, state.opt_state), passes)
+    params = unravel(flat)
 
-    metrics = jax.tree.map(lambda x: jax.lax.pmean(x.mean(), AXIS), losses) | jax.lax.psum(episodes, AXIS)
+    names = (*LOSSES, "grad_norm", "nonfinite_updates")
+    means = dict(zip(names, jax.lax.pmean(log.mean((0, 1)), AXIS), strict=True))
+    metrics = means | jax.lax.psum(episodes, AXIS)
     metrics["nonfinite_updates"] *= config.num_updates_per_batch * config.num_minibatches
     metrics["learned"] = jnp.ones(())
     if vectors := jax.tree.leaves(self.networks.vectors(obs)):
@@ -171,9 +177,15 @@ class PPO(Learner):
     )
     return after, metrics
 
-  def _sgd_step(self, batch: Batch, carry: tuple[Any, Any], x: tuple[jax.Array, jax.Array]) -> tuple[Any, Metrics]:
-    """One gradient step on the trajectories in `columns`."""
-    params, opt_state = carry
+  def _sgd_step(
+    self,
+    batch: Batch,
+    unravel: Callable[[jax.Array], Any],
+    carry: tuple[jax.Array, Any],
+    x: tuple[jax.Array, jax.Array],
+  ) -> tuple[Any, jax.Array]:
+    """One gradient step on the trajectories in `columns`; returns `LOSSES`, the gradient's norm and if it was bad."""
+    flat, opt_state = carry
     columns, key = x
     last_obs = jax.tree.map(lambda x: x[columns], batch.last_obs)
     minibatch = jax.tree.map(lambda x: x[:, columns], batch.replace(last_obs=None)).replace(last_obs=last_obs)
@@ -182,15 +194,15 @@ class PPO(Learner):
       shifts = jax.random.randint(shift_key, (len(columns), 2), 0, 2 * pad + 1)
       shift = lambda obs: random_shift(obs, shifts, pad)
       minibatch = minibatch.replace(obs=shift(minibatch.obs), last_obs=shift(minibatch.last_obs))
-    (_, parts), grads = jax.value_and_grad(self.loss, has_aux=True)(params, minibatch, key)
-    grads = jax.lax.pmean(grads, AXIS)
-    norm = jnp.linalg.norm(ravel_pytree(grads)[0])  # as one vector: a reduction for each array costs 3 % of a run
-    updates, new_opt_state = self.optimizer.update(grads, opt_state, params)
-    new = (optax.apply_updates(params, updates), new_opt_state)
+    (_, parts), grads = jax.value_and_grad(self.loss, has_aux=True)(unravel(flat), minibatch, key)
+    grads = jax.lax.pmean(ravel_pytree(grads)[0], AXIS)
+    norm = jnp.linalg.norm(grads)
+    updates, new_opt_state = self.optimizer.update(grads, opt_state, flat)
     finite = jnp.isfinite(norm)  # a bad gradient is counted and left out
-    carry = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, (params, opt_state))
-    parts = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), parts)
-    return carry, parts | {"grad_norm": jnp.where(finite, norm, 0.0), "nonfinite_updates": 1.0 - finite}
+    new = (optax.apply_updates(flat, updates), new_opt_state)
+    carry = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, carry)
+    log = jnp.stack([*(parts[name] for name in LOSSES), norm])
+    return carry, jnp.append(jnp.where(finite, log, 0.0), 1.0 - finite)
 
   def _with_values(self, batch: Batch, params: ActorCriticParams, obs: dict[str, jax.Array]) -> Batch:
     """Adds the critic's values at acting time, and pays time-outs with them if they are to be bootstrapped."""

@@ -1,10 +1,11 @@
 """Warp's buffers: what a task needs of them, and that a run says when they are too small."""
 
+import jax
 import jax.numpy as jnp
 import pytest
 
 from playground import registry
-from playground.envs.physics import BufferUse
+from playground.envs.physics import BufferUse, mjx
 from playground.envs.wrappers import wrap_for_evaluation
 from playground.errors import ConfigError
 from playground.learning import buffers
@@ -24,11 +25,22 @@ def test_joining_keeps_the_most_and_every_overflow():
   assert joined.overflow.tolist() == [5, 0]
 
 
-def test_advice_has_room_and_grows_with_the_environments():
-  sizes = BufferSizes(constraints=28, contacts=4.0)
-  assert sizes.advised(8192) == {"njmax": 36, "naconmax": 40960}
-  assert sizes.advised(16384)["naconmax"] == 2 * 40960
-  assert BufferSizes(0, 0.0).advised(1024) == {"njmax": 0, "naconmax": 0}
+def test_advice_has_room():
+  assert BufferSizes(constraints=28, contacts=4.1).advised() == {"njmax": 36, "naconmax_per_env": 6}
+  assert BufferSizes(0, 0.0).advised() == {"njmax": 0, "naconmax_per_env": 0}
+
+
+def test_shared_buffers_grow_with_the_batch(monkeypatch):
+  pytest.importorskip("warp")
+  allocated = []
+  make = mjx.make_data
+  remember = lambda *args, **sizes: allocated.append(sizes["naconmax"]) or make(*args, **sizes)
+  monkeypatch.setattr(mjx, "make_data", remember)
+  env = registry.load("Go1JoystickFlatTerrain", overrides={"impl": "warp", "naconmax_per_env": 5})
+  reset = wrap_for_evaluation(env).reset
+  for num_envs in (2, 8192, 32768):
+    jax.eval_shape(reset, jax.ShapeDtypeStruct((num_envs, 2), jnp.uint32), {})
+  assert sorted(set(allocated)) == [320, 40960, 163840]  # few environments get those of 64
 
 
 @pytest.fixture
@@ -38,8 +50,8 @@ def simulated(monkeypatch):
 
   def simulate(rows: int, pairs: int, stubborn: int = 0):
     def roll(env, act, num_envs, num_steps, seed):
-      tried.append((env.njmax, env.naconmax))
-      overflow = stubborn | (rows > env.njmax) * 1 | (pairs > env.naconmax) * 8
+      tried.append((env.njmax, env.naconmax_per_env * num_envs))
+      overflow = stubborn | (rows > env.njmax) * 1 | (pairs > env.naconmax_per_env * num_envs) * 8
       return use(rows, pairs, overflow)
 
     monkeypatch.setattr(buffers, "_roll", roll)
@@ -66,8 +78,6 @@ def test_other_buffers_are_named(simulated):
 
 
 def test_overflows_are_counted_for_training():
-  import jax
-
   state = wrap_for_evaluation(PointTask()).reset(jax.random.split(jax.random.PRNGKey(0), 3), None)
   assert "overflows" not in episode_sums(state)
   state = state.replace(data=state.data.replace(buffers=use([1, 1, 1], [1, 1, 1], [0, 4, 1])))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from playground.benchmark.measures.subject import ONE_DEVICE, Subject, alone, num_updates, rate
 from playground.benchmark.worker import Facts
 from playground.envs.base import PIXELS
+from playground.envs.physics import WORLDS
 from playground.envs.wrappers import Vectorize, wrap_for_training
 from playground.learning.ppo import PPO
 from playground.learning.rollout import unroll
@@ -124,7 +125,7 @@ def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, An
     first = jax.jit(blind.reset)(jax.random.split(subject.key(0), num_envs), subject.model)
     seeing = {"episodes": (scan(by_chance(blind)), first, repeat), "pixels": seeing["episodes"]}
   rolls: dict[str, tuple[Run, Any, int]] = {
-    "physics": (scan(lambda data, model, key: jax.vmap(advance)(data, dict(model))), stepped.data, 1),
+    "physics": (scan(lambda data, model, key: jax.vmap(advance, axis_name=WORLDS)(data, dict(model))), stepped.data, 1),
     "task": (scan(by_chance(bare)), stepped, 1),
     **seeing,
     "inference": (scan(act), (state.env_state, policy), repeat),
