@@ -156,7 +156,7 @@ class Runner:
     self._sweep.stop_file.touch()
 
   def _at_work(self, job: Job) -> bool:
-    return self._states[job.name].status in ("running", "submitted") and (
+    return self._states[job.name].status != "finished" and (
       self._launcher.busy(job) or self._sweep.folder(job).locked()
     )
 

@@ -4,15 +4,20 @@ What Slurm preempts, or ends at its time limit, is asked to save, queued again, 
 """
 
 import dataclasses
+import math
+import os
 import shutil
+import signal
 import socket
+import subprocess
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from playground.config import Section
 from playground.errors import ConfigError, HardwareError
-from playground.sweep.folder import ENDED, Job, JobFolder, SweepDirectory
+from playground.sweep.folder import ENDED, STOP_FILE, Job, JobFolder, SweepDirectory
 from playground.sweep.worker import COMMAND, Worker
 
 try:
@@ -21,6 +26,7 @@ except ImportError:
   raise ConfigError('launcher=slurm needs submitit: pip install "playground-run[slurm]".') from None
 
 SETTLED = tuple(status for status in ENDED if status not in ("preempted", "killed"))  # those Slurm may start again
+QUEUE_S = 5.0  # how often Slurm is asked
 
 
 @dataclasses.dataclass
@@ -31,15 +37,49 @@ class SlurmJob:
   command: tuple[str, ...]
   timeout: float | None
   grace: float
+  _worker = None  # no field: it is not pickled
 
   def __call__(self) -> int:
     self._worker = Worker(self.folder, self.command, self.timeout, self.grace)
-    return self._worker.run(where=socket.gethostname())
+    code = self._worker.run(where=socket.gethostname())
+    if self._taken():
+      signal.raise_signal(signal.SIGUSR2)  # submitit's: Slurm queues nothing again that left before it was killed
+    return code
 
   def checkpoint(self) -> Any:
     """Called by submitit in the middle of `__call__`, on preemption and shortly before the time limit."""
-    self._worker.interrupt("Slurm wants its place; it is queued again")
+    if self._worker is not None:
+      self._worker.interrupt("Slurm wants its place; it is queued again")
     return submitit.helpers.DelayedSubmission(dataclasses.replace(self))
+
+  def _taken(self) -> bool:
+    """Whether the job itself heard that Slurm wants its place, and nobody cancelled it."""
+    if JobFolder(self.folder).state().status != "preempted" or (self.folder.parents[1] / STOP_FILE).exists():
+      return False
+    job_id = os.environ.get("SLURM_JOB_ID")
+    return job_id is not None and Queue().state(job_id) == "RUNNING"
+
+
+class Queue:
+  """The user's jobs in Slurm's queue, by squeue: it answers on every cluster, sacct on those that keep accounts."""
+
+  def __init__(self) -> None:
+    self._states: dict[str, str] | None = {}
+    self.forget()
+
+  def forget(self) -> None:
+    """What was seen is out of date."""
+    self._asked = -math.inf
+
+  def state(self, job_id: str) -> str | None:
+    """A job's state in Slurm's words, None if it has left; at most `QUEUE_S` old, UNKNOWN if Slurm does not answer."""
+    if time.monotonic() - self._asked > QUEUE_S:
+      command = ["squeue", "--me", "--all", "--noheader", "--format=%i %T"]
+      told = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+      lines = [line.split(maxsplit=1) for line in told.stdout.splitlines()]
+      self._states = dict(lines) if told.returncode == 0 else None
+      self._asked = time.monotonic()
+    return "UNKNOWN" if self._states is None else self._states.get(job_id)
 
 
 class SlurmLauncher:
@@ -57,10 +97,16 @@ class SlurmLauncher:
       executor: of submitit; Slurm's if not given.
 
     Raises:
+      ConfigError: settings that do not go together.
       HardwareError: no Slurm here.
     """
     if not config.wait and config.max_parallel is not None:
       raise ConfigError("launcher.wait=false submits all jobs at once: leave launcher.max_parallel out.")
+    if config.minutes * 60 <= _notice_s(config):
+      raise ConfigError(
+        f"launcher.minutes={config.minutes} leaves no time to train: jobs are asked to save {_notice_s(config)} s "
+        "(launcher.grace + 30) before it is over."
+      )
     if executor is None and shutil.which("sbatch") is None:
       raise HardwareError("launcher=slurm, but there is no sbatch here: start it on a machine of the cluster.")
     self._folder = sweep.path.absolute() / "slurm"
@@ -68,6 +114,7 @@ class SlurmLauncher:
     self._sweep = sweep
     self._config = config
     self._command = tuple(command)
+    self._queue = Queue()
     self.submitted: dict[str, Any] = {}
 
   def check(self, jobs: Sequence[Job]) -> None:
@@ -85,6 +132,7 @@ class SlurmLauncher:
     submitted = self._executor.submit(task)
     (folder.path / "slurm_id").write_text(submitted.job_id)
     self.submitted[job.name] = submitted
+    self._queue.forget()
     return True
 
   def busy(self, job: Job) -> bool:
@@ -92,7 +140,9 @@ class SlurmLauncher:
     submitted = self._submitted(job, folder)
     if submitted is None or folder.state().status in SETTLED:
       return False
-    return not submitted.done()
+    if not isinstance(submitted, submitit.SlurmJob):
+      return not submitted.done()
+    return self._queue.state(submitted.job_id) is not None  # whatever it returned: Slurm may have queued it again
 
   def kill(self) -> None:
     for job in self._sweep.jobs:
@@ -120,9 +170,14 @@ def slurm_parameters(config: Section, job: Job) -> dict[str, Any]:
     "mem": f"{config.memory_gb}GB",
     "nodes": 1,
     "ntasks_per_node": 1,
-    "signal_delay_s": int(config.grace) + 30,  # what saving may take, before Slurm's limit
+    "signal_delay_s": _notice_s(config),
     "setup": list(config.setup),
     "additional_parameters": dict(config.parameters),
   }
   named = {key: config[key] for key in ("partition", "account", "qos", "constraint")}
   return parameters | {key: value for key, value in named.items() if value} | ({"gpus_per_node": gpus} if gpus else {})
+
+
+def _notice_s(config: Section) -> int:
+  """How long before its time limit a job is asked to save."""
+  return int(config.grace) + 30

@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +89,8 @@ class Worker:
   ) -> "subprocess.Popen[bytes]":
     path = quoted(self._folder.path)
     args = [f"resume={path}"] if self._folder.begun else [*overrides, f"run_dir={path}"]
-    with self._folder.log.open("ab") as log:
+    # Some Slurms send submitit's signal to all processes of a job; one that does not know it dies of it.
+    with self._folder.log.open("ab") as log, _blocked(signal.SIGUSR2):
       log.write(f"--- start {attempt}, {now()}, {socket.gethostname()}: {' '.join(args)}\n".encode())
       log.flush()
       return subprocess.Popen(
@@ -161,6 +162,16 @@ def main(argv: Sequence[str] | None = None) -> int:
   worker = Worker(args.folder, argv[cut + 1 :] or COMMAND, args.timeout, args.grace)
   with on_signals(lambda *_: worker.stop()):
     return worker.run(args.where, slots=args.slots)
+
+
+@contextlib.contextmanager
+def _blocked(signum: int) -> Iterator[None]:
+  """What is started meanwhile never hears the signal; this process hears it when the block ends."""
+  before = signal.pthread_sigmask(signal.SIG_BLOCK, {signum})
+  try:
+    yield
+  finally:
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _signal(child: "subprocess.Popen[bytes]", signum: int, group: bool) -> None:

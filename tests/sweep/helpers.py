@@ -1,8 +1,10 @@
 """Sweeps of jobs that train nothing (`stub.py`)."""
 
 import json
+import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,12 @@ from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.runner import run_sweep
 
 STUB = (sys.executable, str(Path(__file__).with_name("stub.py")))
+CONTROLLER = """
+import sys
+from playground.sweep.folder import SweepDirectory
+from tests.sweep.helpers import run
+sys.exit(run(SweepDirectory.open(sys.argv[1]), *sys.argv[2:]))
+"""
 
 
 def make_sweep(path: Path, *seeds: int, needs: int | None = None, **varies: Any) -> SweepDirectory:
@@ -26,6 +34,18 @@ def run(sweep: SweepDirectory, *settings: str, command: Sequence[str] = STUB) ->
   settings = ("launcher.cores_per_job=1", *settings) if not any("launcher=" in s for s in settings) else settings
   with (sweep.path / "output.txt").open("a") as out:
     return run_sweep(sweep, compose_settings(settings), command, Console(file=out, width=200))
+
+
+def controller(sweep: SweepDirectory, *settings: str) -> "subprocess.Popen[bytes]":
+  """A process that runs the sweep."""
+  return subprocess.Popen([sys.executable, "-c", CONTROLLER, str(sweep.path), *settings], cwd=Path(__file__).parents[2])
+
+
+def wait_for(what: Callable[[], bool], seconds: float = 30) -> None:
+  until = time.monotonic() + seconds
+  while not what():
+    assert time.monotonic() < until, "what the test waits for does not come"
+    time.sleep(0.05)
 
 
 def output(sweep: SweepDirectory) -> str:

@@ -27,6 +27,7 @@ def status(word: str, reason: str = "") -> None:
 
 
 def save(*_: object) -> None:
+  print("saved")
   status("preempted", "interrupted and saved")
   sys.exit(143)
 

@@ -3,10 +3,7 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -15,27 +12,7 @@ import pytest
 from playground.cli import sweep as command
 from playground.errors import CheckpointError, ConfigError
 from playground.sweep.folder import SweepDirectory
-from tests.sweep.helpers import make_sweep, output, run, starts, statuses
-
-CONTROLLER = """
-import sys
-from pathlib import Path
-from playground.sweep.folder import SweepDirectory
-from tests.sweep.helpers import run
-sys.exit(run(SweepDirectory.open(sys.argv[1]), *sys.argv[2:]))
-"""
-
-
-def controller(sweep: SweepDirectory, *settings: str) -> "subprocess.Popen[bytes]":
-  """A process that runs the sweep."""
-  return subprocess.Popen([sys.executable, "-c", CONTROLLER, str(sweep.path), *settings], cwd=Path(__file__).parents[2])
-
-
-def wait_for(what: Callable[[], bool], seconds: float = 30) -> None:
-  until = time.monotonic() + seconds
-  while not what():
-    assert time.monotonic() < until, "what the test waits for does not come"
-    time.sleep(0.05)
+from tests.sweep.helpers import controller, make_sweep, output, run, starts, statuses, wait_for
 
 
 def alive(pid: int) -> bool:

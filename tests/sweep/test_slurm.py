@@ -51,12 +51,14 @@ def test_a_preempted_job_saves_is_queued_again_and_resumes(tmp_path: Path, local
     assert time.monotonic() < until
     time.sleep(0.05)
   time.sleep(0.3)  # let it listen
-  os.kill(sweep.folder(job).record["pid"], signal.SIGUSR2)  # as Slurm does, for submitit to handle
+  for process in ("job_pid", "pid"):  # as Slurm does, for submitit to handle; some tell every process of a job
+    os.kill(sweep.folder(job).record[process], signal.SIGUSR2)
   while launcher.busy(job):
     assert time.monotonic() < until + 40, statuses(sweep)
     time.sleep(0.1)
   assert statuses(sweep) == {13: "finished"}
   assert [start["again"] for start in starts(sweep)[13]] == [False, True]
+  assert "saved" in sweep.folder(job).log.read_text()
 
 
 def test_submitting_without_waiting(tmp_path: Path, local: list[SlurmLauncher]) -> None:
@@ -82,9 +84,12 @@ def test_what_sbatch_is_told() -> None:
   assert set(told) <= set(executor._valid_parameters()), "submitit knows them all"
 
 
-def test_without_slurm(tmp_path: Path) -> None:
+def test_without_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setenv("PATH", str(tmp_path))  # some machines have one
   sweep = make_sweep(tmp_path / "sweep", 0)
   with pytest.raises(HardwareError, match="there is no sbatch here"):
     run(sweep, "launcher=slurm")
   with pytest.raises(ConfigError, match=r"leave launcher\.max_parallel out"):
     run(sweep, "launcher=slurm", "launcher.wait=false", "launcher.max_parallel=3")
+  with pytest.raises(ConfigError, match=r"launcher\.minutes=1 leaves no time to train: .* save 90 s"):
+    run(sweep, "launcher=slurm", "launcher.minutes=1")
