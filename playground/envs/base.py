@@ -22,7 +22,7 @@ class State(struct.PyTreeNode):
   Attributes:
     data: simulator state.
     obs: observation, one vector or a dict of vectors ("state" for the actor, "privileged_state" for the critic) and
-      pictures ("pixels/<camera>").
+      pictures (`pixels/<camera>`).
     reward: scalar reward of the step just taken.
     done: scalar 0/1 float, the episode ended in this step.
     metrics: scalars logged each step; the key set is the same at reset and step.

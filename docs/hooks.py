@@ -1,0 +1,140 @@
+"""Pages that `make docs` makes: the reference, from docstrings and configs/, and the notebook's."""
+
+import itertools
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import yaml
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOK = ROOT / "docs/first_policy.ipynb"
+# Pages of the API's reference: modules, and packages all of whose modules are meant.
+API = {
+  "Tasks": ["registry", "envs.base", "envs.physics", "envs.wrappers", "envs.vision"],
+  "Parts of tasks": ["mdp"],
+  "Randomisation": ["randomization"],
+  "Scenes": ["robots.scene", "robots.terrain", "robots.tabletop", "robots.in_hand"],
+  "Learning": ["learning"],
+  "Runs": ["config.run_config", "config.composition", "runs.train", "runs.trained", "runs.run_dir", "rendering.video"],
+  "Adapters": ["adapters"],
+  "Deployment": ["deploy"],
+}
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+  """Puts the generated pages into the navigation."""
+  assert config.nav is not None, "mkdocs.yml has one"
+  api = [{title: _uri("api", title)} for title in API]
+  groups = [{group or "config.yaml": _uri("configs", group or "config")} for group in _groups()]
+  config.nav.append({"Reference": [{"Python": api}, {"Configuration": groups}]})
+  return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+  """Adds the generated pages."""
+  pages = {_uri("api", title): _api_page(title, modules) for title, modules in API.items()}
+  pages |= {_uri("configs", group or "config"): _group_page(group) for group in _groups()}
+  pages["first_policy.md"] = _notebook_page()
+  for uri, content in pages.items():
+    files.append(File.generated(config, uri, content=content))
+  return files
+
+
+def _uri(folder: str, title: str) -> str:
+  return f"reference/{folder}/{title.lower().replace(' ', '-').replace('/', '-')}.md"
+
+
+def _api_page(title: str, modules: list[str]) -> str:
+  names = []
+  for module in modules:
+    folder = ROOT / "playground" / module.replace(".", "/")
+    inside = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
+    names += [f"playground.{module}.{name}" for name in inside] or [f"playground.{module}"]
+  return f"# {title}\n\n" + "\n\n".join(f"::: {name}" for name in names) + "\n"
+
+
+def _groups() -> list[str]:
+  """The configuration's groups, that of config.yaml itself ("") first, and each tuned set's agent as a group."""
+  configs = ROOT / "configs"
+  return ["", *sorted({path.parent.relative_to(configs).as_posix() for path in configs.glob("*/**/*.yaml")})]
+
+
+def _group_page(group: str) -> str:
+  """Every option of a group: the comment at its head, its keys, their values and what is said of them."""
+  parts = [f"# {f'configs/{group}' if group else 'config.yaml'}\n"]
+  shared_first = lambda path: (path.stem[0].isupper(), path.stem)
+  for path in sorted((ROOT / "configs" / group).glob("*.yaml"), key=shared_first):
+    lines = path.read_text(encoding="utf-8").splitlines()
+    head = list(itertools.takewhile(lambda line: line.startswith("#"), lines))
+    said = " ".join(line[1:].strip() for line in head if not line.startswith("# @package"))
+    parts.append(f"## {path.stem}\n\n{_text(said)}\n")
+    lines[: len(head)] = [""] * len(head)  # it belongs to no key
+    keys = list(_keys(yaml.compose("\n".join(lines)), lines))
+    bases = [base for key, value, _ in keys if key == "defaults" for base in yaml.safe_load(value) if base != "_self_"]
+    if bases:
+      parts.append("On top of " + ", ".join(_code(_flow(base)) for base in bases) + ".\n")
+    rows = [f"| {_code(key)} | {_code(value)} | {_text(said)} |" for key, value, said in keys if key != "defaults"]
+    if rows:
+      parts.append("\n".join(["| key | value | |", "|---|---|---|", *rows]) + "\n")
+  return "\n".join(parts)
+
+
+def _keys(node: yaml.Node | None, lines: list[str], prefix: str = "") -> Iterator[tuple[str, str, str]]:
+  """Dotted key, value and comments of each entry; a section has no value, and is left out if nothing is said of it."""
+  if not isinstance(node, yaml.MappingNode):
+    return
+  for key, value in node.value:
+    name = f"{prefix}{key.value}"
+    section = isinstance(value, yaml.MappingNode) and not value.flow_style
+    in_block = not section and not value.end_mark.column  # a list over several lines ends where the next key begins
+    beside = _beside(lines, key.end_mark if section or in_block else value.end_mark)
+    said = " ".join([*_above(lines, key.start_mark), *beside])
+    if section:
+      yield from [(name, "", said)] if said else []
+      yield from _keys(value, lines, f"{name}.")
+    else:
+      yield name, _flow(yaml.safe_load(yaml.serialize(value))), said
+
+
+def _above(lines: list[str], key: yaml.Mark) -> list[str]:
+  """The lines of comment directly above a key, which are indented as it is."""
+  begin = " " * key.column + "#"
+  above = list(itertools.takewhile(lambda line: line.startswith(begin), reversed(lines[: key.line])))
+  return [line[len(begin) :].strip() for line in reversed(above)]
+
+
+def _beside(lines: list[str], end: yaml.Mark) -> list[str]:
+  """The comment behind a place in a line, with the lines below that continue it."""
+  before, mark, comment = lines[end.line][end.column :].partition("#")
+  if not mark or before.strip(" :"):
+    return []
+  column = len(lines[end.line]) - len(comment) - 1
+  below = itertools.takewhile(lambda line: line[:column].isspace() and line[column] == "#", lines[end.line + 1 :])
+  return [comment.strip(), *(line[column + 1 :].strip() for line in below)]
+
+
+def _flow(value: object) -> str:
+  """A value on one line, as it could stand on a command line."""
+  text = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False).strip()
+  return text.removesuffix("...").strip()
+
+
+def _code(text: str) -> str:
+  return f"`{text}`".replace("|", "\\|") if text else ""
+
+
+def _text(comment: str) -> str:
+  """A comment in a cell: what looks like HTML or a column's end outside of `code` is neither."""
+  parts = comment.replace("|", "\\|").split("`")
+  return "`".join(part if i % 2 else part.replace("<", "&lt;") for i, part in enumerate(parts))
+
+
+def _notebook_page() -> str:
+  """The notebook's cells, without outputs, and where the notebook itself lies."""
+  cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+  texts = [(cell["cell_type"], "".join(cell["source"])) for cell in cells]
+  page = [text if kind == "markdown" else f"```python\n{text}\n```" for kind, text in texts]
+  return "\n\n".join([*page, f"The notebook: [{NOTEBOOK.name}]({NOTEBOOK.name})."]) + "\n"
