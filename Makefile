@@ -6,11 +6,14 @@ ARGS ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-# Compiling is most of what the tests do. Git ignores the folder; nothing is lost with it but time.
-TEST_ENV := JAX_COMPILATION_CACHE_DIR="$(CURDIR)/.pytest_cache/xla" WARP_CACHE_PATH="$(CURDIR)/.pytest_cache/warp"
+# Compiling is most of what the tests do. Git ignores the folders; nothing is lost with them but time. XLA is told to
+# compile fast rather than fast code; `make test-slow` tests what users run.
+CACHES := JAX_COMPILATION_CACHE_DIR="$(CURDIR)/.pytest_cache/xla" WARP_CACHE_PATH="$(CURDIR)/.pytest_cache/warp"
+FAST_COMPILE := XLA_FLAGS="--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true \
+  --xla_cpu_use_fusion_emitters=false $$XLA_FLAGS"
 
 .DEFAULT_GOAL := setup
-.PHONY: setup run test test-slow test-rsl-rl lint wheel
+.PHONY: setup run test test-slow test-rsl-rl test-slurm lint docs wheel
 
 setup: $(INSTALLED)
 
@@ -25,19 +28,30 @@ run: setup
 	$(BIN)/playground-run $(ARGS)
 
 test: setup
-	$(TEST_ENV) $(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)
+	$(CACHES) $(FAST_COMPILE) $(BIN)/python -m pytest -q -n 2 --dist worksteal $(ARGS)
 
 test-slow: setup
-	$(TEST_ENV) $(BIN)/python -m pytest -q -m slow $(ARGS)
+	$(CACHES) $(BIN)/python -m pytest -q -m slow $(ARGS)
 
 # RSL-RL brings torch, which `setup` leaves out: without it these tests are skipped.
 test-rsl-rl: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[rsl_rl]'
-	$(TEST_ENV) $(BIN)/python -m pytest -q -m '' -k rsl_rl tests/adapters tests/learning tests/runs $(ARGS)
+	$(CACHES) $(BIN)/python -m pytest -q -m '' -k rsl_rl tests/adapters tests/learning tests/runs $(ARGS)
+
+# A Slurm of one node on this machine, started and ended by the tests; without its programs they are skipped. On Debian
+# and Ubuntu: apt-get install slurmctld slurmd slurm-client munge, which `make test-slurm SUDO=sudo` (or SUDO=env) does.
+test-slurm: setup
+	$(if $(SUDO),$(SUDO) apt-get install --yes --no-install-recommends slurmctld slurmd slurm-client munge)
+	$(CACHES) $(BIN)/python -m pytest -q -m slow tests/sweep/test_slurm_cluster.py $(ARGS)
 
 lint: setup
 	$(BIN)/ruff check
 	$(BIN)/pyright
+
+# The site is site/index.html. Strict: a link or a reference that leads nowhere is an error (mkdocs.yml).
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+	@echo "docs: $(CURDIR)/site/index.html"
 
 wheel: setup
 	$(BIN)/python -m build --wheel

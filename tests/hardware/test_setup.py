@@ -79,11 +79,11 @@ def test_more_than_there_are_is_one_sentence() -> None:
 
 
 def test_training_over_two_devices_keeps_parameters_equal_and_environments_apart() -> None:
-  flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+  simulated = {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
   done = subprocess.run(
     [sys.executable, "-c", TWO_DEVICES],
     cwd=Path(__file__).parents[2],
-    env=os.environ | flags,
+    env=os.environ | simulated,
     capture_output=True,
     text=True,
     timeout=300,

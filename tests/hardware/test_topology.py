@@ -63,9 +63,9 @@ def start(
   script: str, folder: Path, *overrides: str, devices: int = 1, line: list[str] = LINE
 ) -> "subprocess.Popen[str]":
   """Starts a process that trains on simulated devices."""
-  flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", "JAX_PLATFORMS": "cpu"}
+  simulated = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu"}
   command = [sys.executable, "-c", script, *line, *overrides]
-  env = os.environ | flags | {"PYTHONPATH": str(ROOT)}
+  env = os.environ | simulated | {"PYTHONPATH": str(ROOT)}
   return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 

@@ -1,5 +1,6 @@
 """Chains of runs: what they leave behind, and that nothing that ends one early changes what comes out."""
 
+import gc
 import os
 import re
 import shutil
@@ -53,6 +54,15 @@ def point() -> Iterator[None]:
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(registry, "load", load)
     yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def collected() -> Iterator[None]:
+  """Chains collect garbage after every stage: they need not look through what the tests before have left."""
+  gc.collect()
+  gc.freeze()
+  yield
+  gc.unfreeze()
 
 
 @pytest.fixture(scope="module")
