@@ -164,6 +164,7 @@ def test_one_sentence_each(
   assert "This needs viser: pip install 'playground-run[web]'." in capsys.readouterr().err
 
 
+@pytest.mark.slow  # without a GPU the browser draws so slowly that beside other tests keys get lost
 def test_page(watch: Watch) -> None:
   with browser() as chromium, running(watch):
     page = chromium.new_page(viewport={"width": 640, "height": 480})
