@@ -16,7 +16,7 @@ from brax.training.acme import running_statistics
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from playground.envs.base import Env
+from playground.envs.base import Env, State
 from playground.envs.wrappers import ModelFields
 from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
@@ -53,6 +53,7 @@ class PPOConfig:
   normalize_advantage: bool = True
   bootstrap_on_timeout: bool = False  # a time-out pays the discounted value of its state instead of being masked out
   deterministic_eval: bool = False
+  init_at_random_ep_len: bool = False  # environments start as old as their draw says, so a batch holds all ages
   augment_pixels: int = 0  # largest random shift of a trajectory's pictures in an update, pixels
   network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
 
@@ -121,6 +122,15 @@ class PPO(Learner):
       env_state=env_state,
       capture=NonfiniteCapture.empty(env_state, self.env.action_size, model),
     )
+
+  def _fresh(self, key: jax.Array, model: ModelFields) -> State:
+    state = super()._fresh(key, model)
+    if not self.config.init_at_random_ep_len:
+      return state
+    key = jax.random.fold_in(jax.random.split(key)[0], jax.lax.axis_index(AXIS))
+    steps = state.info["steps"]
+    age = jax.random.randint(key, steps.shape, 0, self.env.episode_length).astype(steps.dtype)
+    return state.replace(info=state.info | {"steps": age})
 
   def _training_step(self, state: TrainState, model: ModelFields) -> tuple[TrainState, Metrics]:
     config = self.config
