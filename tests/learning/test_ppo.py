@@ -53,3 +53,17 @@ def test_an_observation_entry_that_is_not_there_is_named() -> None:
   config = dataclasses.replace(SMALL_PPO, network=NetworkConfig(value_obs_key="priviledged_state"))
   with pytest.raises(ConfigError, match=r"agent.network.value_obs_key='priviledged_state'.*Did you mean 'privileged"):
     point_learner(config)
+
+
+def test_environments_can_start_at_all_ages() -> None:
+  state = lambda learner: learner.init(jax.random.PRNGKey(0), {}).env_state
+  same_age, mixed = (
+    state(point_learner(dataclasses.replace(SMALL_PPO, init_at_random_ep_len=mix), num_devices=2))
+    for mix in (False, True)
+  )
+  np.testing.assert_array_equal(same_age.info["steps"], 0)
+  ages = np.asarray(mixed.info["steps"])
+  assert ages.min() >= 0 and ages.max() < 20, "an episode is 20 steps"
+  assert len(set(ages)) > 4
+  assert set(ages[: len(ages) // 2]) != set(ages[len(ages) // 2 :]), "each device draws its own"
+  np.testing.assert_array_equal(same_age.obs["state"], mixed.obs["state"])
