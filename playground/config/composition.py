@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -262,7 +263,7 @@ def _check_path(key: str, value: Any) -> None:
   """What `resume` and `init_from` name must be there."""
   path = Path(str(value))
   wanted, what = (path / "config.yaml", "run directory") if key == "resume" else (path, "run directory or checkpoint")
-  if not wanted.exists():
+  if not os.path.lexists(wanted):  # a link that points to nothing is for `find_checkpoints` to name
     siblings = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
     raise ConfigError(f"{key}={value} is no {what}: {wanted} does not exist.{nearest(path.name, siblings)}")
 

@@ -1,12 +1,17 @@
 """Checkpoints: the whole training state, written atomically by Orbax and verified when read.
 
 A checkpoint has three items: `policy` (normaliser and networks: what evaluation, export and `init_from` need), `state`
-(the rest of what training goes on from) and `meta` (step, task, config, the name and shape of every array, a checksum).
-The newest may have a fourth, `replay`: experience, which is too large to keep more than once.
+(the rest of what training goes on from) and `meta` (step, return, task, config, name and shape of every array, a
+checksum). The newest may have a fourth, `replay`: experience, which is too large to keep more than once.
+
+Beside the newest, a run keeps the checkpoint with the highest return; `checkpoints/best` is a link to it.
 """
 
+import errno
 import hashlib
 import logging
+import math
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,6 +25,9 @@ import orbax.checkpoint as ocp
 from playground.errors import CheckpointError
 
 FORMAT = "playground-run/1"
+BEST = "best"
+_NO_BEST = (-math.inf, -1)  # return and step
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)  # what file systems say that have none
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax warns of its own defaults at every save and read
 Arrays = list[np.ndarray]
 Fetch = Callable[[], np.ndarray | None]
@@ -33,28 +41,39 @@ class CheckpointStore:
 
     Args:
       folder: where to.
-      keep: how many are kept, the newest.
+      keep: how many are kept, the newest; the one with the highest return (of several, the newest) is kept besides.
       continued: the step that the run goes on from. Checkpoints after it are removed: they were found damaged, and the
         run is about to make them again.
     """
-    if continued is not None:
-      for path in Path(folder).glob("*"):
-        if path.name.isdigit() and int(path.name) > continued:
-          shutil.rmtree(path)
-    Path(folder).mkdir(parents=True, exist_ok=True)  # Orbax does not where it is told to work alone
+    self._folder, self._keep = Path(folder).absolute(), keep
+    self._folder.mkdir(parents=True, exist_ok=True)  # Orbax does not where it is told to work alone
+    there = _by_step(self._folder)
+    gone = {step for step in there if continued is not None and step > continued}
+    returns = {step: _return_of(path) for step, path in there.items() if step not in gone}
+    self._best = max(((value, step) for step, value in returns.items() if value is not None), default=_NO_BEST)
+    self._link_best()  # before others are removed: what it points to is always whole
+    for step in gone:
+      shutil.rmtree(there[step])
     options = ocp.CheckpointManagerOptions(
       create=False,
-      max_to_keep=keep,
       step_format_fixed_length=12,
       enable_async_checkpointing=False,
       cleanup_tmp_directories=True,
       multiprocessing_options=_alone(),
     )
-    self._manager = ocp.CheckpointManager(Path(folder).absolute(), options=options)
+    self._manager = ocp.CheckpointManager(self._folder, options=options)
     self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
     self._pending: Future[None] | None = None
 
-  def save(self, step: int, policy: Any, state: Any, meta: Mapping[str, Any], replay: Fetch | None = None) -> None:
+  def save(
+    self,
+    step: int,
+    policy: Any,
+    state: Any,
+    meta: Mapping[str, Any],
+    replay: Fetch | None = None,
+    episode_return: float | None = None,
+  ) -> None:
     """Starts saving. The trees' arrays must not be donated or deleted meanwhile; an earlier failure is raised here.
 
     Args:
@@ -63,9 +82,11 @@ class CheckpointStore:
       state: so too.
       meta: what else to note.
       replay: fetches that item, if there is one, on the saving thread. Older checkpoints lose theirs.
+      episode_return: the policy's, if it has been evaluated; one that is not finite counts as none.
     """
     self.wait()
-    self._pending = self._thread.submit(self._write, step, policy, state, dict(meta), replay)
+    noted = episode_return if episode_return is not None and math.isfinite(episode_return) else None
+    self._pending = self._thread.submit(self._write, step, policy, state, {**meta, "return": noted}, replay)
 
   def wait(self) -> None:
     """Returns when what was saved lies on disk; raises what went wrong with it."""
@@ -91,9 +112,33 @@ class CheckpointStore:
     }
     items = {name: ocp.args.StandardSave(_numbered(values)) for name, values in arrays.items()}  # pyright: ignore[reportCallIssue]
     self._manager.save(step, args=ocp.args.Composite(**items, meta=ocp.args.JsonSave(meta)), force=True)  # pyright: ignore[reportCallIssue]
-    for path in Path(self._manager.directory).glob("*/replay"):
-      if path.parent.name.isdigit() and int(path.parent.name) != step:
-        shutil.rmtree(path)
+    if meta["return"] is not None:
+      self._best = max(self._best, (meta["return"], step))
+    # Orbax's own policies would remove the old best before the link has gone over to the new one.
+    self._link_best()
+    for old in sorted(self._manager.all_steps())[: -self._keep]:
+      if old != self._best[1]:
+        self._manager.delete(old)
+    for other, path in _by_step(self._folder).items():
+      if other != step and (path / "replay").is_dir():
+        shutil.rmtree(path / "replay")
+
+  def _link_best(self) -> None:
+    """Lets `best` point to the best checkpoint, in one go; without one, or without links, there is no `best`."""
+    link, temporary = self._folder / BEST, self._folder / f".{BEST}"
+    temporary.unlink(missing_ok=True)  # which a run killed on the next lines has left
+    if link.is_dir() and not link.is_symlink():
+      shutil.rmtree(link)  # the checkpoint once more: the run was copied by something that follows links
+    if self._best == _NO_BEST:
+      link.unlink(missing_ok=True)
+      return
+    try:
+      temporary.symlink_to(f"{self._best[1]:012d}")
+    except OSError as error:
+      if error.errno not in _NO_LINKS:
+        raise
+      return
+    os.replace(temporary, link)
 
 
 class Checkpoint:
@@ -161,12 +206,14 @@ class Checkpoint:
 def find_checkpoints(path: str | Path) -> list[Path]:
   """The checkpoints at `path`, newest first: those of a run directory, or the one that `path` itself is.
 
-  Of a chain's directory they are those of the last stage that has any.
+  Of a chain's directory they are those of the last stage that has any; of `checkpoints/best` the one it links to.
 
   Raises:
     CheckpointError: there is none.
   """
   path = Path(path).expanduser()
+  if path.name == BEST and path.parent.name == "checkpoints" and path.parent.is_dir():
+    return [_linked(path)]
   if not path.exists():
     raise CheckpointError(f"{path} does not exist: give a run directory or one of its checkpoints.")
   if path.name.isdigit() and path.parent.name == "checkpoints":
@@ -176,10 +223,35 @@ def find_checkpoints(path: str | Path) -> list[Path]:
     number = lambda folder: folder.parent.name.partition("_")[0]
     stages = [p for p in path.glob("*_*/checkpoints/") if number(p).isdigit() and any(p.iterdir())]
     folder = max(stages, key=lambda p: int(number(p)), default=folder)
-  found = sorted((p for p in folder.glob("*") if p.name.isdigit() and p.is_dir()), key=lambda p: int(p.name))
+  found = _by_step(folder)
   if not found:
     raise CheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
-  return found[::-1]
+  return [found[step] for step in sorted(found, reverse=True)]
+
+
+def _by_step(folder: Path) -> dict[int, Path]:
+  """The checkpoints in a folder, by what their names say."""
+  return {int(path.name): path for path in folder.glob("*") if path.name.isdigit() and path.is_dir()}
+
+
+def _linked(best: Path) -> Path:
+  """The checkpoint that a link points to; raises CheckpointError if there is none."""
+  if not best.is_symlink():
+    raise CheckpointError(
+      f"{best} is no link to a checkpoint: the run has not saved one with a return, or was copied without its links."
+    )
+  path = best.parent / best.readlink()
+  if not path.is_dir():
+    raise CheckpointError(f"{best} points to {path.name}, which is not there.")
+  return path
+
+
+def _return_of(folder: Path) -> float | None:
+  """The return that a checkpoint notes; one that is damaged has none."""
+  try:
+    return Checkpoint(folder).meta.get("return")
+  except CheckpointError:
+    return None
 
 
 def describe(tree: Any) -> list[list[Any]]:

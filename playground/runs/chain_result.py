@@ -7,7 +7,8 @@ from playground.runs.files import write_text
 from playground.runs.plots import plot_learning_curve
 from playground.runs.run_dir import RunDirectory
 
-_OF_A_RUN = ("env", "final_return", "best_return", "steps", "steps_per_second", "wall_clock_s", "params_sha256")
+_RESULT = ("env", "final_return", "best_return", "best_step", "params_sha256")
+_OF_A_RUN = (*_RESULT, "steps", "steps_per_second", "wall_clock_s")
 
 
 def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
@@ -30,8 +31,8 @@ def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
   chain.write_summary(
     {
       "status": status,
-      # Stages need not be paid the same way, so these are of the last one.
-      **{key: last.get(key) for key in ("env", "final_return", "best_return", "params_sha256")},
+      # Stages need not be paid the same way, so these are of the last one, and so is the step counted.
+      **{key: last.get(key) for key in _RESULT},
       "steps": steps,
       "steps_per_second": steps / seconds if seconds else None,
       "wall_clock_s": sum(stage["wall_clock_s"] for stage in begun),

@@ -68,6 +68,7 @@ class Job:
     self._process_began_s = start.began_s
     self._evaluations = 0
     self._step = start.step or 0
+    self._return: float | None = None  # of the newest row
     self._recording: Any = None
     self._rates: list[float] = []  # steps per second, by row
     self._start_to_first_update_s: float | None = None
@@ -88,7 +89,7 @@ class Job:
     self._progress.update(step, metrics.get("time/steps_per_second"), score)
     taken = step - self._step
     self._time(taken, metrics)
-    self._step, self._recording = step, recording
+    self._step, self._return, self._recording = step, score, recording
     if score is not None:
       self._evaluations += 1
       every = self._config.video.every_evals
@@ -106,7 +107,8 @@ class Job:
       "wall_clock_s": self.wall_clock_s,
       "config": self._config.resolved,
     }
-    self._store.save(step, policy, rest, meta, None if final else partial(self._learner.experience, state))
+    experience = None if final else partial(self._learner.experience, state)
+    self._store.save(step, policy, rest, meta, experience, self._return)
 
   def should_stop(self) -> bool:
     return self._interrupts.signum is not None
@@ -160,13 +162,17 @@ class Job:
 
     table = pd.read_csv(self._run_dir.metrics_csv)
     column = lambda name: np.asarray(table[name] if name in table else np.full(len(table), np.nan), float)
-    returns, rate = column("eval/episode_reward"), column("time/steps_per_second")
-    returns, trained = returns[np.isfinite(returns)], np.isfinite(rate)
-    taken = np.diff(column("step"), prepend=0)[trained]
+    steps, returns, rate = (column(name) for name in ("step", "eval/episode_reward", "time/steps_per_second"))
+    scores = [(value, int(step)) for value, step in zip(returns.tolist(), steps, strict=True) if np.isfinite(value)]
+    # As `checkpoints/best` has it: of several the last, and never the untrained policy, which is not saved.
+    best_return, best_step = max((score for score in scores if score[1] > 0), default=(None, None))
+    trained = np.isfinite(rate)
+    taken = np.diff(steps, prepend=0)[trained]
     seconds = float((taken / rate[trained]).sum())
     return {
-      "final_return": float(returns[-1]) if len(returns) else None,
-      "best_return": float(returns.max()) if len(returns) else None,
+      "final_return": scores[-1][0] if scores else None,
+      "best_return": best_return,
+      "best_step": best_step,
       "steps": self._step,
       "steps_per_second": float(taken.sum()) / seconds if seconds else None,
     }

@@ -14,6 +14,7 @@ from playground.hardware.mesh import divide
 from playground.hardware.scaling import describe_division, scale_envs
 from playground.hardware.setup import setup
 from playground.learning.algorithms import algorithm
+from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
 from playground.learning.learner import Learner
 from playground.learning.loop import Loop, compile_program, schedule
@@ -136,7 +137,9 @@ def _say_where(run_dir: RunDirectory) -> None:
   """The last lines of a run: what lies where."""
   summary = run_dir.summary
   print(f"{summary['status']}: return {summary['final_return']}, {summary['steps']:,} steps")
-  places = {"metrics": run_dir.metrics_csv, "plots": run_dir.plots, "checkpoints": run_dir.checkpoints}
+  places: dict[str, Any] = {"metrics": run_dir.metrics_csv, "plots": run_dir.plots, "checkpoints": run_dir.checkpoints}
+  if (best := run_dir.checkpoints / BEST).is_dir():
+    places["best"] = f"{best} (return {summary['best_return']} after {summary['best_step']:,} steps)"
   for name, path in places.items():
     print(f"  {name:12}{path}")
   videos = sorted(run_dir.videos.glob("*.mp4"))

@@ -1,17 +1,23 @@
 """Checkpoints: what is stored comes back bit for bit, and what is not whole, not ours or does not fit is refused."""
 
+import errno
 import json
+import math
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 
 from playground.errors import CheckpointError
+from playground.learning import checkpoints
 from playground.learning.checkpoints import Checkpoint, CheckpointStore, find_checkpoints
 
 POLICY = {"w": jnp.linspace(-1, 1, 3000).reshape(50, 60), "count": jnp.asarray(7, jnp.int32)}
@@ -28,13 +34,20 @@ STATE = {
 }
 
 
-def save(folder: Path, *steps: int, keep: int = 3, **kwargs: Any) -> list[Path]:
-  """Saves the trees at these steps into folder/checkpoints; returns what lies there, newest first."""
+def save(
+  folder: Path, *steps: int, keep: int = 3, returns: dict[int, float] | None = None, **kwargs: Any
+) -> list[Path]:
+  """Saves the trees at these steps, and those with a return, into folder/checkpoints; what lies there, newest first."""
   store = CheckpointStore(folder / "checkpoints", keep, **kwargs)
-  for step in steps:
-    store.save(step, POLICY, STATE, {"update": step // 10})
+  returns = returns or {}
+  for step in sorted({*steps, *returns}):
+    store.save(step, POLICY, STATE, {"update": step // 10}, episode_return=returns.get(step))
   store.close()
   return find_checkpoints(folder)
+
+
+def numbers(paths: list[Path]) -> list[int]:
+  return [int(path.name) for path in paths]
 
 
 def like(tree: Any) -> Any:
@@ -79,6 +92,108 @@ def test_a_run_that_fell_back_makes_the_later_ones_again(tmp_path: Path) -> None
   paths = save(tmp_path, 20, continued=10)
   assert [p.name for p in paths] == ["000000000020", "000000000010"]
   Checkpoint(paths[0]).restore("state", like(STATE))
+
+
+# The best
+
+
+def test_the_best_is_kept_besides_the_newest(tmp_path: Path) -> None:
+  best = tmp_path / "checkpoints" / "best"
+  assert numbers(save(tmp_path, 50, keep=1, returns={10: -3.0, 20: -1.0, 30: math.nan, 40: -2.0})) == [50, 20]
+  assert os.readlink(best) == "000000000020", "relative: it goes where the run goes"
+  assert find_checkpoints(best) == find_checkpoints(str(best)) == [tmp_path / "checkpoints" / "000000000020"]
+  assert Checkpoint(find_checkpoints(best)[0]).meta["return"] == -1.0
+  # A run that goes on knows it from what lies there, a half-made link from a SIGKILL included.
+  best.with_name(".best").symlink_to("000000000050")
+  assert numbers(save(tmp_path, keep=1, returns={60: -1.5, 70: math.inf})) == [70, 20]
+  assert numbers(find_checkpoints(best)) == [20]
+  assert numbers(save(tmp_path, 90, keep=1, returns={80: -1.0})) == [90, 80], "of equals the newest"
+  assert numbers(find_checkpoints(best)) == [80]
+  assert numbers(save(tmp_path, keep=2, returns={100: 0.0})) == [100, 90]
+  assert sorted(os.listdir(best.parent)) == ["000000000090", "000000000100", "best"]
+
+
+def test_without_a_return_there_is_no_best(tmp_path: Path) -> None:
+  best = tmp_path / "checkpoints" / "best"
+  assert numbers(save(tmp_path, 10, returns={20: math.nan})) == [20, 10]
+  with pytest.raises(CheckpointError) as error:
+    find_checkpoints(best)
+  one_sentence(error, f"{best} is no link", "has not saved one with a return")
+  best.symlink_to("000000000030")
+  with pytest.raises(CheckpointError) as error:
+    find_checkpoints(best)
+  one_sentence(error, f"{best} points to 000000000030, which is not there")
+  with pytest.raises(CheckpointError) as error:
+    find_checkpoints(tmp_path / "nowhere/checkpoints/best")
+  one_sentence(error, "nowhere/checkpoints/best does not exist")
+  save(tmp_path)
+  assert not best.is_symlink(), "a run that goes on removes it"
+
+
+def test_the_best_is_always_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  """Before anything is removed, the link has gone over to what stays."""
+  best, seen = tmp_path / "checkpoints" / "best", []
+
+  def removing(remove: Callable[..., Any]) -> Callable[..., Any]:
+    def watched(*args: Any, **kwargs: Any) -> Any:
+      (path,) = find_checkpoints(best)
+      Checkpoint(path).restore("state", like(STATE))
+      seen.append(int(path.name))
+      return remove(*args, **kwargs)
+
+    return watched
+
+  monkeypatch.setattr(ocp.CheckpointManager, "delete", removing(ocp.CheckpointManager.delete))
+  monkeypatch.setattr(checkpoints, "shutil", SimpleNamespace(rmtree=removing(shutil.rmtree)))
+  assert numbers(save(tmp_path, keep=1, returns={10: 2.0, 20: 1.0, 30: 3.0, 40: 4.0})) == [40]
+  assert seen == [30, 30, 40]
+  assert numbers(save(tmp_path, keep=2, returns={50: 5.0}, continued=40)) == [50, 40]
+  os.truncate(data_file(tmp_path / "checkpoints" / "000000000050"), 10)
+  seen.clear()
+  assert numbers(save(tmp_path, continued=40)) == [40]
+  assert (seen, numbers(find_checkpoints(best))) == ([40], [40])
+
+
+def test_a_run_whose_best_is_damaged_makes_it_again(tmp_path: Path) -> None:
+  best = tmp_path / "checkpoints" / "best"
+  newest, _ = save(tmp_path, keep=2, returns={10: 1.0, 20: 2.0})
+  (newest / "meta" / "metadata").write_text("{")
+  assert numbers(save(tmp_path, keep=2, continued=10)) == numbers(find_checkpoints(best)) == [10]
+  save(tmp_path, keep=2, returns={20: 2.0})
+  assert numbers(find_checkpoints(best)) == [20]
+  store = CheckpointStore(tmp_path / "checkpoints", continued=-1)
+  store.close()
+  assert list((tmp_path / "checkpoints").iterdir()) == [], "from the beginning"
+
+
+def test_a_copy_without_links_loses_only_the_best(tmp_path: Path) -> None:
+  paths = save(tmp_path / "run", keep=1, returns={10: 2.0, 20: 1.0})
+  kept = shutil.copytree(tmp_path / "run", tmp_path / "kept", symlinks=True)
+  assert numbers(find_checkpoints(kept / "checkpoints/best")) == [10]
+  copy = shutil.copytree(tmp_path / "run", tmp_path / "copy")  # which follows them
+  best = copy / "checkpoints" / "best"
+  assert best.is_dir() and not best.is_symlink()
+  assert numbers(find_checkpoints(copy)) == numbers(paths) == [20, 10]
+  with pytest.raises(CheckpointError) as error:
+    find_checkpoints(best)
+  one_sentence(error, f"{best} is no link", "copied without its links")
+  assert numbers(save(copy, 30, keep=1)) == [30, 10]
+  assert numbers(find_checkpoints(best)) == [10], "until the run goes on"
+
+
+@pytest.mark.parametrize(("number", "works"), [(errno.EPERM, True), (errno.ENOSPC, False)])
+def test_where_there_are_no_links(number: int, works: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(Path, "symlink_to", lambda *_: (_ for _ in ()).throw(OSError(number, os.strerror(number))))
+  if not works:
+    with pytest.raises(OSError, match="No space left"):
+      save(tmp_path, returns={10: 1.0})
+    return
+  assert numbers(save(tmp_path, keep=1, returns={10: 2.0, 20: 1.0})) == [20, 10]
+  assert numbers(save(tmp_path, 30, keep=1)) == [30, 10]
+  assert not (tmp_path / "checkpoints" / "best").exists()
+
+
+# What is refused
 
 
 def test_what_cannot_be_written_is_raised(tmp_path: Path) -> None:

@@ -46,9 +46,10 @@ def test_jax_torch_and_onnx_act_alike() -> None:
     theirs = actor(TensorDict({"policy": to_torch(obs)}, [50])).clamp(-1, 1)
   assert 0 < np.abs(theirs.numpy()).max() <= 1
   np.testing.assert_allclose(ours, theirs, atol=1e-6)
-  params, seen = learner.networks.mlp(policy.params.policy, policy.normalizer)
-  graph = policy_graph(params, SMALL_RSL_RL.network.activation, seen, learner.networks.squashed)
-  np.testing.assert_allclose(ours, exported(graph).actions(np.asarray(obs)), atol=1e-6)
+  networks = learner.networks
+  params, seen = networks.mlp(policy.params.policy, policy.normalizer)
+  graph = policy_graph(params, networks.policy_inputs, SMALL_RSL_RL.network.activation, seen, networks.squashed)
+  np.testing.assert_allclose(ours, exported(graph, networks.policy_inputs).actions(np.asarray(obs)), atol=1e-6)
 
 
 @needs_rsl_rl

@@ -67,7 +67,7 @@ def test_a_resumed_run_ends_as_if_it_had_never_stopped(
   assert f"Resuming the whole training state of {newest}" in said
   assert ("Replay buffer: 256 transitions of 9 numbers" in said) == (agent(whole) == "sac")
   ours, theirs = RunDirectory(run), RunDirectory(whole)
-  for key in ("params_sha256", "final_return", "best_return", "steps", "status"):
+  for key in ("params_sha256", "final_return", "best_return", "best_step", "steps", "status"):
     assert ours.summary[key] == theirs.summary[key], key
   ours, theirs = (pd.read_csv(path / "metrics.csv").filter(regex="^(?!time/)") for path in (run, whole))
   pd.testing.assert_frame_equal(ours, theirs, check_like=True, check_exact=True)

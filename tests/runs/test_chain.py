@@ -108,7 +108,7 @@ def assert_same_result(path: Path, whole: Path) -> None:
   for folder in ("", *STAGES):
     ours, theirs = RunDirectory(path / folder), RunDirectory(whole / folder)
     assert ours.status["status"] == "finished"
-    for key in ("params_sha256", "final_return", "best_return", "steps", "status"):
+    for key in ("params_sha256", "final_return", "best_return", "best_step", "steps", "status"):
       assert ours.summary[key] == theirs.summary[key], key
   ours, theirs = (pd.read_csv(chain / "metrics.csv").filter(regex="^(?!time/)") for chain in (path, whole))
   pd.testing.assert_frame_equal(ours, theirs, check_like=True, check_exact=True)
@@ -143,6 +143,7 @@ def test_a_chain_has_one_curve_and_one_summary(whole: Path) -> None:
     *(("near", "1_near", "finished"), ("far", "2_far", "finished")),
   ]
   assert (summary["steps"], summary["params_sha256"]) == (720, far.summary["params_sha256"])
+  assert (summary["best_return"], summary["best_step"]) == (far.summary["best_return"], far.summary["best_step"])
   assert summary["final_return"] == far.summary["final_return"] == table["eval/episode_reward"].to_numpy()[-1]
   assert summary["wall_clock_s"] == pytest.approx(sum(stage["wall_clock_s"] for stage in summary["stages"]))
   assert find_checkpoints(whole) == find_checkpoints(far.path), "what `init_from` and `playground eval` take"

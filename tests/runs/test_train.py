@@ -78,12 +78,15 @@ def resume(run: Path) -> int:
 
 
 def assert_same_result(run: Path, whole: Path) -> None:
-  """Same parameters and same rows as the run that was left alone."""
+  """Same parameters, same best ones and same rows as the run that was left alone."""
   ours, theirs = RunDirectory(run), RunDirectory(whole)
   assert ours.status["status"] == "finished"
-  for key in ("params_sha256", "final_return", "best_return", "steps", "status"):
+  for key in ("params_sha256", "final_return", "best_return", "best_step", "steps", "status"):
     assert ours.summary[key] == theirs.summary[key], key
   assert ours.summary["steps_per_second"] > 0
+  best = [Checkpoint(find_checkpoints(path / "checkpoints/best")[0]) for path in (run, whole)]
+  assert best[0].meta["sha256"] == best[1].meta["sha256"]
+  assert [(it.step, it.meta["return"]) for it in best] == [(ours.summary["best_step"], ours.summary["best_return"])] * 2
   tables = [pd.read_csv(path / "metrics.csv") for path in (run, whole)]
   ours, theirs = (table.filter(regex="^(?!time/)") for table in tables)
   assert len(theirs) == 101
@@ -139,12 +142,16 @@ def test_a_run_leaves_everything_behind(whole: Path) -> None:
   assert STEPS - 10 <= summary["steps"] < STEPS - 10 + BATCH, "the budget is met to within one batch"
   assert table["step"].to_numpy()[-1] == summary["steps"]
   assert summary["final_return"] == table["eval/episode_reward"].to_numpy()[-1]
-  assert summary["best_return"] == np.nanmax(table["eval/episode_reward"].to_numpy())
+  returns = table[table["step"] > 0].set_index("step")["eval/episode_reward"]
+  assert (summary["best_return"], summary["best_step"]) == (returns.max(), returns.idxmax())
   assert summary["steps_per_second"] == pytest.approx(summary["steps"] / timings["train_s"])
   assert summary["wall_clock_s"] > timings["train_s"]
-  newest, *others = find_checkpoints(whole)
-  assert len(others) == 2, "checkpoint.keep"
-  checkpoint = Checkpoint(newest)
+  saved = sorted(returns.dropna().index)
+  (best,) = find_checkpoints(run.checkpoints / "best")
+  kept = find_checkpoints(whole)
+  assert {int(path.name) for path in kept} == {*saved[-3:], summary["best_step"]}, "checkpoint.keep, and the best"
+  assert Checkpoint(best).meta["return"] == summary["best_return"]
+  checkpoint = Checkpoint(kept[0])
   assert checkpoint.step == summary["steps"]
   assert checkpoint.meta["sha256"]["policy"] == summary["params_sha256"]
   assert {p.name for p in run.plots.iterdir()} == {"return_over_steps.png", "return_over_wall_clock.png"}
@@ -221,7 +228,7 @@ def test_a_second_start_compiles_next_to_nothing(whole: Path, cache: Path, tmp_p
 
 
 def test_a_damaged_checkpoint_is_passed_over(whole: Path, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-  newest, before, _ = find_checkpoints(copy)
+  newest, before, *_ = find_checkpoints(copy)
   truncate(newest)
   assert resume(copy) == 0
   said = capsys.readouterr().out
@@ -315,7 +322,7 @@ def test_weights_of_another_task_are_refused(whole: Path, tmp_path: Path, refuse
   assert not (tmp_path / "run").exists(), "nothing was compiled or begun"
 
 
-@pytest.mark.parametrize("source", ["run", "checkpoint"])
+@pytest.mark.parametrize("source", ["run", "checkpoint", "best"])
 def test_a_new_run_starts_from_weights(
   source: str,
   whole: Path,
@@ -323,8 +330,8 @@ def test_a_new_run_starts_from_weights(
   watched: list[Any],
   capsys: pytest.CaptureFixture[str],
 ) -> None:
-  newest, older, _ = find_checkpoints(whole)
-  path, checkpoint = (whole, Checkpoint(newest)) if source == "run" else (older, Checkpoint(older))
+  path = {"run": whole, "checkpoint": find_checkpoints(whole)[1], "best": whole / "checkpoints/best"}[source]
+  checkpoint = Checkpoint(find_checkpoints(path)[0])
   args = [*TASK, "agent.num_timesteps=320", f"init_from={path}", f"run_dir={tmp_path / 'run'}"]
   assert train(compose(args)) == 0
   ((update, policy, _),) = watched
@@ -336,6 +343,14 @@ def test_a_new_run_starts_from_weights(
   summary = RunDirectory(tmp_path / "run").summary
   assert summary["steps"] == 320, "a new budget"
   assert summary["params_sha256"] != checkpoint.meta["sha256"]["policy"], "it trained on"
+
+
+def test_weights_that_a_link_has_lost(copy: Path, refused: Callable[..., str]) -> None:
+  best = copy / "checkpoints/best"
+  shutil.rmtree(best)  # the fixture copied what it points to
+  assert f"init_from={best} is no run directory or checkpoint" in refused(*TASK, f"init_from={best}")
+  best.symlink_to("000000000001")
+  assert f"{best} points to 000000000001, which is not there." in refused(*TASK, f"init_from={best}")
 
 
 def test_resumed_before_its_first_checkpoint_it_starts_from_the_weights_again(whole: Path, tmp_path: Path) -> None:
