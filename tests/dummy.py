@@ -22,6 +22,11 @@ from playground.learning.rsl_rl import RslRlNetworkConfig, RslRlPPO, RslRlPPOCon
 from playground.learning.sac import SAC, SACConfig
 
 
+class NoPhysics:
+  def without_dynamics(self) -> "NoPhysics":
+    return self
+
+
 class PointTask(Env):
   """Position [2] follows the action, reward is minus the distance; NaN or absurd velocity on demand (`*_at` steps)."""
 
@@ -34,6 +39,7 @@ class PointTask(Env):
   ):  # pyright: ignore[reportMissingSuperCall]
     self.dt, self.episode_length, self.action_repeat, self.nan_at = 0.1, episode_length, action_repeat, nan_at
     self.fast_at, self.impl = fast_at, "jax"
+    self.physics: Any = NoPhysics()
 
   @property
   def action_size(self) -> int:

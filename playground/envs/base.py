@@ -1,6 +1,7 @@
 """What a task is: a pure `reset` and `step` for one environment, and the three calls a step is made of."""
 
 import abc
+import copy
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
@@ -121,7 +122,9 @@ class Env(abc.ABC):
   @property
   def observation_size(self) -> int | dict[str, tuple[int, ...]]:
     """Length of the observation vector, or the shape of each entry of a dict observation."""
-    obs = jax.eval_shape(self.jitted[0], jax.random.PRNGKey(0), {}).obs
+    shapes = copy.copy(self)
+    shapes.physics = self.physics.without_dynamics()
+    obs = jax.eval_shape(shapes.reset, jax.random.PRNGKey(0)).obs
     return {k: v.shape for k, v in obs.items()} if isinstance(obs, Mapping) else obs.shape[-1]
 
   @property

@@ -7,6 +7,7 @@ the same for both backends.
 """
 
 import contextlib
+import copy
 import io
 from typing import Any
 
@@ -30,6 +31,11 @@ DERIVED_FIELDS = (
 )  # fmt: skip
 
 
+_INTEGRATE = {
+  mujoco.mjtIntegrator.mjINT_EULER: mjx.euler,
+  mujoco.mjtIntegrator.mjINT_RK4: mjx.rungekutta4,
+  mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit,
+}
 WORLDS = "worlds"  # the axis of the batch of environments, for `jax.vmap(axis_name=...)`: Warp's buffers grow with it
 _FEW = 64  # environments that few need not be like the average: they get the buffers of so many
 
@@ -120,10 +126,17 @@ class Physics:
     self.mj_model = mj_model
     self.impl = impl
     self.derived = derived
+    self._forward = mjx.forward if impl == "warp" else jax.jit(mjx.forward)  # most of all tracing: done once
     self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, impl=impl)
     self._naconmax_per_env = naconmax_per_env
     self._naccdmax_per_env = naccdmax_per_env
     self._njmax = njmax
+
+  def without_dynamics(self) -> "Physics":
+    """The same, but `forward` computes nothing: for `jax.eval_shape`, which then takes a fraction of the time."""
+    still = copy.copy(self)
+    still._forward = lambda model, data: data
+    return still
 
   def make(self, **fields: jax.Array) -> PhysicsData:
     """Returns the model's default state with `fields` replaced; derived fields are those of fresh data."""
@@ -136,14 +149,14 @@ class Physics:
 
   def present(self, model: mjx.Model, data: PhysicsData) -> mjx.Data:
     """MJX's own data of the present state, all that follows from it computed."""
-    return mjx.forward(model, self._full(data))
+    return self._forward(model, self._full(data))
 
   def step(self, model: mjx.Model, data: PhysicsData, ctrl: jax.Array, num_substeps: int) -> PhysicsData:
     """Advances by `num_substeps` physics steps under a constant `ctrl` (shape [nu])."""
     data = data.replace(ctrl=ctrl, buffers=None if data.buffers is None else jax.tree.map(jnp.zeros_like, data.buffers))
 
     def advance(data: PhysicsData, derived: tuple[str, ...]) -> PhysicsData:
-      after = self._keep(mjx.step(model, self._full(data)), derived)
+      after = self._keep(self._advance(model, self._full(data)), derived)
       if data.buffers is None or after.buffers is None:
         return after
       return after.replace(buffers=data.buffers.join(after.buffers))
@@ -154,6 +167,12 @@ class Physics:
       data = data.replace(**dict.fromkeys(self.derived))
       data = jax.lax.scan(lambda data, _: (advance(data, ()), None), data, None, num_substeps - 1)[0]
     return advance(data, self.derived)
+
+  def _advance(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.step`, with the forward dynamics that everything here shares."""
+    if self.impl == "warp":
+      return mjx.step(model, data)
+    return _INTEGRATE[self.mj_model.opt.integrator](model, self._forward(model, data))
 
   def _template(self) -> mjx.Data:
     if self.impl == "jax":

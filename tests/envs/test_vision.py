@@ -37,8 +37,6 @@ class Shown:
 class Aging(Point):
   """A point that knows the time: a step is 0.1 s."""
 
-  physics: Any = None
-
   def reset(self, rng: jax.Array, model: Any = None) -> Any:
     state = super().reset(rng)
     return state.replace(data=state.data.replace(time=jnp.zeros(())))
