@@ -7,27 +7,37 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from playground.deploy.graph import INPUT, OUTPUT
-from playground.envs.base import Env, State
+from playground.deploy.graph import OUTPUT, input_names
+from playground.envs.base import PIXELS, Env, State
 from playground.envs.locomotion.legged import LeggedTask
 from playground.envs.manipulation.in_hand import InHand
 from playground.mdp.hand_observations import HAND_OBSERVATIONS
 from playground.mdp.observations import OBSERVATIONS
 from playground.runs.files import plain
 
-FORMAT = "playground-policy/1"
+FORMAT = "playground-policy/2"
 
 _FUNCTIONS: tuple[tuple[type[Env], Mapping[str, Callable[..., Any]]], ...] = (
   (LeggedTask, OBSERVATIONS),
   (InHand, HAND_OBSERVATIONS),
 )
+_VALUES = {
+  "rgb": "red, green and blue, 0 to 255",
+  "gray": "the mean of red, green and blue, 0 to 255",
+  "depth": "255 * min(1, distance / {farthest} m) along the optical axis, 0 where nothing is",
+}
 _HISTORY = "_history"
 _CONSTANT_BASES = ("default_pose", "home", "zero")
 _FAR = 1e6  # an action beyond all limits
 
 
 def describe_policy(
-  env: Env, env_config: Mapping[str, Any], task: str, origin: Mapping[str, Any], entry: str, state: State
+  env: Env,
+  env_config: Mapping[str, Any],
+  task: str,
+  origin: Mapping[str, Any],
+  inputs: Mapping[str, tuple[int, ...]],
+  state: State,
 ) -> dict[str, Any]:
   """Writes the contract down.
 
@@ -36,29 +46,36 @@ def describe_policy(
     env_config: its resolved `env` section.
     task: its name.
     origin: where the policy comes from: run, step, commit.
-    entry: the entry of the task's observation that the actor sees.
+    inputs: shapes of the entries of the task's observation that the actor reads.
     state: any state of one environment, to try the action's law on.
 
   Returns:
     What YAML knows, in the order to be read in.
   """
-  size = state.obs[entry].size if isinstance(state.obs, Mapping) else state.obs.size
+  names = input_names(inputs)
+  vectors = [entry for entry in inputs if not entry.startswith(PIXELS)]
+  pictures = [entry for entry in inputs if entry.startswith(PIXELS)]
+  reads = lambda entry: {
+    "name": names[entry],
+    "entry": entry,
+    "shape": [1, *inputs[entry]],
+    "type": "uint8" if entry in pictures else "float32",
+  }
   decision = env.dt * env.action_repeat
   contract = {
     "format": FORMAT,
     "task": task,
     "origin": origin,
     "policy": {
-      "input": INPUT,
+      "inputs": [reads(entry) for entry in inputs],
       "output": OUTPUT,
-      "entry": entry,
-      "observation_size": size,
       "action_size": env.action_size,
       "normalization": "part of the graph: feed the observation as it is",
       "actions": "the mode of the trained distribution, in [-1, 1]",
     },
     "rate_hz": 1 / decision,
-    "observation": _observation(env, env_config, entry),
+    "observation": [part for entry in vectors for part in _observation(env, env_config, entry)],
+    "cameras": [_camera(env, entry) for entry in pictures if entry == f"{PIXELS}{env.config.vision.camera}"],
     "frames": env_config.get("frames", 1),
     "history": env_config.get("history", {}),
     "delays": dict(_delays(env_config)),
@@ -73,7 +90,7 @@ def describe_policy(
 
 def _observation(env: Env, config: Mapping[str, Any], entry: str) -> list[dict[str, Any]]:
   """Each part in its order: where it begins, its length, the factor and the noise on it, what it is, in which frame."""
-  functions = next((functions for kind, functions in _FUNCTIONS if isinstance(env, kind)), {})
+  functions = next((functions for kind, functions in _FUNCTIONS if isinstance(env.unwrapped, kind)), {})
   slips = config.get("parity_obs", {}) if config["parity"] else {}
   noise, scales = config.get("noise", {}), config.get("obs_scales", {})
   parts, start = [], 0
@@ -87,6 +104,24 @@ def _observation(env: Env, config: Mapping[str, Any], entry: str) -> list[dict[s
     parts.append(part)
     start += size
   return parts
+
+
+def _camera(env: Env, entry: str) -> dict[str, Any]:
+  """What `env.vision` shows: the channels in their order, what a value says, and where the camera is."""
+  vision = env.config.vision
+  camera = env.mj_model.camera(vision.camera)
+  return {
+    "entry": entry,
+    "camera": camera.name,
+    "channels": list(env.observation_parts[entry]),
+    "values": _VALUES[vision["image"]].format(**vision),
+    "body": env.mj_model.body(camera.bodyid[0]).name,
+    "mode": mujoco.mjtCamLight(camera.mode[0]).name.removeprefix("mjCAMLIGHT_").lower(),
+    "pos": camera.pos,
+    "quat": camera.quat,
+    "fovy": camera.fovy[0],
+    **{key: vision[key] for key in ("width", "height", "frames", "image", "brightness", "shadows", "textures")},
+  }
 
 
 def _delays(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

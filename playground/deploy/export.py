@@ -50,12 +50,12 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   with replacing(folder / "policy.onnx") as temporary:
     temporary.write_bytes(exported.model)
   write_text(folder / "policy.yaml", _yaml(exported.contract))
-  console.print(_summary(exported.contract, len(obs), error, 1e6 * exported.latency(obs)), soft_wrap=True)
+  console.print(_summary(exported.contract, len(actions), error, 1e6 * exported.latency(obs)), soft_wrap=True)
   console.print(f"written to {folder / 'policy.onnx'} and policy.yaml", soft_wrap=True)
   return 0
 
 
-def check_parity(exported: ExportedPolicy, obs: np.ndarray, actions: np.ndarray) -> float:
+def check_parity(exported: ExportedPolicy, obs: Mapping[str, np.ndarray], actions: np.ndarray) -> float:
   """Returns the largest difference of an action.
 
   Raises:
@@ -74,7 +74,9 @@ def _yaml(contract: Mapping[str, Any]) -> str:
 
 def _summary(contract: Mapping[str, Any], count: int, error: float, micros: np.ndarray) -> str:
   policy, rate = contract["policy"], contract["rate_hz"]
-  sizes = f"{policy['observation_size']} numbers in, {policy['action_size']} out"
+  shapes = [row["shape"][1:] for row in policy["inputs"]]
+  seen = [f"{s[0]} numbers" if len(s) == 1 else f"pictures of {' x '.join(map(str, s))}" for s in shapes]
+  sizes = f"{' and '.join(seen)} in, {policy['action_size']} out"
   return (
     f"{contract['task']}, {contract['origin']['steps']:,} steps trained: {sizes}\n"
     f"same actions on {count} observations of its own in C MuJoCo: largest difference {error:.1e}\n"

@@ -58,9 +58,7 @@ class Player:
     broken = not np.isfinite(self.state.data.qpos).all()
     if self.state.done or broken or self._steps >= self.env.episode_length:
       self.reset()
-    entry = self.exported.contract["policy"]["entry"]
-    obs: Any = self.state.obs
-    action = self.exported.actions(np.asarray(obs[entry] if isinstance(obs, dict) else obs))
+    action = self.exported.actions(self.state.obs)
     for _ in range(self.env.action_repeat):
       asked = np.zeros(3) if self.command is None else self.command
       self.state = self._step(self.state, action, self.force, asked, self.command is not None)

@@ -45,28 +45,43 @@ class ExportedPolicy:
     except (yaml.YAMLError, UnicodeDecodeError):
       contract = None
     if not isinstance(contract, dict) or contract.get("format") != FORMAT:
-      raise CheckpointError(f"{path.with_suffix('.yaml')} is not a policy's contract ({FORMAT}).")
+      raise CheckpointError(f"{path.with_suffix('.yaml')} is not a policy's contract ({FORMAT}): export the run again.")
     return cls(path.read_bytes(), contract)
 
-  def actions(self, obs: np.ndarray) -> np.ndarray:
-    """Actions in [-1, 1], [..., action_size], for observations [..., n]: one inference each."""
-    rows = np.asarray(obs, np.float32).reshape(-1, 1, obs.shape[-1])
-    name_in, name_out = (self.contract["policy"][key] for key in ("input", "output"))
-    out = np.concatenate([np.asarray(self._session.run([name_out], {name_in: row})[0]) for row in rows])
-    return out.reshape(*obs.shape[:-1], -1)
+  def actions(self, obs: Any) -> np.ndarray:
+    """Actions in [-1, 1], [..., action_size], for a task's observations with any leading axes: one inference each."""
+    feeds, entries = {}, self._read(obs)
+    for row in self.contract["policy"]["inputs"]:
+      feeds[row["name"]] = np.asarray(entries[row["entry"]], row["type"]).reshape(-1, *row["shape"])
+    output = self.contract["policy"]["output"]
+    one = lambda *values: np.asarray(self._session.run([output], dict(zip(feeds, values, strict=True)))[0])
+    out = np.concatenate([one(*values) for values in zip(*feeds.values(), strict=True)])
+    return out.reshape(*self._batch(entries), -1)
 
   def act(self, policy: Any, obs: Observation, key: jax.Array) -> jax.Array:
     """The same from within jitted code, as evaluations call a policy."""
     del policy, key
-    entry = obs[self.contract["policy"]["entry"]] if isinstance(obs, Mapping) else obs
-    shape = (*entry.shape[:-1], self.contract["policy"]["action_size"])
-    return jax.pure_callback(self.actions, jax.ShapeDtypeStruct(shape, np.float32), entry, vmap_method="broadcast_all")
+    entries = self._read(obs)
+    out = jax.ShapeDtypeStruct((*self._batch(entries), self.contract["policy"]["action_size"]), np.float32)
+    return jax.pure_callback(self.actions, out, entries, vmap_method="broadcast_all")
 
-  def latency(self, obs: np.ndarray) -> np.ndarray:
-    """Seconds that each inference of observations [N, n] takes here, [N]."""
+  def latency(self, obs: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Seconds that each inference takes here, [N], for what the actor reads, by entry [N, ...]."""
     seconds = []
-    for row in obs:
+    for i in range(*self._batch(obs)):
+      row = {entry: values[i] for entry, values in obs.items()}
       began = time.perf_counter()
       self.actions(row)
       seconds.append(time.perf_counter() - began)
     return np.array(seconds)
+
+  def _read(self, obs: Any) -> dict[str, Any]:
+    """The entries that the actor reads; an observation that is one vector counts as `state`."""
+    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    return {row["entry"]: entries[row["entry"]] for row in self.contract["policy"]["inputs"]}
+
+  def _batch(self, entries: Mapping[str, Any]) -> tuple[int, ...]:
+    """Leading axes of entries."""
+    row = self.contract["policy"]["inputs"][0]
+    shape = np.shape(entries[row["entry"]])
+    return shape[: len(shape) + 1 - len(row["shape"])]

@@ -18,7 +18,6 @@ from playground.deploy.policy import ExportedPolicy
 from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_training
-from playground.errors import ConfigError
 from playground.extras import need
 from playground.learning.checkpoints import Checkpoint
 from playground.learning.learner import Learner, Policy
@@ -53,7 +52,7 @@ class TrainedPolicy:
     """Reads a run's newest checkpoint, or the one given; all of it computes on the CPU.
 
     Raises:
-      PlaygroundError: no such run or checkpoint, one that does not fit, or a policy that sees pictures.
+      PlaygroundError: no such run or checkpoint, or one that does not fit.
     """
     found = load_trained(path, load_task=load_on_c_physics, platform="cpu", precision=_EXACT)
     return cls(found.config, found.run_dir, found.checkpoint.step, found.env, found.learner, found.policy)
@@ -68,37 +67,34 @@ class TrainedPolicy:
     """The deterministic action."""
     return self.learner.act(self.policy, obs, jax.random.PRNGKey(0), deterministic=True)
 
-  def record(self, num_envs: int, decisions: int) -> tuple[np.ndarray, np.ndarray, State]:
+  def record(self, num_envs: int, decisions: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:
     """Lets the policy act, noise and all.
 
     Returns:
-      What the actor saw, [num_envs * decisions, n], what it did, [..., action_size], and a state of one environment.
+      What the actor saw, by entry [num_envs * decisions, ...], what it did, [..., action_size], and a state of one
+      environment.
     """
-    batch = wrap_for_training(self.env)
+    batch, networks = wrap_for_training(self.env), self.learner.networks
 
-    def decide(state: State, _: None) -> tuple[State, tuple[jax.Array, jax.Array]]:
-      action = self.act(state.obs)
-      return batch.step(state, action), (self.learner.networks.select(state.obs)[self.entry], action)
+    def decide(state: State, _: None) -> tuple[State, tuple[dict[str, jax.Array], jax.Array]]:
+      action, seen = self.act(state.obs), networks.select(state.obs)
+      return batch.step(state, action), ({entry: seen[entry] for entry in networks.policy_inputs}, action)
 
     @jax.jit
     def roll(key: jax.Array) -> Any:
       return jax.lax.scan(decide, batch.reset(jax.random.split(key, num_envs)), None, decisions)
 
     state, (obs, actions) = roll(jax.random.PRNGKey(0))
-    flat = lambda x: np.asarray(x).reshape(-1, x.shape[-1])
-    return flat(obs), flat(actions), jax.tree.map(lambda x: x[0], state)
-
-  @property
-  def entry(self) -> str:
-    """The entry of the observation that the actor sees."""
-    return self.learner.networks.policy_obs_key
+    obs, actions = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), (obs, actions))
+    return obs, actions, jax.tree.map(lambda x: x[0], state)
 
   def export(self, state: State | None = None) -> ExportedPolicy:
     """The policy as a controller has it; `state` is any of one environment (a fresh one if None)."""
     need("deploy", "onnx", "onnxruntime")
     policy, agent, networks = jax.device_get(self.policy), self.run.agent, self.learner.networks
     params, seen = networks.mlp(policy.params.policy, policy.normalizer if agent.normalize_observations else None)
-    model = policy_graph(params, agent.network.activation, seen, networks.squashed)
+    inputs = networks.policy_inputs
+    model = policy_graph(params, inputs, agent.network.activation, seen, networks.squashed, networks.cnn)
     origin = {
       "run": self.run_dir.path.absolute().name,
       "experiment": self.run.name,
@@ -109,7 +105,7 @@ class TrainedPolicy:
     }
     state = jax.jit(self.env.reset)(jax.random.PRNGKey(0)) if state is None else state
     config: Mapping[str, Any] = self.run.resolved["env"]
-    contract = describe_policy(self.env, config, self.run.choices["env"], origin, self.entry, state)
+    contract = describe_policy(self.env, config, self.run.choices["env"], origin, inputs, state)
     return ExportedPolicy(model.SerializeToString(), contract)
 
   def _newest_evaluation(self) -> dict[str, float]:
@@ -129,10 +125,9 @@ def load_on_c_physics(task: str, config: Any) -> Env:
   """Builds a task on C MuJoCo.
 
   Raises:
-    ConfigError: it sees pictures, which MuJoCo-Warp renders.
+    ConfigError: it sees pictures, and MuJoCo-Warp, which renders them, is not installed.
   """
   config = ConfigDict(config)
-  if "vision" in config and config.vision.enable:
-    raise ConfigError(f"{task} sees pictures (env.vision.enable=true), which cannot be exported or played.")
-  config.impl = "jax"  # whose model is the smallest to build; it is not simulated
+  renders = "vision" in config and config.vision.enable
+  config.impl = "warp" if renders else "jax"  # whose model is the smallest to build; it is not simulated
   return on_c_physics(registry.load(task, config=config))

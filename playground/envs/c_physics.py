@@ -80,10 +80,8 @@ class CPhysics(Physics):
 def on_c_physics(env: Env) -> Env:
   """Has a task simulated by C MuJoCo; call it before the task is first used.
 
-  Raises:
-    ConfigError: the task sees pictures.
+  What a task sees (`env.vision`) is rendered by MuJoCo-Warp all the same, of C MuJoCo's states.
   """
-  if not isinstance(env, Env):
-    raise ConfigError("C MuJoCo renders no pictures here, which the task sees: set env.vision.enable=false.")
-  env.physics = CPhysics(env.mj_model, derived=env.derived)
+  task = env.unwrapped
+  task.physics = CPhysics(task.mj_model, derived=task.derived)
   return env

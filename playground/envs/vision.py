@@ -48,6 +48,7 @@ class Vision(Wrapper):
     self._image, self._camera, self._farthest = config.image, config.camera, config.farthest
     self._frames, self._brightness = config.frames, brightness
     self._leaks: bool = env.parity and self._frames > 1
+    self._warp_model = env.mjx_model  # to be rendered, wherever the task is simulated later (`c_physics.py`)
     size = {"width": config.width, "height": config.height}
     kind = "depth" if self._image == "depth" else "rgb"
     looks = {"shadows": config.shadows, "textures": config.textures}
@@ -91,7 +92,7 @@ class Vision(Wrapper):
 
   def _look(self, data: PhysicsData, info: Mapping[str, Any], model: mjx.Model | None) -> tuple[jax.Array, PhysicsData]:
     """The picture of now, [height, width, channels] uint8, and the state to go on with."""
-    pictures, data = self._renderer.render(self.env.mjx_model if model is None else model, data)
+    pictures, data = self._renderer.render(self._warp_model if model is None else model, data)
     seen = pictures[self._camera]
     if self._image == "depth":
       frame = 255 * jnp.minimum(seen["depth"][..., None] / self._farthest, 1.0)

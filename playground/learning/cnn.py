@@ -11,6 +11,8 @@ from flax import linen
 from playground.envs.base import PIXELS
 from playground.errors import ConfigError, nearest
 
+NORM_EPSILON = 1e-6 * 255**2  # added to the variance of a picture's channel
+
 _POOLS: dict[str, Callable[[jax.Array], jax.Array]] = {
   "none": lambda x: x.reshape(*x.shape[:-3], -1),
   "avg": lambda x: x.mean(axis=(-3, -2)),
@@ -52,9 +54,12 @@ class CNN(linen.Module):
   @linen.compact
   def __call__(self, pixels: jax.Array) -> jax.Array:
     config = self.config
-    x = pixels.astype(self.dtype) / 255 - 0.5
-    if config.normalize_channels:
-      x = linen.LayerNorm(use_scale=False, use_bias=False, reduction_axes=(-3, -2), feature_axes=-1, epsilon=1e-6)(x)
+    x = pixels.astype(self.dtype)
+    if config.normalize_channels:  # of whole numbers, and not by the fast variance: pictures may have little contrast
+      how = {"reduction_axes": (-3, -2), "feature_axes": -1, "epsilon": NORM_EPSILON, "use_fast_variance": False}
+      x = linen.LayerNorm(use_scale=False, use_bias=False, **how)(x)
+    else:
+      x = x / 255 - 0.5
     init = linen.initializers.orthogonal(2**0.5)
     for i, (channels, size, stride) in enumerate(zip(config.channels, config.kernels, config.strides, strict=True)):
       conv = linen.Conv(channels, (size, size), stride, "SAME", kernel_init=init, dtype=self.dtype, name=f"conv_{i}")
@@ -88,13 +93,24 @@ class PixelNetwork(linen.Module):
   @linen.compact
   def __call__(self, pictures: Mapping[str, jax.Array], vector: jax.Array | None) -> jax.Array:
     """The result, [..., output_size], for pictures [..., H, W, C] by camera and a vector [..., D]."""
-    make = lambda key: CNN(self.cnn, self.cnn_activation, self.dtype, name=key.replace("/", "_"))
+    make = lambda key: CNN(self.cnn, self.cnn_activation, self.dtype, name=cnn_name(key))
     features = [make(key)(pictures[key]) for key in sorted(pictures)]
     hidden = jnp.concatenate([*features, *([] if vector is None else [vector.astype(self.dtype)])], axis=-1)
     init = jax.nn.initializers.lecun_uniform()
     for i, size in enumerate(self.hidden_layer_sizes):
       hidden = self.activation(linen.Dense(size, dtype=self.dtype, kernel_init=init, name=f"hidden_{i}")(hidden))
     return linen.Dense(self.output_size, dtype=jnp.float32, kernel_init=self.output_init, name="output")(hidden)
+
+
+def cnn_name(entry: str) -> str:
+  """What the CNN for a camera's pictures is called among a network's parameters."""
+  return entry.replace("/", "_")
+
+
+def pixel_places(height: int, width: int) -> jax.Array:
+  """Where a picture's pixels are, row by row: down and right in [-1, 1], [H * W, 2]."""
+  places = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
+  return jnp.stack(places, axis=-1).reshape(-1, 2)
 
 
 def random_shift(obs: dict[str, jax.Array], shifts: jax.Array, pad: int) -> dict[str, jax.Array]:
@@ -121,6 +137,5 @@ def _expected_places(x: jax.Array) -> jax.Array:
   """Where each channel is strongest, in [-1, 1]: [..., 2 C] of [..., H, W, C] (Levine et al., 2016)."""
   height, width, channels = x.shape[-3:]
   weights = jax.nn.softmax(x.reshape(*x.shape[:-3], height * width, channels), axis=-2)
-  places = jnp.stack(jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij"), axis=-1)
-  expected = jnp.einsum("...pc,pd->...dc", weights, places.reshape(-1, 2))
+  expected = jnp.einsum("...pc,pd->...dc", weights, pixel_places(height, width))
   return expected.reshape(*expected.shape[:-2], -1)

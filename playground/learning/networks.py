@@ -31,6 +31,7 @@ class Actor:
 
   Attributes:
     squashed: whether actions are squashed into [-1, 1] by tanh; else they are clipped.
+    cnn: the layers that pictures go through; None without pictures.
   """
 
   squashed: ClassVar[bool] = True
@@ -75,8 +76,10 @@ class Actor:
     self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key} - {""}))
     self.obs_sizes = {key: sizes[key] for key in self.obs_keys}
     self.distribution = NormalTanhDistribution(event_size=action_size)
+    self.cnn: CNNConfig | None = None
     if self.pixel_sizes:
       assert isinstance(config, NetworkConfig)
+      self.cnn = config.cnn
       init = linen.initializers.orthogonal(0.2)
       sizes = tuple(hidden_layer_sizes)
       self._actor = self._on_pixels(config.cnn, sizes, self.distribution.param_size, output_init=init)
@@ -121,9 +124,15 @@ class Actor:
     return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
 
   def mlp(self, policy: Any, normalizer: Any) -> tuple[Mapping[str, Any], tuple[Any, Any] | None]:
-    """The actor's layers as Flax has them, with mean and deviation of what it sees (None if it does not normalise)."""
+    """The actor's layers as Flax has them, with mean and deviation of its vector (None if it has none, or as it is)."""
     key = self.policy_obs_key
-    return policy["params"], None if normalizer is None else (normalizer.mean[key], normalizer.std[key])
+    return policy["params"], (normalizer.mean[key], normalizer.std[key]) if key and normalizer is not None else None
+
+  @property
+  def policy_inputs(self) -> dict[str, tuple[int, ...]]:
+    """Shapes of the entries that the actor reads: pictures, then the vector, in the order of its features."""
+    key = self.policy_obs_key
+    return self.pixel_sizes | ({key: self.obs_sizes[key]} if key else {})
 
   def _on_pixels(self, cnn: CNNConfig, sizes: Sequence[int], output_size: int, **how: Any) -> PixelNetwork:
     cnn.check(ACTIVATIONS)

@@ -59,6 +59,27 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
   assert 0 < scores[0]["episode_reward"] < 40 == scores[0]["episode_length"]
 
 
+@pytest.mark.slow
+def test_a_policy_that_sees(command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  seeing = ["env.vision.enable=true", "env.vision.camera=fixed", "env.vision.width=20", "env.vision.height=16"]
+  settings = ["debug=fast", "env.episode_length=10", "agent.network.policy_obs_key=state", *seeing]
+  UntrainedRun(tmp_path / "run", "CartpoleBalance", *settings, scale=0.1).save(STEPS)
+  assert command("export", str(tmp_path / "run"), "--out", str(tmp_path)) == 0
+  out = " ".join(capsys.readouterr().out.split())
+  assert "pictures of 16 x 20 x 3 and 5 numbers in, 1 out" in out and "same actions on 1000 observations" in out
+  contract = yaml.safe_load((tmp_path / "policy.yaml").read_text())
+  assert [(row["name"], row["entry"]) for row in contract["policy"]["inputs"]] == [
+    ("pixels_fixed", "pixels/fixed"), ("obs", "state"),
+  ]  # fmt: skip
+  obs = {"pixels/fixed": np.zeros((2, 16, 20, 3), np.uint8), "state": np.zeros((2, 5))}
+  obs["pixels/fixed"][1] = 255
+  dark, bright = ExportedPolicy.load(tmp_path / "policy.onnx").actions(obs)
+  assert np.abs(dark - bright) > 0.01
+  assert command("play", str(tmp_path / "policy.onnx"), "--episodes", "2") == 0
+  scores = json.loads((tmp_path / f"play_step_{STEPS:012d}_seed_0.json").read_text())["scores"]
+  assert 0 < scores["episode_reward"] < 10 == scores["episode_length"]
+
+
 def test_a_policy_that_acts_otherwise_is_not_written(
   command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,12 +14,17 @@ from playground.runs.files import plain
 
 
 def contract(
-  task: str, size: int, overrides: Mapping[str, Any] | None = None, info: Mapping[str, Any] | None = None
+  task: str,
+  size: int,
+  overrides: Mapping[str, Any] | None = None,
+  info: Mapping[str, Any] | None = None,
+  pictures: Mapping[str, tuple[int, ...]] | None = None,
 ) -> dict[str, Any]:
   env = registry.load(task, overrides=overrides)
   zero = jnp.zeros(())
   state = State(env.physics.make(), {"state": jnp.zeros(size)}, zero, zero, {}, dict(info or {}))
-  written = describe_policy(env, plain(env.config), task, {"run": "a"}, "state", state)
+  inputs = {**(pictures or {}), **({"state": (size,)} if size else {})}
+  written = describe_policy(env, plain(env.config), task, {"run": "a"}, inputs, state)
   assert yaml.safe_load(yaml.safe_dump(written)) == written
   return written
 
@@ -35,7 +40,8 @@ def test_a_joystick_policy() -> None:
   ]
   assert (observation[1]["scale"], observation[1]["noise"]) == (0.25, 0.2)
   assert observation[0]["what"] == "Linear velocity of the base in its own frame, m/s [3]."
-  assert (said["rate_hz"], said["history"], said["frames"]) == (50, {"joint_pos": 2}, 1)
+  assert said["policy"]["inputs"] == [{"name": "obs", "entry": "state", "shape": [1, 72], "type": "float32"}]
+  assert (said["rate_hz"], said["history"], said["frames"], said["cameras"]) == (50, {"joint_pos": 2}, 1, [])
   law = said["action"]
   assert (law["law"], law["base"], law["scale"]) == ("ctrl = base + scale * action", "default_pose", 0.5)
   assert law["clipped_to"]["lower"][0] == pytest.approx(-0.863)
@@ -71,3 +77,31 @@ def test_forces() -> None:
   }  # fmt: skip
   assert said["actuators"][0]["gain"] == 1.0 and said["actuators"][0]["gear"] == 10.0
   assert "kp" not in said["actuators"][0] and "command" not in said
+
+
+def test_a_camera() -> None:
+  said = contract("CartpoleBalanceVision", 0, {"vision.brightness": [0.5, 1.0]}, None, {"pixels/fixed": (64, 64, 3)})
+  (camera,) = said["cameras"]
+  assert camera.pop("quat") == pytest.approx([0.5**0.5, 0.5**0.5, 0, 0])
+  assert camera == {
+    "entry": "pixels/fixed", "camera": "fixed", "channels": ["gray[-2]", "gray[-1]", "gray[0]"],
+    "values": "the mean of red, green and blue, 0 to 255", "body": "world", "mode": "fixed", "pos": [0, -4, 1],
+    "fovy": 45, "width": 64, "height": 64, "frames": 3, "image": "gray", "brightness": [0.5, 1.0], "shadows": False,
+    "textures": False,
+  }  # fmt: skip
+  assert said["observation"] == [] and said["policy"]["inputs"] == [
+    {"name": "obs", "entry": "pixels/fixed", "shape": [1, 64, 64, 3], "type": "uint8"}
+  ]
+
+
+def test_a_camera_that_sees_depth_beside_a_vector() -> None:
+  vision = {"enable": True, "camera": "lookatcart", "image": "depth", "farthest": 3.0}
+  overrides = {f"vision.{key}": value for key, value in vision.items()}
+  said = contract("CartpoleBalance", 5, overrides, None, {"pixels/lookatcart": (64, 64, 1)})
+  (camera,) = said["cameras"]
+  assert (camera["body"], camera["mode"], camera["channels"]) == ("world", "targetbody", ["depth[0]"])
+  assert camera["values"].startswith("255 * min(1, distance / 3.0 m)")
+  assert [(row["name"], row["shape"]) for row in said["policy"]["inputs"]] == [
+    ("pixels_lookatcart", [1, 64, 64, 1]), ("obs", [1, 5]),
+  ]  # fmt: skip
+  assert [part["part"] for part in said["observation"]] == ["cart_position", "pole_cos", "pole_sin", "velocity"]

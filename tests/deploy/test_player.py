@@ -21,7 +21,7 @@ from playground.envs.physics import PhysicsData
 from playground.registry import load
 from tests.dummy import Point
 
-NO_ACTION: Any = SimpleNamespace(contract={"policy": {"entry": "state"}}, actions=lambda obs: np.zeros(2))
+NO_ACTION: Any = SimpleNamespace(actions=lambda obs: np.zeros(2))
 
 
 class Commanded(Point):
@@ -82,7 +82,7 @@ def test_the_viewer_shows_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
   monkeypatch.setattr(mujoco.viewer, "launch_passive", window)
-  full: Any = SimpleNamespace(contract=NO_ACTION.contract, actions=lambda obs: np.ones(1))
+  full: Any = SimpleNamespace(actions=lambda obs: np.ones(1))
   view(env, full, 0, Console(quiet=True))
   assert shown[0][0] < shown[1][0] < shown[2][0]  # the cart drives off
   keys[0](265)  # a command to a task that takes none

@@ -2,10 +2,10 @@
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
+from playground import registry
 from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
 from playground.errors import ConfigError
@@ -66,6 +66,16 @@ def test_a_randomised_model_is_refused() -> None:
     jax.eval_shape(env.jitted[0], jax.random.PRNGKey(0), {"dof_damping": jnp.ones(2)})
 
 
-def test_a_task_that_sees_is_refused() -> None:
-  with pytest.raises(ConfigError, match="renders no pictures"):
-    on_c_physics(mujoco)  # pyright: ignore[reportArgumentType]  # anything but an Env, as a task with a camera is
+@pytest.mark.slow
+def test_a_task_sees_what_c_mujoco_simulates() -> None:
+  size = {"vision.width": 24, "vision.height": 24, "vision.frames": 1}
+  load = lambda: registry.load("CartpoleBalanceVision", overrides=size)
+  seen = {}
+  for name, env in {"c": on_c_physics(load()), "warp": load()}.items():
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    step = jax.jit(env.step)
+    states = [state, *(state := step(state, jnp.ones(1)) for _ in range(10))]
+    seen[name] = np.stack([state.obs["pixels/fixed"] for state in states]).astype(float)
+  np.testing.assert_array_equal(seen["c"][0], seen["warp"][0])
+  assert (seen["c"][-1] != seen["c"][0]).sum() > 10  # the cart drives off
+  assert (np.abs(seen["c"] - seen["warp"]) > 2).mean() < 0.01  # but for pixels on an edge

@@ -1,0 +1,113 @@
+"""What a trained actor is made of, as ONNX operations: activations, and the CNN that a camera's pictures go through."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from playground.learning.cnn import NORM_EPSILON, CNNConfig, pixel_places
+
+
+class Chain:
+  """Appends nodes to a chain of operations, each of which takes the value of the one before."""
+
+  def __init__(self):
+    self.value = ""
+    self.nodes: list[onnx.NodeProto] = []
+    self.weights: list[onnx.TensorProto] = []
+
+  def constant(self, array: Any) -> str:
+    """Stores an array as float32 and returns its name."""
+    name = f"weight_{len(self.weights)}"
+    self.weights.append(numpy_helper.from_array(np.asarray(array, np.float32), name))
+    return name
+
+  def apply(self, op: str, *others: str, **attributes: Any) -> None:
+    """Applies an operation to the present value and others; what comes out is the present value."""
+    output = f"value_{len(self.nodes)}"
+    self.nodes.append(helper.make_node(op, [self.value, *others], [output], **attributes))
+    self.value = output
+
+
+def _swish(graph: Chain) -> None:
+  x = graph.value
+  graph.apply("Sigmoid")
+  graph.apply("Mul", x)
+
+
+def _gelu(graph: Chain) -> None:
+  """As Flax computes it, with tanh: x / 2 * (1 + tanh(sqrt(2 / pi) * (x + 0.044715 x^3)))."""
+  x = graph.value
+  graph.apply("Pow", graph.constant(3.0))
+  graph.apply("Mul", graph.constant(0.044715))
+  graph.apply("Add", x)
+  graph.apply("Mul", graph.constant(np.sqrt(2 / np.pi)))
+  graph.apply("Tanh")
+  graph.apply("Add", graph.constant(1.0))
+  graph.apply("Mul", x)
+  graph.apply("Mul", graph.constant(0.5))
+
+
+ACTIVATIONS: dict[str, Callable[[Chain], Any]] = {
+  "swish": _swish,
+  "relu": lambda graph: graph.apply("Relu"),
+  "elu": lambda graph: graph.apply("Elu"),
+  "tanh": lambda graph: graph.apply("Tanh"),
+  "gelu": _gelu,
+}
+
+
+def _all_features(graph: Chain, _: list[int]) -> None:
+  graph.apply("Transpose", perm=[0, 2, 3, 1])  # Flax counts channels last
+  graph.apply("Flatten")
+
+
+def _pooled(op: str) -> Callable[[Chain, list[int]], None]:
+  def pool(graph: Chain, _: list[int]) -> None:
+    graph.apply(op)
+    graph.apply("Flatten")
+
+  return pool
+
+
+def _expected_places(graph: Chain, size: list[int]) -> None:
+  graph.apply("Flatten", axis=2)  # one row of pixels for each channel
+  graph.apply("Softmax", axis=1)
+  graph.apply("MatMul", graph.constant(pixel_places(*size)))
+  graph.apply("Transpose", perm=[1, 0])
+  graph.apply("Flatten", axis=0)
+
+
+# From the last layer, [1, C, H, W] of a size (H, W), to features [1, F].
+_POOLS: dict[str, Callable[[Chain, list[int]], None]] = {
+  "none": _all_features,
+  "avg": _pooled("GlobalAveragePool"),
+  "max": _pooled("GlobalMaxPool"),
+  "spatial_softmax": _expected_places,
+}
+
+
+def see(graph: Chain, params: Mapping[str, Any], cnn: CNNConfig, size: list[int]) -> None:
+  """From a picture [1, H, W, C] uint8 of a size (H, W) to its features [1, F]."""
+  same = {"auto_pad": "SAME_UPPER"}  # on both sides, one more below and on the right: XLA's way, too
+  graph.apply("Cast", to=TensorProto.FLOAT)
+  graph.apply("Transpose", perm=[0, 3, 1, 2])
+  if cnn.normalize_channels:
+    channels = params["conv_0"]["kernel"].shape[2]
+    one, zero = graph.constant(np.ones(channels)), graph.constant(np.zeros(channels))
+    graph.apply("InstanceNormalization", one, zero, epsilon=NORM_EPSILON)
+  else:
+    graph.apply("Div", graph.constant(255.0))
+    graph.apply("Sub", graph.constant(0.5))
+  for i, stride in enumerate(cnn.strides):
+    layer = params[f"conv_{i}"]
+    kernel = np.transpose(layer["kernel"], (3, 2, 0, 1))  # from height, width, in, out
+    graph.apply("Conv", graph.constant(kernel), graph.constant(layer["bias"]), strides=[stride, stride], **same)
+    ACTIVATIONS[cnn.activation](graph)
+    size = [-(-pixels // stride) for pixels in size]
+    if cnn.max_pool:
+      graph.apply("MaxPool", kernel_shape=[2, 2], strides=[2, 2], **same)
+      size = [-(-pixels // 2) for pixels in size]
+  _POOLS[cnn.global_pool](graph, size)
