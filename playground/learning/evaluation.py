@@ -43,6 +43,9 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
     reset_key, act_key = jax.random.split(key)
     state = wrapped.reset(jax.random.split(reset_key, per_device), model)
+    # Constants become of the type that may differ between devices, as in training: the task is traced once for both.
+    always = jax.lax.axis_index(AXIS) >= 0
+    state = jax.tree.map(lambda x: jax.lax.select(jax.lax.broadcast(always, x.shape), x, x), state)
     zeros = jnp.zeros(per_device)
     totals = {name: zeros for name in ("nonfinite", *state.info["episode_metrics"])}
 
