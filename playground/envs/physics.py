@@ -29,13 +29,13 @@ DERIVED_FIELDS = (
   "qacc", "sensordata", "actuator_force", "qfrc_actuator", "xpos", "xquat", "xmat", "xipos", "xanchor", "site_xpos",
   "site_xmat", "geom_xpos", "geom_xmat", "subtree_com", "cvel", "ten_length",
 )  # fmt: skip
-
-
+# What follows forward dynamics in a step.
 _INTEGRATE = {
   mujoco.mjtIntegrator.mjINT_EULER: mjx.euler,
   mujoco.mjtIntegrator.mjINT_RK4: mjx.rungekutta4,
   mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit,
 }
+
 WORLDS = "worlds"  # the axis of the batch of environments, for `jax.vmap(axis_name=...)`: Warp's buffers grow with it
 _FEW = 64  # environments that few need not be like the average: they get the buffers of so many
 

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,35 +14,18 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
-from playground.cli.replay import replay
-from playground.cli.run import main
 from playground.config import compose
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
-from playground.learning.loop import Loop
-from playground.runs import train as train_module
 from playground.runs.run_dir import RunDirectory
 from playground.runs.start import Start
 from playground.runs.train import train
+from tests.runs.helpers import TASK, resume
 
 BATCH = 80  # environment steps of one training step with debug=fast
 STEPS = 400_000  # seconds of training, so that a signal finds the run at work
-TASK = ["env=CartpoleBalance", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv"]
 LONG = [*TASK, f"agent.num_timesteps={STEPS - 10}", "agent.num_evals=5"]  # a checkpoint every quarter
 COMMAND = [sys.executable, "-c", "from playground.cli.run import main; main()"]
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-  """One compilation cache for all runs of this module, those in this process included; empty at first."""
-  folder = tmp_path_factory.mktemp("cache")
-  before = jax.config.jax_compilation_cache_dir
-  jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
-  compilation_cache.reset_cache()
-  yield folder
-  jax.config.update("jax_compilation_cache_dir", before)
-  compilation_cache.reset_cache()
 
 
 def start(run: Path, cache: Path, *overrides: str) -> "subprocess.Popen[str]":
@@ -71,10 +54,6 @@ def last_row(run: Path) -> int:
   except FileNotFoundError:
     return -1
   return int(rows[-1].split(",")[0]) if rows else -1
-
-
-def resume(run: Path) -> int:
-  return train(compose([f"resume={run}"]))
 
 
 def assert_same_result(run: Path, whole: Path) -> None:
@@ -246,24 +225,6 @@ def test_a_run_killed_after_its_last_checkpoint_ends_with_the_same_result(whole:
 # What is refused
 
 
-@pytest.fixture
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-  """Runs the command in this process: exit code 2 and one sentence, which it returns."""
-
-  def run(*args: str) -> str:
-    monkeypatch.setattr(sys, "argv", ["playground-run", *args])
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as exit_:
-      main()
-    assert exit_.value.code == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    return lines[0]
-
-  return run
-
-
 def test_nothing_but_damaged_checkpoints(copy: Path, refused: Callable[..., str]) -> None:
   checkpoints = find_checkpoints(copy)
   for path in checkpoints:
@@ -295,22 +256,6 @@ def test_more_devices_than_there_are(tmp_path: Path, refused: Callable[..., str]
 
 
 # Starting from weights
-
-
-@pytest.fixture
-def watched(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-  """For every run in this process: the update that its loop began after, the policy before and the policy after."""
-  seen: list[Any] = []
-
-  class Watched(Loop):
-    def run(self, state: Any, update: int | None = None) -> tuple[Any, bool]:
-      before = jax.device_get(self._learner.policy(state))
-      state, completed = super().run(state, update)
-      seen.append((update, before, jax.device_get(self._learner.policy(state))))
-      return state, completed
-
-  monkeypatch.setattr(train_module, "Loop", Watched)
-  return seen
 
 
 def test_weights_of_another_task_are_refused(whole: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
@@ -358,53 +303,3 @@ def test_resumed_before_its_first_checkpoint_it_starts_from_the_weights_again(wh
   found = Start.find(compose([f"resume={run.path}"]))
   assert found.weights is not None
   assert found.weights.path == find_checkpoints(whole)[0]
-
-
-# Numbers that are not finite
-
-UNSTABLE = [*TASK, "agent.num_timesteps=800", "env.ctrl_dt=10", "env.sim_dt=10"]  # blows up within a few steps
-
-
-def test_nan_is_counted_dumped_and_kept_out(
-  tmp_path: Path, cache: Path, watched: list[Any], capsys: pytest.CaptureFixture[str]
-) -> None:
-  run = tmp_path / "run"
-  assert train(compose([*UNSTABLE, "on_nonfinite.max_fraction=1", f"run_dir={run}"])) == 0
-  assert RunDirectory(run).status["status"] == "finished"
-  table = pd.read_csv(run / "metrics.csv")
-  assert np.sum(table["training/nonfinite"].to_numpy() > 0) > 1, "more than one row has them"
-  assert table["eval/nonfinite"].to_numpy()[-1] > 0
-  numbers = table.filter(regex="^(eval|training)/").to_numpy()
-  assert not np.isinf(numbers).any()
-  trained = table[table["training/episodes"] > 0].filter(regex="^training/")
-  assert len(trained)
-  assert np.isfinite(trained.to_numpy()).all()
-  (dump,) = (run / "nan_dump").iterdir()
-  said = capsys.readouterr().out
-  assert said.count("playground replay") == 1
-  assert f"playground replay {dump}" in said
-
-  ((_, _, policy),) = watched
-  assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy))
-
-  assert replay(str(dump)) == 0
-  recorded, replayed = capsys.readouterr().out.split("replayed on cpu with impl=jax: NaN, infinite or absurd in ")
-  assert "recorded: NaN, infinite or absurd in" in recorded
-  assert "['qvel']: " in recorded
-  assert "['data'].qvel: " in replayed
-
-  (newest,) = find_checkpoints(run)
-  newest.rename(newest.with_name("kept"))  # as if killed before the checkpoint: the first bad step is found again
-  RunDirectory(run).set_status("running")
-  assert resume(run) == 0
-  assert list((run / "nan_dump").iterdir()) == [dump], "one dump a run, however often it is resumed"
-
-
-def test_too_many_nan_stop_the_run(tmp_path: Path, cache: Path, refused: Callable[..., str]) -> None:
-  run = tmp_path / "run"
-  sentence = refused(*UNSTABLE, "on_nonfinite.max_fraction=0.001", f"run_dir={run}")
-  assert "went NaN, infinite or absurd, more than on_nonfinite.max_fraction=0.001" in sentence
-  (dump,) = (run / "nan_dump").iterdir()
-  assert f"playground replay {dump}" in sentence
-  status = RunDirectory(run).status
-  assert (status["status"], f"error: {status['reason']}") == ("failed", sentence)

@@ -1,0 +1,64 @@
+"""Runs whose numbers go NaN or infinite: counted, dumped, kept out of what learns, and replayed."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+
+from playground.cli.replay import replay
+from playground.config import compose
+from playground.learning.checkpoints import find_checkpoints
+from playground.runs.run_dir import RunDirectory
+from playground.runs.train import train
+from tests.runs.helpers import TASK, resume
+
+UNSTABLE = [*TASK, "agent.num_timesteps=800", "env.ctrl_dt=10", "env.sim_dt=10"]  # blows up within a few steps
+
+
+def test_nan_is_counted_dumped_and_kept_out(
+  tmp_path: Path, cache: Path, watched: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+  run = tmp_path / "run"
+  assert train(compose([*UNSTABLE, "on_nonfinite.max_fraction=1", f"run_dir={run}"])) == 0
+  assert RunDirectory(run).status["status"] == "finished"
+  table = pd.read_csv(run / "metrics.csv")
+  assert np.sum(table["training/nonfinite"].to_numpy() > 0) > 1, "more than one row has them"
+  assert table["eval/nonfinite"].to_numpy()[-1] > 0
+  numbers = table.filter(regex="^(eval|training)/").to_numpy()
+  assert not np.isinf(numbers).any()
+  trained = table[table["training/episodes"] > 0].filter(regex="^training/")
+  assert len(trained)
+  assert np.isfinite(trained.to_numpy()).all()
+  (dump,) = (run / "nan_dump").iterdir()
+  said = capsys.readouterr().out
+  assert said.count("playground replay") == 1
+  assert f"playground replay {dump}" in said
+
+  ((_, _, policy),) = watched
+  assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy))
+
+  assert replay(str(dump)) == 0
+  recorded, replayed = capsys.readouterr().out.split("replayed on cpu with impl=jax: NaN, infinite or absurd in ")
+  assert "recorded: NaN, infinite or absurd in" in recorded
+  assert "['qvel']: " in recorded
+  assert "['data'].qvel: " in replayed
+
+  (newest,) = find_checkpoints(run)
+  newest.rename(newest.with_name("kept"))  # as if killed before the checkpoint: the first bad step is found again
+  RunDirectory(run).set_status("running")
+  assert resume(run) == 0
+  assert list((run / "nan_dump").iterdir()) == [dump], "one dump a run, however often it is resumed"
+
+
+def test_too_many_nan_stop_the_run(tmp_path: Path, cache: Path, refused: Callable[..., str]) -> None:
+  run = tmp_path / "run"
+  sentence = refused(*UNSTABLE, "on_nonfinite.max_fraction=0.001", f"run_dir={run}")
+  assert "went NaN, infinite or absurd, more than on_nonfinite.max_fraction=0.001" in sentence
+  (dump,) = (run / "nan_dump").iterdir()
+  assert f"playground replay {dump}" in sentence
+  status = RunDirectory(run).status
+  assert (status["status"], f"error: {status['reason']}") == ("failed", sentence)
