@@ -3,7 +3,7 @@
 import mujoco
 
 from playground.errors import UnknownNameError, nearest
-from playground.robots.scene import add_studio
+from playground.robots.scene import add_studio_floor
 from playground.robots.tabletop import load
 
 # Files of `robots/aloha`, one for each task, and how far its left gripper closes, m: a gap left open while it holds the
@@ -26,16 +26,7 @@ def build_aloha_scene(task: str) -> mujoco.MjSpec:
   if task not in _CLOSED:
     raise UnknownNameError(f"task={task!r} is unknown: choose from {', '.join(_CLOSED)}.{nearest(task, _CLOSED)}")
   spec = load(f"aloha/{task}")
-  add_studio(spec)
-  spec.worldbody.add_geom(
-    name="floor",
-    type=mujoco.mjtGeom.mjGEOM_PLANE,
-    size=[0, 0, 0.05],
-    pos=[0, 0, -0.75],
-    contype=0,
-    conaffinity=0,
-    material="groundplane",
-  )
+  add_studio_floor(spec, -0.75, contype=0, conaffinity=0)
   gripper = spec.actuator("left/gripper")
   gripper.ctrlrange = [_CLOSED[task], gripper.ctrlrange[1]]
   for side in ("left", "right"):

@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 
 from playground.errors import UnknownNameError, nearest
-from playground.robots.scene import add_studio
+from playground.robots.scene import add_studio_floor
 from playground.robots.tabletop import load
 
 
@@ -63,16 +63,7 @@ def build_in_hand_scene(hand: str) -> mujoco.MjSpec:
   if hand not in CUBES:
     raise UnknownNameError(f"hand={hand!r} is unknown: choose from {', '.join(CUBES)}.{nearest(hand, CUBES)}")
   spec = load(f"{hand}/right_hand")
-  add_studio(spec)
-  spec.worldbody.add_geom(
-    name="floor",
-    type=mujoco.mjtGeom.mjGEOM_PLANE,
-    size=[0, 0, 0.01],
-    pos=[0, 0, -0.25],
-    contype=2,
-    conaffinity=2,
-    material="groundplane",
-  )
+  add_studio_floor(spec, -0.25, contype=2, conaffinity=2)
   _add_cube(spec, CUBES[hand])
   _add_position_sensors(spec)
   _add_goal(spec)

@@ -212,6 +212,13 @@ def add_studio(spec: mujoco.MjSpec) -> None:
   )
 
 
+def add_studio_floor(spec: mujoco.MjSpec, height: float = 0.0, **properties: Any) -> None:
+  """A studio with an infinite plane `height` m above the origin, the geom `floor`; `properties` are the geom's."""
+  add_studio(spec)
+  plane, at = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, height]
+  spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 0.05], pos=at, material="groundplane", **properties)
+
+
 COLLISIONS: dict[str, Callable[[mujoco.MjSpec], None]] = {
   "feet": _feet,
   "full_floor": _full_floor,

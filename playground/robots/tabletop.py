@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from playground.errors import UnknownNameError, nearest
-from playground.robots.scene import ROBOTS, add_studio
+from playground.robots.scene import ROBOTS, add_studio_floor
 
 # Pose from which the Panda picks things up: joints (rad), fingers (m).
 _ARM_HOME = (0, 0.3, 0, -1.57079, 0, 2, -0.7853)
@@ -99,10 +99,8 @@ def _panda() -> mujoco.MjSpec:
 
 def _add_floor(spec: mujoco.MjSpec, height: float = 0.0) -> None:
   """A studio and its floor, `height` m above the arm's base."""
-  add_studio(spec)
+  add_studio_floor(spec, height)
   spec.delete(spec.light("spotlight"))  # scenes here have lights of their own
-  plane = mujoco.mjtGeom.mjGEOM_PLANE
-  spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 0.05], pos=[0, 0, height], material="groundplane")
 
 
 def _add_top_light(spec: mujoco.MjSpec) -> None:
