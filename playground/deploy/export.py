@@ -9,7 +9,7 @@ import yaml
 from rich.console import Console
 
 from playground.deploy.policy import ExportedPolicy
-from playground.deploy.trained import TrainedPolicy
+from playground.deploy.trained import export_policy, load_exact, record
 from playground.errors import PlaygroundError
 from playground.extras import need
 from playground.runs.files import replacing, write_text
@@ -41,9 +41,9 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   """
   console = console or Console()
   need("deploy", "onnx", "onnxruntime")
-  trained = TrainedPolicy.open(path)
-  obs, actions, state = trained.record(_ENVS, _DECISIONS)
-  exported = trained.export(state)
+  trained = load_exact(path)
+  obs, actions, state = record(trained, _ENVS, _DECISIONS)
+  exported = export_policy(trained, state)
   error = check_parity(exported, obs, actions)
   folder = Path(out).expanduser() if out else trained.run_dir.path / "export"
   folder.mkdir(parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from playground import config as configs
 from playground.deploy.policy import ExportedPolicy
-from playground.deploy.trained import TrainedPolicy, load_on_c_physics
+from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
 from playground.errors import ConfigError
 from playground.extras import need
@@ -21,6 +21,7 @@ from playground.learning.evaluation import make_evaluator
 from playground.rendering.video import render_video
 from playground.runs.files import write_json
 from playground.runs.job import episodes_of
+from playground.runs.trained import Trained
 
 
 def play(
@@ -108,7 +109,7 @@ class Opened:
   exported: ExportedPolicy
   env: Env
   folder: Path
-  trained: TrainedPolicy | None = None
+  trained: Trained | None = None
 
 
 def open_policy(path: str) -> Opened:
@@ -122,10 +123,10 @@ def open_policy(path: str) -> Opened:
     task = exported.contract["task"]
     setup(this_machine(configs.compose([f"env={task}", "hardware=cpu"]).hardware))
     return Opened(exported, load_on_c_physics(task, exported.contract["env"]), Path(path).expanduser().parent)
-  trained = TrainedPolicy.open(path)
+  trained = load_exact(path)
   folder = trained.run_dir.path / "export"
   folder.mkdir(exist_ok=True)
-  return Opened(trained.export(), trained.env, folder, trained)
+  return Opened(export_policy(trained), trained.env, folder, trained)
 
 
 def _table(contract: Mapping[str, Any], episodes: int, scores: Mapping[str, float]) -> Table:

@@ -9,9 +9,10 @@ import numpy as np
 
 from playground.deploy.player import Player
 from playground.deploy.policy import ExportedPolicy
-from playground.deploy.trained import TrainedPolicy, load_on_c_physics
+from playground.deploy.trained import export_policy, load_on_c_physics
 from playground.envs.base import Env
 from playground.learning.checkpoints import find_checkpoints
+from playground.runs.trained import Trained
 
 
 class Session:
@@ -29,7 +30,7 @@ class Session:
   """
 
   def __init__(
-    self, env: Env, exported: ExportedPolicy, seed: int, trained: TrainedPolicy | None = None, following: bool = True
+    self, env: Env, exported: ExportedPolicy, seed: int, trained: Trained | None = None, following: bool = True
   ):
     """Starts an episode of a policy; `trained` is the checkpoint that it is from, if a run is at hand."""
     self._seed = seed
@@ -97,7 +98,7 @@ class Session:
     """Control steps trained of the run's checkpoints, newest first; the one that acts is among them, though gone."""
     if self.trained is None:
       return []
-    return sorted({self.trained.step, *(int(path.name) for path in self._checkpoints())}, reverse=True)
+    return sorted({self.trained.checkpoint.step, *(int(path.name) for path in self._checkpoints())}, reverse=True)
 
   def choose_checkpoint(self, step: int | None) -> None:
     """Lets the policy of a checkpoint act, from now on the newest if None; raises CheckpointError if it is gone."""
@@ -120,10 +121,10 @@ class Session:
 
   def _act_as(self, path: Path) -> None:
     assert self.trained is not None
-    if int(path.name) == self.trained.step:
+    if int(path.name) == self.trained.checkpoint.step:
       return
     self.trained = self.trained.at(path)
-    self.player.exported = self.trained.export(self.player.state)
+    self.player.exported = export_policy(self.trained, self.player.state)
 
   def _begin(self) -> None:
     self._due = 0.0

@@ -29,7 +29,7 @@ class Trained:
     run_dir: the run's directory.
     config: the run's configuration.
     checkpoint: where the policy is from.
-    env: the task, as the run trained it.
+    env: the task, as the run trained it, unless it was asked for otherwise.
     hardware: this machine's devices.
     learner: the algorithm, whose `act(policy, obs, key, deterministic)` gives actions.
     policy: networks and normaliser, on the devices.
@@ -50,6 +50,12 @@ class Trained:
   def act(self, obs: Any, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
     """Actions in [-1, 1], [..., action_size]."""
     return self.learner.act(self.policy, obs, key, deterministic)
+
+  def at(self, path: Path) -> "Trained":
+    """The policy of another checkpoint of the run; raises CheckpointError if it is gone or damaged."""
+    checkpoint = Checkpoint(path)
+    policy = self.learner.place_policy(checkpoint.restore("policy", self.learner.policy_shape()))
+    return dataclasses.replace(self, checkpoint=checkpoint, policy=policy)
 
 
 def load_trained(

@@ -54,7 +54,7 @@ class Panel:
     """Shows where the session stands."""
     session, player = self._session, self._session.player
     contract = player.exported.contract
-    steps = contract["origin"]["steps"] if session.trained is None else session.trained.step
+    steps = contract["origin"]["steps"] if session.trained is None else session.trained.checkpoint.step
     lines = [
       f"**{contract['task']}**, {steps:,} steps trained",
       f"{player.seconds:.1f} s, return {player.episode_return:.2f}",
@@ -118,7 +118,7 @@ class Panel:
       self.terrain = self._gui.add_dropdown("Terrain", tuple(TERRAINS), initial_value=session.terrain)
       self.terrain.on_update(lambda _: self._ask(lambda name=self.terrain.value: session.choose_terrain(name)))
     if session.trained is not None:
-      now = LATEST if session.following else _label(session.trained.step)
+      now = LATEST if session.following else _label(session.trained.checkpoint.step)
       self.checkpoint = self._gui.add_dropdown("Checkpoint", (LATEST, *map(_label, session.steps())), initial_value=now)
       self.checkpoint.on_update(lambda _: self._ask(lambda label=self.checkpoint.value: self._choose(label)))
 
