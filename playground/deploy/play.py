@@ -23,6 +23,8 @@ from playground.runs.files import write_json
 from playground.runs.job import episodes_of
 from playground.runs.trained import Trained
 
+_BACKENDS = {"jax": "MJX ", "warp": "MJX-Warp "}  # by the manifest's `impl`; a policy exported long ago tells none
+
 
 def play(
   path: str,
@@ -131,12 +133,13 @@ def open_policy(path: str) -> Opened:
 
 def _table(contract: Mapping[str, Any], episodes: int, scores: Mapping[str, float]) -> Table:
   """Scores, beside those of the last evaluation in training."""
-  trained = contract["origin"]["evaluation"]
-  title = f"{contract['task']}, {contract['origin']['steps']:,} steps trained"
+  origin = contract["origin"]
+  trained = origin["evaluation"]
+  title = f"{contract['task']}, {origin['steps']:,} steps trained"
   table = Table("per episode", title=title)
   table.add_column(f"C MuJoCo, mean of {episodes}", justify="right")
   if trained:
-    table.add_column(f"MJX in training, at {trained['steps']:,} steps", justify="right")
+    table.add_column(f"{_BACKENDS.get(origin.get('impl'), '')}in training, at {trained['steps']:,} steps", justify="right")
     table.caption = "Here the model as it is and the policy's mode; in training as that was configured."
   for name, value in scores.items():
     beside = [f"{trained[name]:.4g}" if name in trained else ""] if trained else []

@@ -66,6 +66,7 @@ def export_policy(trained: Trained, state: State | None = None) -> ExportedPolic
     "agent": agent.name,
     "steps": trained.checkpoint.step,
     **(trained.run_dir.manifest.get("git") or {}),
+    "impl": trained.run_dir.manifest.get("impl"),
     "evaluation": _newest_evaluation(trained),
   }
   state = jax.jit(trained.env.reset)(jax.random.PRNGKey(0)) if state is None else state

@@ -23,7 +23,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
   """A run's directory as training leaves it."""
   path = tmp_path_factory.mktemp("deploy") / "run"
   run = UntrainedRun(path, "CartpoleBalance", "debug=fast", "env.episode_length=40")
-  run.directory.update_manifest(git={"commit": "abc", "dirty": False})
+  run.directory.update_manifest(git={"commit": "abc", "dirty": False}, impl="warp")
   run.directory.metrics_csv.write_text(
     "step,eval/episode_reward,eval/episode_length\n0,1.0,40\n2000,12.5,40\n2500,,\n4000,30.0,40\n"
   )
@@ -43,7 +43,7 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
   assert difference and float(difference[1]) <= 1e-5
   assert re.search(r"\d+ µs \(median\).* of the 10,000 µs there are at 100 Hz", out)
   contract = yaml.safe_load((run / "export" / "policy.yaml").read_text())
-  origin = {"run": "run", "agent": "ppo", "steps": STEPS, "commit": "abc", "dirty": False}
+  origin = {"run": "run", "agent": "ppo", "steps": STEPS, "commit": "abc", "dirty": False, "impl": "warp"}
   assert origin.items() <= contract["origin"].items()
   assert contract["origin"]["evaluation"] == {"steps": 2000, "episode_reward": 12.5, "episode_length": 40}
 
@@ -54,6 +54,7 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
     report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4.json").read_text())
     assert (report["simulator"], report["episodes"]) == ("C MuJoCo", 3)
     scores.append(report["scores"])
+    assert "MJX-Warp in training, at 2,000 steps" in shown
     assert re.search(rf"reward\W+{scores[-1]['episode_reward']:.4g}\W+12.5\b", shown)
   assert scores[0] == scores[1]
   assert 0 < scores[0]["episode_reward"] < 40 == scores[0]["episode_length"]
