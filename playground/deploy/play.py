@@ -139,7 +139,8 @@ def _table(contract: Mapping[str, Any], episodes: int, scores: Mapping[str, floa
   table = Table("per episode", title=title)
   table.add_column(f"C MuJoCo, mean of {episodes}", justify="right")
   if trained:
-    table.add_column(f"{_BACKENDS.get(origin.get('impl'), '')}in training, at {trained['steps']:,} steps", justify="right")
+    backend = _BACKENDS.get(origin.get("impl"), "")
+    table.add_column(f"{backend}in training, at {trained['steps']:,} steps", justify="right")
     table.caption = "Here the model as it is and the policy's mode; in training as that was configured."
   for name, value in scores.items():
     beside = [f"{trained[name]:.4g}" if name in trained else ""] if trained else []

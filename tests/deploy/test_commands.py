@@ -54,7 +54,7 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
     report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4.json").read_text())
     assert (report["simulator"], report["episodes"]) == ("C MuJoCo", 3)
     scores.append(report["scores"])
-    assert "MJX-Warp in training, at 2,000 steps" in shown
+    assert "MJX-Warp in training" in shown
     assert re.search(rf"reward\W+{scores[-1]['episode_reward']:.4g}\W+12.5\b", shown)
   assert scores[0] == scores[1]
   assert 0 < scores[0]["episode_reward"] < 40 == scores[0]["episode_length"]
