@@ -219,14 +219,19 @@ def find_checkpoints(path: str | Path) -> list[Path]:
   if path.name.isdigit() and path.parent.name == "checkpoints":
     return [path]
   folder = path if path.name == "checkpoints" else path / "checkpoints"
-  if not folder.is_dir():
-    number = lambda folder: folder.parent.name.partition("_")[0]
-    stages = [p for p in path.glob("*_*/checkpoints/") if number(p).isdigit() and any(p.iterdir())]
-    folder = max(stages, key=lambda p: int(number(p)), default=folder)
+  if not folder.is_dir() and (stages := find_stages(path)):
+    folder = stages[-1] / "checkpoints"
   found = _by_step(folder)
   if not found:
     raise CheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
   return [found[step] for step in sorted(found, reverse=True)]
+
+
+def find_stages(chain: Path) -> list[Path]:
+  """The stages in a chain's directory that have a checkpoint, the last one last."""
+  number = lambda stage: stage.name.partition("_")[0]
+  stages = [stage for stage in chain.glob("*_*/") if number(stage).isdigit() and _by_step(stage / "checkpoints")]
+  return sorted(stages, key=lambda stage: int(number(stage)))
 
 
 def _by_step(folder: Path) -> dict[int, Path]:

@@ -288,6 +288,15 @@ def test_find_checkpoints(tmp_path: Path) -> None:
   assert find_checkpoints(expected[1]) == [expected[1]]
 
 
+def test_those_of_a_chain(tmp_path: Path) -> None:
+  """They are the last stage's that has any: one that is about to save its first has none."""
+  save(tmp_path / "2_near", 20)
+  expected = save(tmp_path / "10_far", 10)
+  (tmp_path / "11_next/checkpoints/000000000005.orbax-checkpoint-tmp").mkdir(parents=True)
+  assert find_checkpoints(tmp_path) == expected
+  assert [path.name for path in checkpoints.find_stages(tmp_path)] == ["2_near", "10_far"]
+
+
 def test_an_unfinished_save_is_cleaned_away(tmp_path: Path) -> None:
   save(tmp_path, 10)
   half = tmp_path / "checkpoints" / "000000000020.orbax-checkpoint-tmp"
