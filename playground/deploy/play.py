@@ -10,7 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from playground import config as configs
+from playground.deploy.menu import Menu
 from playground.deploy.policy import ExportedPolicy
+from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
 from playground.errors import ConfigError
@@ -77,11 +79,12 @@ def play(
     view(env, exported, seed, console)
     return 0
   if web:
-    from playground.deploy.session import Session
     from playground.deploy.web.server import watch
 
-    whole_run = Path(path).expanduser().parent.name != "checkpoints"
-    watch(Session(env, exported, seed, opened.trained, following=whole_run), host, port, console)
+    given = Path(path).expanduser().absolute()
+    menu = _menu(given, opened.trained, console) if opened.trained else None
+    following = None if given.parent.name == "checkpoints" else LATEST
+    watch(Session(env, exported, seed, menu, following), host, port, console)
     return 0
   evaluate = make_evaluator(env, exported.act, episodes, make_mesh(1), 1 if video else 0)
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {})
@@ -129,6 +132,12 @@ def open_policy(path: str) -> Opened:
   folder = trained.run_dir.path / "export"
   folder.mkdir(exist_ok=True)
   return Opened(export_policy(trained), trained.env, folder, trained)
+
+
+def _menu(given: Path, trained: Trained, console: Console) -> Menu:
+  """The checkpoints of the run that `given` is, or is in; of all stages, if it is a chain."""
+  run = trained.run_dir.path
+  return Menu(given if given == run.parent else run, trained, lambda said: console.print(said, soft_wrap=True))
 
 
 def _table(contract: Mapping[str, Any], episodes: int, scores: Mapping[str, float]) -> Table:

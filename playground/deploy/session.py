@@ -7,12 +7,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from playground.deploy.menu import Menu
 from playground.deploy.player import Player
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.trained import export_policy, load_on_c_physics
 from playground.envs.base import Env
-from playground.learning.checkpoints import find_checkpoints
-from playground.runs.trained import Trained
+from playground.learning.checkpoints import BEST
+
+LATEST = "latest"
 
 
 class Session:
@@ -23,19 +25,20 @@ class Session:
   Attributes:
     player: who acts; another takes its place when the terrain changes.
     trained: the run's policy that acts; None without a run.
-    following: whether the newest checkpoint is to act, as training goes on.
+    following: `LATEST` or `BEST` if that checkpoint is to act, as training goes on, None if the one that does.
     paused: whether time stands still.
     speed: simulated seconds in one.
     previous_qpos: the joints' positions at the decision before the last, [nq].
   """
 
   def __init__(
-    self, env: Env, exported: ExportedPolicy, seed: int, trained: Trained | None = None, following: bool = True
+    self, env: Env, exported: ExportedPolicy, seed: int, menu: Menu | None = None, following: str | None = LATEST
   ):
-    """Starts an episode of a policy; `trained` is the checkpoint that it is from, if a run is at hand."""
+    """Starts an episode of a policy; `menu` holds the checkpoint that it is from, if a run is at hand."""
     self._seed = seed
     self.player = Player(env, exported, seed)
-    self.trained = trained
+    self._menu = menu
+    self.trained = menu.trained if menu else None
     self.following = following
     self.paused = False
     self.speed = 1.0
@@ -94,34 +97,44 @@ class Session:
     self.player.command = old.command
     self._begin()
 
-  def steps(self) -> list[int]:
-    """Control steps trained of the run's checkpoints, newest first; the one that acts is among them, though gone."""
-    if self.trained is None:
-      return []
-    return sorted({self.trained.checkpoint.step, *(int(path.name) for path in self._checkpoints())}, reverse=True)
+  @property
+  def acting(self) -> str:
+    """Control steps trained of the policy that acts, in a chain behind its stage's name."""
+    if self._menu is None or self.trained is None:
+      return f"{self.player.exported.contract['origin']['steps']:,}"
+    return self._menu.label(self.trained.checkpoint.path)
 
-  def choose_checkpoint(self, step: int | None) -> None:
-    """Lets the policy of a checkpoint act, from now on the newest if None; raises CheckpointError if it is gone."""
-    self.following, self._tried = step is None, None
-    if step is not None and self.trained is not None:
-      self._act_as(self.trained.run_dir.checkpoints / f"{step:012d}")
+  def choices(self) -> dict[str, str | Path]:
+    """What can be chosen to act, by label: `LATEST`, `BEST` if there is one, and checkpoints, newest last.
+
+    The one that acts is among them, though gone. Empty without a run.
+    """
+    if self._menu is None or self.trained is None:
+      return {}
+    choices: dict[str, str | Path] = {LATEST: LATEST}
+    if (best := self._menu.best()) is not None:
+      choices[f"{BEST} ({self._menu.label(best)})"] = BEST
+    checkpoints = self._menu.checkpoints(self.trained.checkpoint.path)
+    return choices | {self._menu.label(path): path for path in checkpoints}
+
+  def choose_checkpoint(self, choice: str | Path) -> None:
+    """Lets one of `choices` act; raises CheckpointError if it is gone."""
+    self.following, self._tried = None if isinstance(choice, Path) else choice, None
+    if isinstance(choice, Path):
+      self._act_as(choice)
 
   def follow(self) -> None:
-    """Lets the newest checkpoint act, if that is asked for; raises CheckpointError if it cannot be read."""
-    if not self.following or self.trained is None:
+    """Lets the newest or best checkpoint act, if that is asked for; raises CheckpointError if it cannot be read."""
+    if self.following is None or self._menu is None:
       return
-    newest = self._checkpoints()[0]
-    if newest != self._tried:
-      self._tried = newest
-      self._act_as(newest)
-
-  def _checkpoints(self) -> list[Path]:
-    assert self.trained is not None
-    return find_checkpoints(self.trained.run_dir.path)
+    wanted = self._menu.best() if self.following == BEST else self._menu.checkpoints()[-1]
+    if wanted is not None and wanted != self._tried:
+      self._tried = wanted
+      self._act_as(wanted)
 
   def _act_as(self, path: Path) -> None:
     assert self.trained is not None
-    if int(path.name) == self.trained.checkpoint.step:
+    if path == self.trained.checkpoint.path:
       return
     self.trained = self.trained.at(path)
     self.player.exported = export_policy(self.trained, self.player.state)

@@ -52,10 +52,14 @@ class Trained:
     return self.learner.act(self.policy, obs, key, deterministic)
 
   def at(self, path: Path) -> "Trained":
-    """The policy of another checkpoint of the run; raises CheckpointError if it is gone or damaged."""
+    """The policy of another checkpoint of the run, or of a stage of its chain, with this one's task and configuration.
+
+    Raises:
+      CheckpointError: it is gone or damaged, or its arrays have other shapes.
+    """
     checkpoint = Checkpoint(path)
     policy = self.learner.place_policy(checkpoint.restore("policy", self.learner.policy_shape()))
-    return dataclasses.replace(self, checkpoint=checkpoint, policy=policy)
+    return dataclasses.replace(self, run_dir=RunDirectory(path.parents[1]), checkpoint=checkpoint, policy=policy)
 
 
 def load_trained(

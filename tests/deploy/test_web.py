@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from playground.cli.main import main
+from playground.deploy.menu import Menu
 from playground.deploy.play import open_policy
 from playground.deploy.session import Session
 from playground.deploy.web.server import Watch
@@ -35,7 +36,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> UntrainedRun:
 @pytest.fixture(scope="module")
 def watch(run: UntrainedRun) -> Iterator[Watch]:
   opened = open_policy(str(run.directory.path))
-  watch = Watch(Session(opened.env, opened.exported, 0, opened.trained), "127.0.0.1", free_port())
+  assert opened.trained is not None
+  menu = Menu(run.directory.path, opened.trained, print)
+  watch = Watch(Session(opened.env, opened.exported, 0, menu), "127.0.0.1", free_port())
   yield watch
   watch.close()
 
@@ -113,28 +116,47 @@ def test_checkpoints_follow_the_training(watch: Watch, session: Session, run: Un
   menu = watch.panel.checkpoint
   acting = lambda: session.player.exported.contract["origin"]["steps"]
   refresh = lambda: (session.carry_out(), session.follow(), watch.panel.draw())
-  assert (menu.value, menu.options, acting()) == ("latest", ("latest", "2,000", "1,000"), 2000)
+  assert (menu.value, menu.options, acting()) == ("latest", ("latest", "1,000", "2,000"), 2000)
   run.save(3000)
   refresh()
-  assert menu.options == ("latest", "3,000", "2,000", "1,000") and acting() == 3000
+  assert menu.options == ("latest", "1,000", "2,000", "3,000") and acting() == 3000
   menu.value = "1,000"
   refresh()
   run.save(4000)  # three are kept: the one that acts is no more
   refresh()
-  assert menu.options == ("latest", "4,000", "3,000", "2,000", "1,000") and acting() == 1000
+  assert menu.options == ("latest", "1,000", "2,000", "3,000", "4,000") and acting() == 1000
   menu.value = "latest"
   refresh()
   assert acting() == 4000 and menu.value == "latest"
 
+  run.save(5000, episode_return=2.0)
+  run.save(6000, episode_return=1.0)
+  refresh()
+  assert menu.options == ("latest", "best (5,000)", "4,000", "5,000", "6,000") and acting() == 6000
+  menu.value = "best (5,000)"
+  refresh()
+  assert acting() == 5000
+  run.save(7000, episode_return=3.0)
+  refresh()
+  assert (menu.value, acting()) == ("best (7,000)", 7000), "training goes on, and so does the best"
+  run.save(8000)
+  refresh()
+  assert menu.options == ("latest", "best (7,000)", "6,000", "7,000", "8,000") and acting() == 7000
+  menu.value = "latest"
+  refresh()
+  assert acting() == 8000
 
-def test_a_checkpoint_that_is_gone(watch: Watch, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+
+def test_a_checkpoint_that_is_gone(
+  watch: Watch, session: Session, run: UntrainedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
   said: list[str] = []
   monkeypatch.setattr(watch.panel, "say", lambda title, body: said.append(body))
-  session.ask(lambda: session.choose_checkpoint(77))
+  session.ask(lambda: session.choose_checkpoint(run.directory.checkpoints / f"{77:012d}"))
   acting = session.player.exported
   watch.frame()
   assert len(said) == 1 and "000000000077" in said[0] and session.player.exported is acting
-  session.choose_checkpoint(None)
+  session.choose_checkpoint("latest")
 
 
 def test_terrain(watch: Watch, session: Session) -> None:

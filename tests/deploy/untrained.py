@@ -29,11 +29,11 @@ class UntrainedRun:
     weights = jax.tree.map(lambda x: rng.uniform(0.1, 0.5, x.shape).astype(x.dtype), learner.policy_shape())
     self._policy = Policy(jax.tree.map(lambda x: x * np.float32(scale), weights.params), weights.normalizer)
 
-  def save(self, *steps: int) -> None:
+  def save(self, *steps: int, episode_return: float | None = None) -> None:
     """Writes checkpoints."""
     store = CheckpointStore(self.directory.checkpoints)
     for step in steps:
-      store.save(step, self._policy, {"rest": np.zeros(1)}, {"env": self._task})
+      store.save(step, self._policy, {"rest": np.zeros(1)}, {"env": self._task}, episode_return=episode_return)
     store.close()
 
 

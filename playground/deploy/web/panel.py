@@ -3,7 +3,8 @@
 Keys move the sliders, and the sliders move the player, so that there is one way for a command to go.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from playground.deploy.web.gamepad import Gamepads
 from playground.deploy.web.plots import Plots
 from playground.robots.terrain import TERRAINS
 
-LATEST = "latest"
 # Component of the command, key that adds to it, key that takes away; viser moves its camera with WASD, QE and arrows.
 AXES: tuple[tuple[str, Any, Any], ...] = (
   ("forward, m/s", "I", "K"),
@@ -54,9 +54,8 @@ class Panel:
     """Shows where the session stands."""
     session, player = self._session, self._session.player
     contract = player.exported.contract
-    steps = contract["origin"]["steps"] if session.trained is None else session.trained.checkpoint.step
     lines = [
-      f"**{contract['task']}**, {steps:,} steps trained",
+      f"**{contract['task']}**, {session.acting} steps trained",
       f"{player.seconds:.1f} s, return {player.episode_return:.2f}",
     ]
     if player.takes_commands:
@@ -64,10 +63,8 @@ class Panel:
       lines.append(f"command {' / '.join(f'{value:.2f}' for value in player.task_command)} ({who})")
     self._status.content = "  \n".join(lines)
     self.plots.draw()
-    if session.trained is not None:
-      options = (LATEST, *map(_label, session.steps()))
-      if options != self.checkpoint.options:
-        self.checkpoint.options = options
+    if choices := session.choices():
+      self._offer(choices)
 
   def say(self, title: str, body: str) -> None:
     """Shows a sentence to all who watch."""
@@ -117,10 +114,12 @@ class Panel:
     if session.terrain is not None:
       self.terrain = self._gui.add_dropdown("Terrain", tuple(TERRAINS), initial_value=session.terrain)
       self.terrain.on_update(lambda _: self._ask(lambda name=self.terrain.value: session.choose_terrain(name)))
-    if session.trained is not None:
-      now = LATEST if session.following else _label(session.trained.checkpoint.step)
-      self.checkpoint = self._gui.add_dropdown("Checkpoint", (LATEST, *map(_label, session.steps())), initial_value=now)
-      self.checkpoint.on_update(lambda _: self._ask(lambda label=self.checkpoint.value: self._choose(label)))
+    if choices := session.choices():
+      self._choices = choices
+      self.checkpoint = self._gui.add_dropdown("Checkpoint", tuple(choices), initial_value=self._chosen(choices))
+      self.checkpoint.on_update(
+        lambda _: self._ask(lambda label=self.checkpoint.value: session.choose_checkpoint(self._choices[label]))
+      )
 
   def _steer(self, sticks: Sequence[float]) -> None:
     """Sets the command from sticks in [-1, 1], whose ends are those of the sliders."""
@@ -133,8 +132,18 @@ class Panel:
   def _toggle_pause(self) -> None:
     self.paused.value = not self.paused.value
 
-  def _choose(self, label: str) -> None:
-    self._session.choose_checkpoint(None if label == LATEST else int(label.replace(",", "")))
+  def _offer(self, choices: Mapping[str, str | Path]) -> None:
+    """Brings the menu of checkpoints up to date."""
+    self._choices |= choices  # a label that is gone may just have been clicked
+    if tuple(choices) == self.checkpoint.options:
+      return
+    if self.checkpoint.value not in choices:  # the best is another by now
+      self.checkpoint.value = self._chosen(choices)
+    self.checkpoint.options = tuple(choices)
+
+  def _chosen(self, choices: Mapping[str, str | Path]) -> str:
+    session = self._session
+    return next((label for label, choice in choices.items() if choice == session.following), session.acting)
 
   def _add_button(self, label: str, key: Any, act: Callable[[], None]) -> viser.GuiButtonHandle:
     button = self._gui.add_button(f"{label} ({key})")
@@ -149,10 +158,6 @@ class Panel:
   def _ask(self, act: Callable[[], None]) -> None:
     self._status.content = "one moment ..."
     self._session.ask(act)
-
-
-def _label(step: int) -> str:
-  return f"{step:,}"
 
 
 def _set(slider: viser.GuiSliderHandle[float], value: float) -> None:

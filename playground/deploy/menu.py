@@ -1,0 +1,70 @@
+"""What somebody who watches a policy can choose from: the checkpoints of a run, or of all stages of a chain."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from playground.errors import CheckpointError
+from playground.learning.checkpoints import BEST, find_checkpoints, find_stages
+from playground.runs.trained import Trained
+
+# Keys of a run's config that give meaning to what an actor reads and gives; how many numbers that is, its arrays tell.
+_ENV = ("task", "robot", "hand", "obs", "obs_scales", "history", "frames", "vision", "parity", "parity_obs")
+_CONTROL = ("ctrl_dt", "action_repeat", "action_base", "action_scale", "clip_targets")
+_MEANING = {"env": (*_ENV, *_CONTROL), "agent": ("name", "network", "normalize_observations")}
+
+
+class Menu:
+  """The checkpoints that lie on disk, as training adds and removes them.
+
+  A stage of a chain is left out, with a sentence, if its policies cannot take the place of the newest stage's.
+
+  Attributes:
+    trained: the checkpoint to begin with.
+  """
+
+  def __init__(self, folder: Path, trained: Trained, say: Callable[[str], object]):
+    """Takes the absolute folder of a run or a chain, a checkpoint of its last stage, and who shows a sentence."""
+    self.trained = trained
+    self._folder, self._say = folder, say
+    self._fits = {trained.run_dir.path: True}
+
+  def checkpoints(self, acting: Path | None = None) -> list[Path]:
+    """All there are, newest last, and the one that acts, though it be gone."""
+    here = lambda stage: {acting} if acting is not None and acting.parents[1] == stage else set()
+    return [path for stage in self._stages() for path in sorted({*find_checkpoints(stage), *here(stage)})]
+
+  def best(self) -> Path | None:
+    """The one with the highest return of the last stage; None if there is none that has a return."""
+    try:
+      return find_checkpoints(self._stages()[-1] / "checkpoints" / BEST)[0]
+    except CheckpointError:
+      return None
+
+  def label(self, path: Path) -> str:
+    """Control steps trained, in a chain behind the stage's name."""
+    stage = path.parents[1]
+    name = "" if stage == self._folder else f"{stage.name.partition('_')[2]} "
+    return f"{name}{int(path.name):,}"
+
+  def _stages(self) -> list[Path]:
+    """The run, or the chain's stages to choose from, the last one last."""
+    if self._folder == self.trained.run_dir.path:
+      return [self._folder]
+    stages = find_stages(self._folder)
+    for stage in stages:
+      if stage not in self._fits:
+        self._fits[stage] = not (reason := self._misfit(stage))
+        if reason:
+          self._say(f"Stage {stage.name} is left out: {reason}")
+    return [stage for stage in stages if self._fits[stage]]
+
+  def _misfit(self, stage: Path) -> str:
+    """Why a stage's policies cannot act here, "" if they can."""
+    try:
+      theirs = self.trained.at(find_checkpoints(stage)[0]).run_dir.config
+    except CheckpointError as error:
+      return str(error)
+    ours = self.trained.run_dir.config
+    keys = [(section, key) for section, keys in _MEANING.items() for key in keys]
+    other = [f"{section}.{key}" for section, key in keys if theirs[section].get(key) != ours[section].get(key)]
+    return f"{other[0]} is not that of {self.trained.run_dir.path.name}." if other else ""
