@@ -33,7 +33,7 @@ QUANTITIES = {
   "training_steps_per_s": "control steps (action repeats counted) trained on a second: collecting and learning",
   "env_steps_per_s": "control steps a second with random actions, episodes limited and reset, nothing learned",
   "trace_s": "tracing the run's functions in Python",
-  "compile_s": "compiling them, side by side, after tracing",
+  "compile_s": "compiling them, side by side, after tracing; on a GPU Warp's kernels, too",
   "start_to_first_update_s": "from the start of the process to the end of the first update",
   "peak_memory_gib": "most memory that JAX's allocator held on one device (Warp's own is not in it)",
   "used_memory_gib": "most memory in use on the GPU while it ran, what was in use before taken off (nvidia-smi)",

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
+from playground.envs.warp_kernels import Building
+
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
 
@@ -137,6 +139,12 @@ class Physics:
     still = copy.copy(self)
     still._forward = lambda model, data: data
     return still
+
+  def compile_ahead(self) -> Building | None:
+    """Starts to compile what Warp will need on a GPU; None where there is nothing to be gained."""
+    if self.impl != "warp" or jax.default_backend() != "gpu":
+      return None
+    return Building(self.mj_model, self._njmax)
 
   def make(self, **fields: jax.Array) -> PhysicsData:
     """Returns the model's default state with `fields` replaced; derived fields are those of fresh data."""

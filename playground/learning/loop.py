@@ -78,7 +78,7 @@ class Hooks(Protocol):
 
 @dataclasses.dataclass
 class Program:
-  """The compiled functions of one run, and how long they took to make (s)."""
+  """The compiled functions of one run, how long they took to make (s), and a sentence on what went wrong with it."""
 
   init: Any
   train: Any
@@ -87,13 +87,15 @@ class Program:
   copy: Any
   trace_s: float
   compile_s: float
+  notice: str | None
 
 
 def compile_program(learner: Learner, evaluate: Any, model: ModelFields, eval_model: ModelFields) -> Program:
-  """Traces each function once and compiles them side by side, ahead of the first step."""
+  """Traces each function once and compiles them side by side, Warp's kernels too, ahead of the first step."""
   key = jax.ShapeDtypeStruct((2,), jnp.uint32)
   start, trace_s = time.perf_counter(), 0.0
   pool = ThreadPoolExecutor(thread_name_prefix=COMPILER)
+  kernels = learner.env.unwrapped.physics.compile_ahead()
 
   def submit(function: Any, *args: Any) -> tuple[Any, Any]:
     nonlocal trace_s
@@ -112,11 +114,14 @@ def compile_program(learner: Learner, evaluate: Any, model: ModelFields, eval_mo
     reset, _ = submit(learner.reset, state, key, model)
     copied, _ = submit(learner.copy, state)
     compiled = [future.result() for future in (init, train, reset, evaluated, copied)]
+    notice = None if kernels is None else kernels.wait()
   finally:
+    if kernels is not None:
+      kernels.stop()
     pool.shutdown(wait=False, cancel_futures=True)  # an interrupted run does not wait for its compiler
     if collecting:
       gc.enable()
-  return Program(*compiled, trace_s=trace_s, compile_s=time.perf_counter() - start - trace_s)
+  return Program(*compiled, trace_s=trace_s, compile_s=time.perf_counter() - start - trace_s, notice=notice)
 
 
 @dataclasses.dataclass

@@ -99,6 +99,8 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
       progress.print(notice)
     progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
     program = compile_program(learner, evaluate, model, eval_model)
+    if program.notice:
+      progress.print(program.notice)
     to_compiled_s = process_age_s() - began_s
     timings = {"start_to_compiled_s": to_compiled_s, "trace_s": program.trace_s, "compile_s": program.compile_s}
     run_dir.update_manifest(timings=timings)
