@@ -5,8 +5,10 @@ The device is not kept waiting: a thread of its own logs and saves what was done
 
 import dataclasses
 import gc
+import itertools
 import math
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
@@ -51,6 +53,12 @@ def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_upd
     marks.append(Mark(stop, stop in evals and num_evals > 0, stop in resets))
     at = stop
   return marks
+
+
+def longest_stretch(marks: Sequence[Mark]) -> int:
+  """The most training steps from one fresh start of all environments to the next, or to the end of the run."""
+  starts = [0, *(mark.update for mark in marks if mark.reset), marks[-1].update]
+  return max(after - before for before, after in itertools.pairwise(starts))
 
 
 class Hooks(Protocol):

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -17,7 +18,7 @@ from playground.learning.algorithms import algorithm
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
 from playground.learning.learner import Learner
-from playground.learning.loop import Loop, compile_program, schedule
+from playground.learning.loop import Loop, Mark, compile_program, longest_stretch, schedule
 from playground.randomization import Randomizer
 from playground.rendering.visuals import drawn_model
 from playground.runs.chain import train_chain
@@ -79,6 +80,7 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
 
   num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
   marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
+  start.notices += cut_short(agent, env.episode_length, marks, learner.steps_per_update)
   num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
   evaluate = make_evaluator(env, learner.act, agent.num_eval_envs, hardware.mesh, num_recorded)
   if not is_main():
@@ -112,6 +114,27 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
       job.finish(loop, state, completed)
   _say_where(run_dir)
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+
+
+def cut_short(agent: Any, episode_length: int, marks: Sequence[Mark], steps_per_update: int) -> list[str]:
+  """A sentence for the user where fresh starts of all environments leave no time for a whole episode.
+
+  They come closer with fewer steps to train: a trial of a tenth of the steps sees a tenth as much of an episode, and
+  what comes later (the next command, the second push) finds the policy unprepared.
+
+  Args:
+    agent: the algorithm's settings.
+    episode_length: of the task, control steps.
+    marks: of the run.
+    steps_per_update: control steps of one training step, over all environments.
+  """
+  seen = longest_stretch(marks) * steps_per_update // agent.num_envs
+  if seen >= episode_length or not any(mark.reset for mark in marks):
+    return []
+  return [
+    f"Training sees the first {seen} of an episode's {episode_length} control steps: then all environments start "
+    f"afresh (agent.num_resets_per_eval={agent.num_resets_per_eval}; fewer, or more steps, let episodes go on)."
+  ]
 
 
 def _run(loop: Loop, learner: Learner, start: Start, interrupts: Interrupts) -> tuple[Any, bool]:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from playground.learning.loop import Mark, schedule
+from playground.learning.loop import Mark, longest_stretch, schedule
 
 
 def test_a_short_run_written_out() -> None:
@@ -43,3 +43,10 @@ def test_any_schedule_covers_the_budget_in_order(updates: int, evals: int, reset
 def test_resets_fall_between_evaluations(resets: int) -> None:
   marks = schedule(100, 5, resets, 100)
   assert sum(mark.reset for mark in marks) == 4 * resets - 1
+
+
+def test_the_longest_stretch_is_from_one_fresh_start_to_the_next_or_to_the_end() -> None:
+  assert longest_stretch(schedule(12, num_evals=3, num_resets_per_eval=2, max_updates=2)) == 3
+  assert longest_stretch(schedule(7, num_evals=2, num_resets_per_eval=3, max_updates=50)) == 3  # 2, 3, 2
+  assert longest_stretch(schedule(12, num_evals=3, num_resets_per_eval=0, max_updates=2)) == 12
+  assert longest_stretch([Mark(4), Mark(5, reset=True), Mark(8)]) == 5

@@ -1,5 +1,6 @@
 """Whole runs: what they leave behind, and that nothing that ends one early changes what comes out."""
 
+import math
 import os
 import shutil
 import signal
@@ -17,9 +18,10 @@ import pytest
 
 from playground.config import compose
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
+from playground.learning.loop import schedule
 from playground.runs.run_dir import RunDirectory
 from playground.runs.start import Start
-from playground.runs.train import train
+from playground.runs.train import cut_short, train
 from tests.runs.helpers import TASK, resume
 
 BATCH = 80  # environment steps of one training step with debug=fast
@@ -303,3 +305,19 @@ def test_resumed_before_its_first_checkpoint_it_starts_from_the_weights_again(wh
   found = Start.find(compose([f"resume={run.path}"]))
   assert found.weights is not None
   assert found.weights.path == find_checkpoints(whole)[0]
+
+
+def test_a_run_whose_fresh_starts_end_every_episode_early_says_so() -> None:
+  """Spot's commands last 201 control steps: a policy of such a run has never seen one change."""
+
+  def said(*overrides: str) -> list[str]:
+    agent = compose(["env=SpotFlatTerrainJoystick", *overrides]).agent
+    updates = math.ceil(agent.num_timesteps / 163_840)
+    return cut_short(agent, 1000, schedule(updates, agent.num_evals, agent.num_resets_per_eval, 3), 163_840)
+
+  (short,) = said("agent.num_timesteps=40e6", "agent.num_evals=6")
+  assert "the first 100 of an episode's 1000 control steps" in short
+  assert "agent.num_resets_per_eval=10" in short
+  assert "the first 140 of" in said()[0]  # as many as in playground 0.2.0
+  assert said("agent.num_resets_per_eval=1") == []
+  assert said("agent.num_resets_per_eval=0", "agent.num_timesteps=1e6") == []  # nothing starts afresh
