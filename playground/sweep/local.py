@@ -9,9 +9,10 @@ import sys
 from collections.abc import Sequence
 
 from playground.config import Section
-from playground.errors import HardwareError
+from playground.errors import ConfigError, HardwareError
 from playground.hardware.gpus import visible_gpus
 from playground.sweep.folder import Job, SweepDirectory
+from playground.sweep.mps import MultiProcessService
 from playground.sweep.worker import COMMAND
 
 MEMORY_FRACTION = 0.9  # of a GPU, shared among its slots; the rest is for Warp and the driver
@@ -53,6 +54,9 @@ class LocalLauncher:
     if config.gpus is not None and config.gpus > len(gpus):
       raise HardwareError(f"launcher.gpus={config.gpus}, but this machine has {len(gpus)}.")
     self._gpus = gpus[: config.gpus]
+    if config.mps and (config.slots_per_gpu < 2 or not self._gpus):
+      raise ConfigError("launcher.mps=true is for jobs that share a GPU: a GPU, and launcher.slots_per_gpu above 1.")
+    self._mps = MultiProcessService(sweep.path) if config.mps else None
     self.slots = make_slots(self._gpus, config.slots_per_gpu, sorted(os.sched_getaffinity(0)), config.cores_per_job)
     self._sweep = sweep
     self._config = config
@@ -114,6 +118,8 @@ class LocalLauncher:
   def close(self) -> None:
     for worker in self._workers.values():
       worker.wait()
+    if self._mps:
+      self._mps.stop()
 
   def _at_work(self, name: str) -> bool:
     worker = self._workers.get(name)
@@ -127,4 +133,4 @@ class LocalLauncher:
     shared = self._config.slots_per_gpu
     if gpus and shared > 1:
       env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION / shared:.3f}"
-    return env
+    return env | (self._mps.environment if self._mps else {})

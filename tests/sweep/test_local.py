@@ -1,11 +1,12 @@
 """How a machine is divided into slots, and what jobs get of it."""
 
+import os
 from pathlib import Path
 
 import pytest
 
 from playground.config import compose_settings
-from playground.errors import HardwareError
+from playground.errors import ConfigError, HardwareError
 from playground.sweep import local
 from playground.sweep.local import LocalLauncher, make_slots, pick
 from tests.sweep.helpers import make_sweep, run, starts, statuses
@@ -41,6 +42,52 @@ def test_each_job_sees_its_own_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPat
   cpu = make_sweep(tmp_path / "cpu", 0, needs=0)
   assert run(cpu) == 0
   assert starts(cpu)[0][0]["gpus"] == ""
+
+
+@pytest.fixture
+def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+  """Stands in for NVIDIA's control program; the folder has its calls (`calls`), and `up` while it runs."""
+  folder = tmp_path / "service"
+  folder.mkdir()
+  program = folder / "nvidia-cuda-mps-control"
+  program.write_text(f"""#!/bin/sh
+cd {folder}
+[ "$1" = -d ] && [ -e broken ] && echo "no GPU here" && exit 1
+[ "$1" = -d ] && echo "start ${{CUDA_VISIBLE_DEVICES-all}} $CUDA_MPS_PIPE_DIRECTORY" >> calls && touch up && exit
+read what; echo $what >> calls; [ -e up ] || exit 1; [ $what = quit ] && rm up; exit 0
+""")
+  program.chmod(0o755)
+  monkeypatch.setenv("PATH", str(folder), prepend=os.pathsep)
+  monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+  return folder
+
+
+def test_jobs_share_a_gpu_through_its_service(tmp_path: Path, service: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0, 1)
+  assert run(sweep, "launcher.slots_per_gpu=2", "launcher.mps=true") == 0
+  (pipes,) = {found[0]["CUDA_MPS_PIPE_DIRECTORY"] for found in starts(sweep).values()}
+  assert (service / "calls").read_text().splitlines() == ["get_server_list", f"start all {pipes}", "quit"]
+  assert not Path(pipes).exists()
+
+
+def test_a_service_that_runs_already_is_used(tmp_path: Path, service: Path) -> None:
+  (service / "up").touch()
+  assert run(make_sweep(tmp_path / "sweep", 0), "launcher.slots_per_gpu=2", "launcher.mps=true") == 0
+  assert (service / "calls").read_text().split() == ["get_server_list", "quit"]
+
+
+def test_a_service_that_cannot_be_had(tmp_path: Path, service: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  shared = ("launcher.mps=true", "launcher.slots_per_gpu=2")
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  (service / "broken").touch()
+  with pytest.raises(HardwareError, match=r"^launcher\.mps=true, but nvidia-cuda-mps-control .* start: no GPU here$"):
+    run(sweep, *shared)
+  with pytest.raises(ConfigError, match=r"launcher\.slots_per_gpu above 1\.$"):
+    run(sweep, "launcher.mps=true")
+  monkeypatch.setenv("PATH", str(tmp_path))
+  with pytest.raises(HardwareError, match=r"is not on PATH: leave launcher\.mps out\.$"):
+    run(sweep, *shared)
+  assert statuses(sweep) == {0: "queued"}
 
 
 def test_more_gpus_than_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,67 @@
+"""NVIDIA's Multi-Process Service: processes that share a GPU run side by side on it instead of by turns."""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from playground.errors import HardwareError
+
+CONTROL = "nvidia-cuda-mps-control"
+TIMEOUT_S = 60.0
+
+
+class MultiProcessService:
+  """The service for one sweep, of all GPUs that the driver has.
+
+  A sweep that is started again finds the one that its jobs of before still use.
+  """
+
+  def __init__(self, sweep: Path):
+    """Starts it, unless it runs already.
+
+    Args:
+      sweep: the sweep's folder, which takes its logs.
+
+    Raises:
+      HardwareError: it is not installed, or does not start.
+    """
+    program = shutil.which(CONTROL)
+    if program is None:
+      raise HardwareError(
+        f"launcher.mps=true, but {CONTROL}, which comes with NVIDIA's driver, is not on PATH: leave launcher.mps out."
+      )
+    name = hashlib.sha256(str(sweep.resolve()).encode()).hexdigest()[:12]
+    pipes = Path(tempfile.gettempdir(), f"playground-mps-{os.getuid()}-{name}")  # its sockets' names must be short
+    logs = sweep / "mps"
+    for folder in (pipes, logs):
+      folder.mkdir(mode=0o700, exist_ok=True)
+    self._program = program
+    self.environment = {"CUDA_MPS_PIPE_DIRECTORY": str(pipes), "CUDA_MPS_LOG_DIRECTORY": str(logs)}
+    if self._control(command="get_server_list\n")[0] == 0:
+      return
+    code, said = self._control("-d")
+    if code:
+      raise HardwareError(f"launcher.mps=true, but {CONTROL} does not start: {said or f'exit code {code}'}")
+
+  def stop(self) -> None:
+    """Ends it once the processes that use it have ended."""
+    self._control(command="quit\n")
+    shutil.rmtree(self.environment["CUDA_MPS_PIPE_DIRECTORY"], ignore_errors=True)
+
+  def _control(self, *args: str, command: str = "") -> tuple[int, str]:
+    """Runs the control program; returns its exit code and what it says."""
+    # All GPUs: a service that sees some of them numbers them anew for the jobs.
+    env = {key: value for key, value in os.environ.items() if key != "CUDA_VISIBLE_DEVICES"} | self.environment
+    with tempfile.TemporaryFile("w+") as out:  # a file: the service goes on, and would hold a pipe open
+      call = [self._program, *args]
+      try:
+        done = subprocess.run(
+          call, input=command, stdout=out, stderr=subprocess.STDOUT, text=True, env=env, timeout=TIMEOUT_S
+        )
+      except subprocess.TimeoutExpired:
+        return 1, f"nothing after {TIMEOUT_S:.0f} s"
+      out.seek(0)
+      return done.returncode, out.read().strip()
