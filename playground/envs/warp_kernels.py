@@ -118,4 +118,4 @@ def _launched(mj_model: mujoco.MjModel, njmax: int | None) -> list[tuple[Any, in
 
 
 if __name__ == "__main__":
-  compile_all(mujoco.MjModel.from_binary_path(sys.argv[1]), int(sys.argv[2]) or None, os.cpu_count() or 1)
+  compile_all(mujoco.MjModel.from_binary_path(sys.argv[1]), int(sys.argv[2]) or None, len(os.sched_getaffinity(0)))
