@@ -70,6 +70,19 @@ def test_budgets_in_proportion(configs: Path):
   assert budgets("agent.num_timesteps=5e3", "curriculum.scale=0") == [5000] * 3
 
 
+def test_a_shortened_chain_sees_as_much_of_an_episode():
+  """As many steps from one fresh start of all environments to the next."""
+
+  def starts(*overrides: str) -> set[int]:
+    return {stage.agent.num_resets_per_eval for stage in compose(["experiment=go1_handstand_chain", *overrides]).stages}
+
+  assert starts() == starts("curriculum.scale=2") == {10}
+  assert starts("curriculum.scale=0.3") == {3}
+  assert starts("curriculum.scale=0.01") == {1}
+  assert starts("curriculum.scale=0.3", "agent.num_resets_per_eval=0") == {0}
+  assert starts("curriculum.scale=0.3", "agent.num_resets_per_eval=10") == {10}
+
+
 def test_a_chain_starts_at_a_stage_with_what_those_before_it_set(configs: Path, tmp_path: Path):
   (only,) = compose([*MINE, "curriculum.start_at=slope", f"init_from={tmp_path}"], configs).stages
   assert (only.name, only.env.command.max[0]) == ("Go1JoystickFlatTerrain/slope", 2.0)

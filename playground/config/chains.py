@@ -99,6 +99,20 @@ def budget(curriculum: Mapping[str, Any], stage: str, default: int) -> int:
   return max(1, round(scale * (default if own is None else own))) if scale else default
 
 
+def fresh_starts(curriculum: Mapping[str, Any], parsed: Sequence[Override], default: int) -> int:
+  """A stage's `agent.num_resets_per_eval`: fewer in a shortened chain, so that as much of an episode is seen as in it.
+
+  Args:
+    curriculum: the chain's resolved section.
+    parsed: what the stage is composed from; what it sets stays.
+    default: the task's.
+  """
+  scale = curriculum["scale"]
+  if not 0 < scale < 1 or any(override.key == "agent.num_resets_per_eval" for override in parsed):
+    return default
+  return min(default, max(1, round(scale * default)))
+
+
 @contextlib.contextmanager
 def in_stage(name: str) -> Iterator[None]:
   """Names the stage in an error that the user can act on."""

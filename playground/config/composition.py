@@ -17,7 +17,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from playground.config.chains import SINGLE_RUN, budget, check_chain, in_stage, stage_folders, stage_overrides
+from playground.config.chains import (
+  SINGLE_RUN,
+  budget,
+  check_chain,
+  fresh_starts,
+  in_stage,
+  stage_folders,
+  stage_overrides,
+)
 from playground.config.files import DELTAS, config_roots, groups, options, search_path_override
 from playground.config.limits import check_limits
 from playground.config.overrides import (
@@ -181,9 +189,13 @@ def _compose_stage(
   """The configuration of a stage, a single run; where it lies and what it starts from is left open."""
   with in_stage(name):
     stage = _compose_new(parsed, files, roots)
-  steps = budget(chain.resolved["curriculum"], name, stage.agent.num_timesteps)
+  curriculum = chain.resolved["curriculum"]
+  lengths = {
+    "num_timesteps": budget(curriculum, name, stage.agent.num_timesteps),
+    "num_resets_per_eval": fresh_starts(curriculum, parsed, stage.agent.num_resets_per_eval),
+  }
   own = {"name": f"{chain.name}/{name}", "choices": {**stage.choices, "curriculum": "none"}, "curriculum": SINGLE_RUN}
-  own |= {"agent": {**stage.resolved["agent"], "num_timesteps": steps}, "run_dir": None, "init_from": None}
+  own |= {"agent": {**stage.resolved["agent"], **lengths}, "run_dir": None, "init_from": None}
   return from_dict({**stage.resolved, **own}, stage.overrides)
 
 
