@@ -26,6 +26,9 @@ class NoPhysics:
   def without_dynamics(self) -> "NoPhysics":
     return self
 
+  def compile_ahead(self) -> None:
+    return None
+
 
 class PointTask(Env):
   """Position [2] follows the action, reward is minus the distance; NaN or absurd velocity on demand (`*_at` steps)."""
