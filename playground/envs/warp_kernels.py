@@ -69,23 +69,14 @@ class Building:
     self._folder.cleanup()
 
 
-def compile_all(mj_model: mujoco.MjModel, njmax: int | None, workers: int) -> list[str]:
-  """Compiles the kernels of a physics step for this process's device; it cannot launch any afterwards.
-
-  Returns:
-    The names of the modules.
-  """
+def compile_all(mj_model: mujoco.MjModel, njmax: int | None, workers: int) -> None:
+  """Compiles the kernels of a physics step for this process's device; it cannot launch any afterwards."""
   import warp
 
   modules = _launched(mj_model, njmax)
   device = warp.get_device()
-
-  def load(module: Any) -> None:
-    warp.force_load(device, [module[0]], block_dim=module[1])
-
   with ThreadPoolExecutor(workers) as pool:
-    list(pool.map(load, modules))
-  return [module.name for module, _ in modules]
+    list(pool.map(lambda module, block_dim: warp.force_load(device, [module], block_dim), *zip(*modules, strict=True)))
 
 
 def _launched(mj_model: mujoco.MjModel, njmax: int | None) -> list[tuple[Any, int | None]]:
