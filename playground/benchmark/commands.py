@@ -208,10 +208,11 @@ class Topology(OfTasks):
   seeds: int = option(3, "trainings timed")
 
   name = "topology"
-  alone = True
 
   def check(self) -> None:
     super().check()
+    if self.gpus:
+      raise ConfigError(f"gpus={list(self.gpus)}: topology uses the devices itself, say how many with devices=.")
     for kind in self.hyperparameters:
       if kind not in ("fixed", "scaled"):
         raise ConfigError(f"hyperparameters={kind} must be fixed, scaled or both.")
@@ -254,18 +255,16 @@ class Chain(Measuring):
 
 
 @dataclasses.dataclass(frozen=True)
-class Compare(OfTasks):
-  """Ours and the public package's PPO, in turn, on one machine in one call; the best of the repeats counts."""
+class BesidePeer(OfTasks):
+  """Options of what is measured for another package, too: PPO with the hyperparameters of that one on both sides."""
 
   peer: str = option("playground020", "the package to compare with")
   peer_python: str = option("python3", "interpreter of the environment that it is installed in")
   peer_path: str = option("", "PYTHONPATH of that interpreter")
   peer_menagerie: str = option("", "folder of its robot models, where it should not fetch them")
   backends: tuple[str, ...] = option(("jax", "warp"), "the peer's backends; ours is the task's own choice")
-  repeats: int = option(3, "turns")
 
-  name = "compare"
-  alone = True
+  ours = "ppo_v020"  # our side's `agent`
 
   def check(self) -> None:
     from playground.benchmark.peer import check_peer
@@ -275,23 +274,73 @@ class Compare(OfTasks):
       raise ConfigError(f"agent={self.agent}: the comparison is of PPO.")
     check_peer(self.peer, self.peer_python, self.peer_path)
 
+  def peer_job(self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: Any) -> Job:
+    """A job of the peer; overrides are of our run and do not reach it."""
+    peer = {"peer": self.peer, "python": self.peer_python, "path": self.peer_path, "menagerie": self.peer_menagerie}
+    columns = self.columns(task, self.agent, setting, self.peer)
+    return Job(measure, {"task": task, **peer, **arguments}, columns, {"quantity": quantity})
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare(BesidePeer):
+  """Ours and the public package's PPO, in turn, on one machine in one call; the best of the repeats counts."""
+
+  repeats: int = option(3, "turns")
+
+  name = "compare"
+  alone = True
+
   def jobs(self, facts: dict[str, Any]) -> list[Job]:
     jobs = []
     for task in self.chosen():
       for turn in range(1, self.repeats + 1):
-        # With the hyperparameters of the peer.
-        ours = self.job("training", task, seeds=[turn], agent="ppo_v020", watch_memory=True)
-        jobs.append(self.on_one_device(dataclasses.replace(ours, columns=self.columns(task, "ppo_v020"))))
+        ours = self.job("training", task, seeds=[turn], agent=self.ours, watch_memory=True)
+        jobs.append(self.on_one_device(dataclasses.replace(ours, columns=self.columns(task, self.ours))))
         for backend in self.backends:
-          peer = {"peer": self.peer, "python": self.peer_python, "path": self.peer_path}
-          peer |= {"menagerie": self.peer_menagerie, "backend": backend, "seeds": [turn]}
-          columns = self.columns(task, self.agent, (f"env.impl={backend}",), self.peer)
-          jobs.append(Job("peer", {"task": task, "seconds": self.seconds, **peer}, columns, {"quantity": TRAINING}))
+          of_it = {"seconds": self.seconds, "backend": backend, "seeds": [turn]}
+          jobs.append(self.peer_job("peer", TRAINING, task, [f"env.impl={backend}"], **of_it))
+    return jobs
+
+
+@dataclasses.dataclass(frozen=True)
+class Learning(BesidePeer):
+  """Ours and the public package's PPO trained for as many steps, with their own evaluations: returns, wall-clock."""
+
+  backends: tuple[str, ...] = option(("warp",), "the peer's backends; ours is the task's own choice")
+  num_timesteps: int | None = option(
+    None, "control steps that each side trains for; null is the task's own budget in 0.2.0's set"
+  )
+  seeds: int = option(1, "trainings of each side, seeds 1 to this")
+
+  name = "learning"
+
+  def check(self) -> None:
+    super().check()
+    if any(text.startswith("agent.num_timesteps=") for text in self.overrides):
+      raise ConfigError("agent.num_timesteps= would be our side's alone: give num_timesteps=, which is both's.")
+    self.configured(self.chosen()[0], *self.budget())
+
+  def budget(self) -> list[str]:
+    return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
+
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    jobs = []
+    for task in self.chosen():
+      for seed in range(1, self.seeds + 1):
+        columns = self.columns(task, self.ours, self.budget())
+        arguments = {"task": task, "agent": self.ours, "overrides": [*self.overrides, *self.budget()], "seeds": [seed]}
+        jobs.append(self.on_one_device(Job("run", arguments, columns, {"quantity": "final_return"})))
+        for backend in self.backends:
+          setting = [f"env.impl={backend}", *self.budget()]
+          of_it = {"num_timesteps": self.num_timesteps, "backend": backend, "seeds": [seed]}
+          of_it["told"] = [*self.overrides, *setting]
+          jobs.append(self.peer_job("peer_run", "final_return", task, setting, **of_it))
     return jobs
 
 
 COMMANDS: dict[str, type[Measuring]] = {
-  command.name: command for command in (Throughput, Startup, Scaling, Breakdown, Pixels, Topology, Chain, Compare)
+  command.name: command
+  for command in (Throughput, Startup, Scaling, Breakdown, Pixels, Topology, Chain, Compare, Learning)
 }
 
 

@@ -10,7 +10,7 @@ from playground.errors import ConfigError
 from playground.runs.files import write_text
 
 COLUMNS = {
-  "benchmark": "the command that measured: throughput, startup, scaling, breakdown, pixels, topology, chain, compare",
+  "benchmark": "the command: throughput, startup, scaling, breakdown, pixels, topology, chain, compare, learning",
   "task": "the task's name, of a chain the experiment's",
   "agent": "ppo or sac",
   "who": "ours, or the peer's name and version",
@@ -38,9 +38,11 @@ QUANTITIES = {
   "peak_memory_gib": "most memory that JAX's allocator held on one device (Warp's own is not in it)",
   "used_memory_gib": "most memory in use on the GPU while it ran, what was in use before taken off (nvidia-smi)",
   "seconds_per_step": "breakdown, pixels: time of one control step of one environment, with the parts so far",
+  "return": "mean return of one evaluation; setting says after how many steps",
+  "best_return": "best mean return of an evaluation, that of the untrained policy apart",
   "final_return": "mean return of the last evaluation",
   "steps": "control steps trained",
-  "wall_clock_s": "of a run without compiling, evaluations included",
+  "wall_clock_s": "of a run without compiling (conditions say where it is in), evaluations included",
 }
 
 KEY = ("benchmark", "task", "agent", "who", "setting", "seed", "quantity", "devices", "device")

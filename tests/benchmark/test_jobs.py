@@ -24,6 +24,7 @@ print("what a library says")
 if measure == "train":
   gpu = os.environ["CUDA_VISIBLE_DEVICES"]
   for seed in arguments["seeds"]: row(seed=seed, value=100.0 + seed, conditions="timed", backend=gpu)
+elif measure == "lock": row(seed=1, value=1.0, conditions=f"lock {arguments['lock']}")
 elif measure == "user": print("ERROR that cannot be."); sys.exit(2)
 elif measure == "bug": sys.exit("Traceback of a bug")
 elif measure == "sleep": row(seed=1, value=1.0); time.sleep(60)
@@ -97,6 +98,19 @@ def test_workers_are_spread_over_gpus(tmp_path: Path):
   table = Table(path)
   assert all(table.has({"task": name}) for name in "ABCDEFGH")
   assert table.has({"backend": "4"}) and table.has({"backend": "7"})
+
+
+def test_more_workers_than_gpus_take_turns_at_each(tmp_path: Path):
+  def locks(**plan: Any) -> list[str]:
+    path = tmp_path / f"rows{plan}.csv"
+    jobs = [job("lock", name, (1,)) for name in "ABCD"]
+    assert run_jobs(jobs, Table(path), FACTS, Plan(**{**vars(PLAN), **plan})) == 0
+    return [line.split("lock ")[1].split(";")[0] for line in path.read_text().splitlines() if "lock " in line]
+
+  assert set(locks(workers=1)) == set(locks(workers=2, gpus=(4, 7))) == {"None"}
+  assert {Path(lock).name for lock in locks(workers=4, gpus=(4, 7))} <= {"gpu4.lock", "gpu7.lock"}
+  whole = locks(workers=3)
+  assert len(whole) == 4 and len(set(whole)) == 1 and whole[0] != "None", "one lock, the machine's"
 
 
 def test_the_machine_is_asked_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch):

@@ -12,7 +12,9 @@ import pytest
 
 from playground import registry
 from playground.benchmark import peer as peers
+from playground.benchmark.commands import Learning, Topology
 from playground.benchmark.worker import ROW, Facts
+from playground.errors import ConfigError
 from playground.runs.files import write_json
 from tests.dummy import Point
 
@@ -88,6 +90,105 @@ def test_a_peer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.
     peer.measure(Facts(), **arguments, peer="some", backend="jax", seeds=[1], lock=None)
 
 
+def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+  from playground.benchmark.measures import peer, peer_run
+
+  result = {"evaluations": [[0, 9.0, 0.0], [1000, 7.0, 30.25], [2000, 6.0, 40.5]], "steps": 2000, "wall_clock_s": 40.5}
+  result |= {"training_steps_per_s": 100.0, "versions": "JAX 1", "settings": "num_evals 3"}
+  driver = tmp_path / "driver.py"
+  driver.write_text(f"import sys; print(sys.argv[1], file=open({str(tmp_path / 'job')!r}, 'w'))\n")
+  with driver.open("a") as file:
+    file.write(f"print('RESULT ' + {json.dumps(result)!r})")
+  monkeypatch.setitem(peers.PEERS, "some", (driver, ("some", "1")))
+  arguments = {"task": "CheetahRun", "num_timesteps": None, "python": sys.executable, "path": "", "menagerie": ""}
+  arguments |= {"peer": "some", "backend": "warp", "told": ["env.impl=warp"], "seeds": [2], "lock": None}
+  peer_run.measure(Facts(), **arguments)
+  found = rows(capsys)
+  assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
+    ("return", 9.0, "env.impl=warp step=0"), ("return", 7.0, "env.impl=warp step=1000"),
+    ("return", 6.0, "env.impl=warp step=2000"), ("steps", 2000, None), ("wall_clock_s", 40.5, None),
+    ("training_steps_per_s", 100.0, None), ("best_return", 7.0, None), ("final_return", 6.0, None),
+  ]  # fmt: skip
+  assert all(row["seed"] == 2 and row["backend"] == "warp" and "num_evals 3" in row["conditions"] for row in found)
+  assert found[1]["conditions"].endswith("; after 30.2 s") and "after" not in found[-1]["conditions"].split(";")[-1]
+  job = {"task": "CheetahRun", "backend": "warp", "seed": 2, "evaluate": True, "num_timesteps": None}
+  assert json.loads((tmp_path / "job").read_text()) == job
+
+  driver.write_text("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
+  with pytest.raises(peer.PeerFailedError, match="some failed: nothing said"):
+    peer_run.measure(Facts(), **arguments)
+  assert rows(capsys) == []
+
+
+def test_a_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+  from playground.benchmark.measures import run
+
+  given = []
+
+  def train(overrides: list[str]) -> None:
+    given.extend(overrides)
+    folder = Path(overrides[-1].removeprefix("run_dir="))
+    folder.mkdir()
+    manifest = {"impl": "warp", "num_devices": 1, "matmul_precision": "highest", "network_precision": "highest"}
+    write_json(folder / "manifest.json", {**manifest, "timings": {"steady_steps_per_second": 50.0}})
+    scores = {"best_return": 4.0, "final_return": 3.0, "steps": 200, "steps_per_second": 45.0, "wall_clock_s": 7.5}
+    write_json(folder / "summary.json", {"status": "finished", **scores})
+    lines = ["step,time/wall_clock_s,eval/episode_reward", "0,0.5,1.0", "50,1.5,", "100,3.0,4.0", "200,7.0,3.0"]
+    (folder / "metrics.csv").write_text("\n".join(lines))
+
+  monkeypatch.setattr(run, "run_training", train)
+  run.measure(Facts(), "CheetahRun", "ppo", ["agent.num_timesteps=200", "hardware.devices=1"], seeds=[3], lock=None)
+  found = rows(capsys)
+  setting = "agent.num_timesteps=200 step="
+  assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
+    ("return", 1.0, f"{setting}0"), ("return", 4.0, f"{setting}100"), ("return", 3.0, f"{setting}200"),
+    ("steps", 200, None), ("wall_clock_s", 7.5, None), ("training_steps_per_s", 50.0, None),
+    ("best_return", 4.0, None), ("final_return", 3.0, None),
+  ]  # fmt: skip
+  assert all(row["seed"] == 3 and row["backend"] == "warp" and row["devices"] == 1 for row in found)
+  assert found[1]["conditions"].endswith("; after 3.0 s")
+  chosen = ["env=CheetahRun", "agent=ppo", "agent.num_timesteps=200", "hardware.devices=1", "seed=3"]
+  assert given[:-1] == [*chosen, "video.enable=false", "tracking=csv"]
+  assert not Path(given[-1].removeprefix("run_dir=")).exists(), "it leaves nothing behind"
+
+
+def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytest.MonkeyPatch):
+  own = Learning(tasks=("CheetahRun", "HopperHop"), seeds=2, backends=("jax", "warp"), peer_python="py").jobs({})
+  assert [(job.columns["task"], job.arguments["seeds"], job.measure) for job in own] == [
+    (task, [seed], measure)
+    for task in ("CheetahRun", "HopperHop") for seed in (1, 2) for measure in ("run", "peer_run", "peer_run")
+  ]  # fmt: skip
+  assert [job.columns["setting"] for job in own[:3]] == ["", "env.impl=jax", "env.impl=warp"]
+  assert [(job.columns["agent"], job.columns["who"]) for job in own[:2]] == [
+    ("ppo_v020", "ours"), ("ppo", "playground020"),
+  ]  # fmt: skip
+  assert all(job.last == {"quantity": "final_return"} for job in own)
+
+  given = Learning(tasks=("CheetahRun",), num_timesteps=5000, overrides=("env.impl=jax",))
+  ours, peer = given.jobs({})
+  assert ours.columns["setting"] == "env.impl=jax agent.num_timesteps=5000"
+  overrides = ["env.impl=jax", "agent.num_timesteps=5000", "hardware.devices=1"]
+  assert ours.arguments == {"task": "CheetahRun", "agent": "ppo_v020", "overrides": overrides, "seeds": [1]}
+  setting = "env.impl=jax env.impl=warp agent.num_timesteps=5000"
+  assert peer.columns["setting"] == " ".join(peer.arguments["told"]) == setting
+  assert peer.arguments["num_timesteps"] == 5000 and peer.arguments["backend"] == "warp"
+
+  monkeypatch.setattr(peers, "check_peer", lambda *_: None)
+  given.check()
+  with pytest.raises(ConfigError, match=r"give num_timesteps="):
+    Learning(tasks=("CheetahRun",), overrides=("agent.num_timesteps=5",)).check()
+  with pytest.raises(ConfigError, match=r"num_timesteps"):
+    Learning(tasks=("CheetahRun",), num_timesteps=0).check()
+  with pytest.raises(ConfigError, match=r"of PPO"):
+    Learning(tasks=("CheetahRun",), agent="sac").check()
+
+
+def test_topology_has_all_devices_and_may_have_several_workers():
+  Topology(tasks=("CheetahRun",), workers=4).check()
+  with pytest.raises(ConfigError, match=r"gpus=\[0, 1\]: topology uses the devices itself"):
+    Topology(tasks=("CheetahRun",), gpus=(0, 1)).check()
+
+
 FAKE = """
 import sys, types
 import playground
@@ -101,7 +202,8 @@ module("wrapper", wrap_for_brax_training=playground.wrap_for_brax_training)
 module("dm_control_suite", _envs=["CartpoleBalance"])
 module("locomotion", _envs=[])
 params = types.SimpleNamespace(brax_ppo_config=lambda name, impl: dict(
-  num_timesteps=1, num_evals=1, episode_length=20, num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2,
+  num_timesteps=1, num_evals=3, num_resets_per_eval=1, num_eval_envs=2, episode_length=20,
+  num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2,
   num_updates_per_batch=1, action_repeat=1, network_factory=dict(policy_hidden_layer_sizes=(8,))))
 module("config", dm_control_suite_params=params, locomotion_params=params, manipulation_params=params)
 """
@@ -112,14 +214,24 @@ def test_the_peers_driver_trains_with_brax(tmp_path: Path):
   (tmp_path / "mujoco_playground").mkdir()
   (tmp_path / "mujoco_playground" / "__init__.py").write_text(FAKE)
   driver, _ = peers.PEERS["playground020"]
-  job = {"task": "CartpoleBalance", "backend": "jax", "seed": 1, "steps": 40, "epochs": 3}
-  done = subprocess.run(
-    [sys.executable, str(driver), json.dumps(job)], capture_output=True, text=True,
-    env={"PYTHONPATH": f"{tmp_path}:{CHECKOUT}", "PATH": "", "JAX_PLATFORMS": "cpu"},
-  )  # fmt: skip
-  assert done.returncode == 0, done.stderr
-  result = json.loads(done.stdout.splitlines()[-1].removeprefix("RESULT "))
+
+  def drive(**job: Any) -> dict[str, Any]:
+    job |= {"task": "CartpoleBalance", "backend": "jax", "seed": 1}
+    done = subprocess.run(
+      [sys.executable, str(driver), json.dumps(job)], capture_output=True, text=True,
+      env={"PYTHONPATH": f"{tmp_path}:{CHECKOUT}", "PATH": "", "JAX_PLATFORMS": "cpu"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1].removeprefix("RESULT "))
+
+  result = drive(steps=40, epochs=3)
   assert len(result["epochs"]) == 3 and result["epoch_steps"] == 48 and result["update_steps"] == 16
+  result = drive(evaluate=True, num_timesteps=64)  # three evaluations, two updates between them
+  assert [step for step, _, _ in result["evaluations"]] == [0, 32, 64] and result["steps"] == 64
+  scores, moments = [score for _, score, _ in result["evaluations"]], [moment for _, _, moment in result["evaluations"]]
+  assert all(0 < score <= 20 for score in scores), "sums of rewards of at most 1"
+  assert moments == sorted(moments) and moments[0] == 0 and result["wall_clock_s"] == moments[-1]
+  assert result["training_steps_per_s"] > 0 and "num_evals 3, num_resets_per_eval 1" in result["settings"]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The report: truthful about what is there and what is not, from rows of every age."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import pytest
 
 from playground.benchmark.report import Options, page, run
 from playground.benchmark.report.evidence import Evidence
-from playground.benchmark.report.page import Heading, Picture, Table, Text, to_html, to_markdown
+from playground.benchmark.report.page import Block, Heading, Picture, Table, Text, to_html, to_markdown
 from playground.benchmark.schema import Table as Rows
 from playground.benchmark.suites import SUITES, paper_table
 from playground.errors import ConfigError
@@ -31,6 +32,10 @@ def line_of(found: Evidence, task: str, number: int = 0) -> list[str]:
   """A task's row in the n-th table of the page."""
   tables = [block for block in page(found) if isinstance(block, Table)]
   return next(list(row) for row in tables[number].rows if row[0] == task)
+
+
+def table_with(blocks: Sequence[Block], column: str) -> Table:
+  return next(block for block in blocks if isinstance(block, Table) and column in block.header)
 
 
 def test_mean_and_interval_over_seeds(tmp_path: Path):
@@ -71,9 +76,15 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
       "benchmark": "topology",
       "setting": "hardware.devices=2 hardware.scale_envs=true",
       "devices": 2,
-      "value": 2e4,
+      "value": 1.5e4,
       **speed,
     },
+    {"benchmark": "topology", "setting": "hardware.devices=4", "devices": 4, "device": "NVIDIA Y", "value": 3e4},
+    *(
+      {"benchmark": "learning", "who": who, "setting": setting, "seed": 1, "quantity": quantity, "value": value}
+      for who, score in (("ours", 612.5), ("playground020", 598.5))
+      for setting, quantity, value in (("step=0", "return", 1.5), ("", "best_return", 9.0), ("", "final_return", score))
+    ),
     {"benchmark": "chain", "task": "a_chain", "setting": "stage=all", "quantity": "wall_clock_s", "value": 100.0},
     *(
       {"benchmark": "breakdown", "setting": f"part={part}", "quantity": "seconds_per_step", "value": value}
@@ -84,7 +95,13 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
   assert {block.name for block in blocks if isinstance(block, Picture)} == {"scaling", "topology", "breakdown"}
   cells = {cell for block in blocks if isinstance(block, Table) for row in block.rows for cell in row}
   assert {"2.00", "12.5", "20,000", "a_chain", "100"} <= cells  # 300 / 150: the best of the turns
-  shares = next(b for b in blocks if isinstance(b, Table) and "update (µs)" in b.header).rows[0]
+  devices = {row[1]: list(row[2:8]) for row in table_with(blocks, "efficiency").rows}
+  assert devices["1"] == ["fixed", "10,000", "1.00", "1.00", "6,000", "NVIDIA X"]  # 60 M steps are the task's own
+  assert devices["2"] == ["scaled", "15,000", "1.50", "0.75", "4,000", "NVIDIA X"]
+  assert devices["4"] == ["fixed", "30,000", "", "", "2,000", "NVIDIA Y"], "of another device than the one alone"
+  scores = [list(row[:4]) for row in table_with(blocks, "return of each run").rows]
+  assert scores == [["CheetahRun", "ppo", "ours", "612.5"], ["CheetahRun", "ppo", "playground020", "598.5"]]
+  shares = table_with(blocks, "update (µs)").rows[0]
   assert list(shares[1:8]) == ["1", "2", "", "", "", "", "7"]
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from playground.benchmark.measures.subject import ONE_DEVICE, Subject, alone, num_updates, rate
+from playground.benchmark.measures.subject import Subject, alone, num_updates, rate, told
 from playground.benchmark.worker import Facts
 from playground.envs.base import PIXELS
 from playground.envs.physics import WORLDS
@@ -52,12 +52,7 @@ def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: 
         best[part] = max(best[part], rate(call, steps, seconds / TURNS)[0])
   facts["conditions"] += f"; parts added one by one, best of {TURNS} turns of {seconds / TURNS:.1f} s"
   for part, speed in best.items():
-    facts.emit("seconds_per_step", 1 / speed, "s", setting=" ".join((*_told(overrides), f"part={part}")))
-
-
-def _told(overrides: list[str]) -> list[str]:
-  """Overrides that make a setting: that one device is used goes without saying."""
-  return [text for text in overrides if text != ONE_DEVICE]
+    facts.emit("seconds_per_step", 1 / speed, "s", setting=" ".join((*told(overrides), f"part={part}")))
 
 
 def _repeat(subject: Subject, run: Run, carry: Any) -> Callable[[int], Any]:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from playground.benchmark.measures.run import emit_result
 from playground.benchmark.measures.startup import facts_of, run_training
 from playground.benchmark.worker import Facts
 from playground.runs.run_dir import RunDirectory
@@ -26,7 +27,4 @@ def measure(facts: Facts, experiment: str, overrides: list[str], runs: str, seed
     columns: dict[str, Any] = {"seed": seed, "setting": " ".join((*overrides, f"stage={stage['name']}"))}
     columns |= facts_of(run.manifest) if run.manifest else {}
     columns["conditions"] = f"task {stage['env']}, evaluations included, compiling not"
-    units = {"steps": "steps", "final_return": "", "wall_clock_s": "s"}
-    for quantity, unit in units.items():
-      if stage.get(quantity) is not None:
-        facts.emit(quantity, stage[quantity], unit, **columns)
+    emit_result(facts, stage, ("steps", "final_return", "wall_clock_s"), **columns)

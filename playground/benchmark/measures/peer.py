@@ -4,6 +4,7 @@ import json
 import math
 import os
 import subprocess
+from typing import Any
 
 from playground.benchmark.measures.machine import used_memory
 from playground.benchmark.peer import PEERS
@@ -33,27 +34,37 @@ def measure(
   """Rows for the best epoch's steps a second, time to the first update and memory, as `training` has them of ours."""
   del lock  # a comparison has the machine to itself
   (seed,) = seeds
-  driver, _ = PEERS[peer]
   job = {"task": task, "backend": backend, "seed": seed, "steps": _epoch_steps(task, seconds), "epochs": EPOCHS}
-  env = {**os.environ, "PYTHONPATH": path, "PEER_MENAGERIE": menagerie}
-  env.pop("JAX_COMPILATION_CACHE_DIR", None)  # the peer keeps no compiled programs
   with used_memory(facts, seed):
-    done = subprocess.run(
-      [python, "-W", "ignore", str(driver), json.dumps(job)], capture_output=True, text=True, errors="replace", env=env
-    )
-  lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
-  if done.returncode or not lines:
-    raise PeerFailedError(f"{peer} failed: {(done.stderr.strip().splitlines() or ['nothing said'])[-1]}")
-  result = json.loads(lines[-1].removeprefix("RESULT "))
+    result = drive(facts, peer, python, path, menagerie, job)
   epochs = result["epochs"]  # seconds of each
   best = result["epoch_steps"] / min(epochs[1:])
   first_update = result["start_s"] + epochs[0] - (result["epoch_steps"] - result["update_steps"]) / best
-  facts.update(backend=backend, devices=1, precision="JAX's default", versions=result["versions"])
   facts["conditions"] = f"best of {len(epochs) - 1} epochs of {result['epoch_steps']:,} steps; {result['settings']}"
   facts.emit("start_to_first_update_s", first_update, "s", seed=seed)
   if result["peak_memory_gib"] is not None:
     facts.emit("peak_memory_gib", result["peak_memory_gib"], "GiB", seed=seed)
   facts.emit("training_steps_per_s", best, "steps/s", seed=seed)
+
+
+def drive(facts: Facts, peer: str, python: str, path: str, menagerie: str, job: dict[str, Any]) -> dict[str, Any]:
+  """Has the peer's driver do a job, and fills in the facts that its rows share.
+
+  Raises:
+    PeerFailedError: it ended with an error, or was ended.
+  """
+  driver, _ = PEERS[peer]
+  env = {**os.environ, "PYTHONPATH": path, "PEER_MENAGERIE": menagerie}
+  env.pop("JAX_COMPILATION_CACHE_DIR", None)  # the peer keeps no compiled programs
+  done = subprocess.run(
+    [python, "-W", "ignore", str(driver), json.dumps(job)], capture_output=True, text=True, errors="replace", env=env
+  )
+  lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
+  if done.returncode or not lines:
+    raise PeerFailedError(f"{peer} failed: {(done.stderr.strip().splitlines() or ['nothing said'])[-1]}")
+  result = json.loads(lines[-1].removeprefix("RESULT "))
+  facts.update(backend=job["backend"], devices=1, precision="JAX's default", versions=result["versions"])
+  return result
 
 
 def _epoch_steps(task: str, seconds: float) -> int:

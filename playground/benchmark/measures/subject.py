@@ -72,6 +72,11 @@ class Subject:
     return jax.device_put(jax.random.PRNGKey(seed), NamedSharding(self.hardware.mesh, P()))
 
 
+def told(overrides: Sequence[str]) -> list[str]:
+  """Overrides that make a setting: that one device is used goes without saying."""
+  return [text for text in overrides if text != ONE_DEVICE]
+
+
 def _precision(hardware: Hardware, learner: Learner) -> str:
   facts, value_dtype = hardware.facts, getattr(learner.networks, "value_dtype", None)
   critic = f", critic activations {value_dtype}" if value_dtype else ""

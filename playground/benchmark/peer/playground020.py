@@ -21,6 +21,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+SIZES = ("num_envs", "batch_size", "num_minibatches")
+EVALUATION = ("num_evals", "num_resets_per_eval", "num_eval_envs")
+
 
 def put_back_names() -> None:
   """Restores what JAX and MuJoCo removed."""
@@ -78,33 +81,46 @@ def load(task: str, backend: str, num_envs: int) -> Any:
   return registry.load(task, config_overrides=changes)
 
 
-def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: Any) -> dict[str, Any]:
-  """Trains for some epochs of at least `steps` control steps, without evaluations or resets between."""
+def arguments_of(task: str, backend: str, seed: int) -> dict[str, Any]:
+  """What Brax's trainer takes to train a task on one device as the package does."""
   from brax.training.agents.ppo import networks
-  from brax.training.agents.ppo import train as ppo
   from mujoco_playground import registry, wrapper  # pyright: ignore[reportMissingImports]
 
   settings = tuned(task, backend)
   settings.update(json.loads(os.environ.get("PEER_SETTINGS", "{}")))  # smaller ones, to try the driver out
   network = dict(settings.pop("network_factory", None) or {})
-  for name in ("num_timesteps", "num_evals", "num_resets_per_eval", "num_eval_envs"):
-    settings.pop(name, None)
-  update_steps = settings["batch_size"] * settings["num_minibatches"] * settings["unroll_length"]
-  update_steps *= settings.get("action_repeat", 1)
+  return {
+    **settings,
+    "environment": load(task, backend, settings["num_envs"]),
+    "network_factory": functools.partial(networks.make_ppo_networks, **network),
+    "wrap_env_fn": wrapper.wrap_for_brax_training,
+    "randomization_fn": registry.get_domain_randomizer(task),
+    "max_devices_per_host": 1,
+    "seed": seed,
+  }
+
+
+def told(arguments: dict[str, Any], *names: str) -> str:
+  """Settings in words."""
+  return ", ".join(f"{name} {arguments[name]}" for name in (*SIZES, *names) if name in arguments)
+
+
+def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: Any) -> dict[str, Any]:
+  """Trains for some epochs of at least `steps` control steps, without evaluations or resets between."""
+  from brax.training.agents.ppo import train as ppo
+
+  arguments, marks = arguments_of(task, backend, seed), []
+  for name in EVALUATION:
+    arguments.pop(name, None)
+  update_steps = arguments["batch_size"] * arguments["num_minibatches"] * arguments["unroll_length"]
+  update_steps *= arguments.get("action_repeat", 1)
   epoch_steps = -(-steps // update_steps) * update_steps
-  environment, marks = load(task, backend, settings["num_envs"]), []
   start_s, begin = age_s(), time.perf_counter()
   ppo.train(
-    environment=environment,
-    num_timesteps=epochs * epoch_steps,
+    **arguments | {"num_timesteps": epochs * epoch_steps},
     num_evals=epochs + 1,
     run_evals=False,
-    seed=seed,
-    network_factory=functools.partial(networks.make_ppo_networks, **network),
-    wrap_env_fn=wrapper.wrap_for_brax_training,
-    randomization_fn=registry.get_domain_randomizer(task),
     progress_fn=lambda step, _: marks.append((step, time.perf_counter())),
-    **settings,
   )
   times = [begin, *(moment for step, moment in marks if step)]
   memory = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
@@ -114,7 +130,35 @@ def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: An
     "epoch_steps": epoch_steps,
     "update_steps": update_steps,
     "peak_memory_gib": None if memory is None else memory / 2**30,
-    "settings": ", ".join(f"{name} {settings[name]}" for name in ("num_envs", "batch_size", "num_minibatches")),
+    "settings": told(arguments),
+  }
+
+
+def learn(task: str, backend: str, seed: int, num_timesteps: int | None) -> dict[str, Any]:
+  """Trains to the end with the package's own evaluations and resets; None is its own budget.
+
+  The clock starts when the evaluation before training is done. Brax has compiled and run that one by then; compiling
+  the training, all training and resets, and the evaluations after are in the time.
+  """
+  from brax.training.agents.ppo import train as ppo
+
+  arguments, evaluations, rates = arguments_of(task, backend, seed), [], []
+  if num_timesteps is not None:
+    arguments["num_timesteps"] = num_timesteps
+
+  def note(step: int, metrics: Any) -> None:
+    evaluations.append((int(step), float(metrics["eval/episode_reward"]), time.perf_counter()))
+    if step:  # the rate is of the last stretch between resets; that of the first evaluation may have compiling in it
+      rates.append(float(metrics["training/sps"]))
+
+  ppo.train(**arguments, run_evals=True, progress_fn=note)
+  begin = evaluations[0][2]
+  return {
+    "evaluations": [(step, score, moment - begin) for step, score, moment in evaluations],
+    "steps": evaluations[-1][0],
+    "wall_clock_s": evaluations[-1][2] - begin,
+    "training_steps_per_s": float(np.median(rates)),
+    "settings": told(arguments, *EVALUATION),
   }
 
 
@@ -129,7 +173,11 @@ def main() -> None:
   put_back_names()
   if os.environ.get("PEER_MENAGERIE"):
     use_menagerie(os.environ["PEER_MENAGERIE"])
-  result = train(job["task"], job["backend"], job["seed"], job["steps"], job["epochs"], process_age_s)
+  subject = job["task"], job["backend"], job["seed"]
+  if job.get("evaluate"):
+    result = learn(*subject, job["num_timesteps"])
+  else:
+    result = train(*subject, job["steps"], job["epochs"], process_age_s)
   names = {"jax": "JAX", "mujoco": "MuJoCo", "mujoco-mjx": "MJX", "brax": "Brax", "warp-lang": "Warp"}
   have = {dist.name: dist.version for dist in metadata.distributions()}
   result["versions"] = "; ".join(f"{label} {have[name]}" for name, label in names.items() if name in have)

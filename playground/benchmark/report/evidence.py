@@ -15,7 +15,8 @@ _WORDS = {
   "final return": "final_return",
   "peak_gib": "peak_memory_gib",
 }
-_UNITS = {"training_steps_per_s": "steps/s", "final_return": "", "steps": "steps", "peak_memory_gib": "GiB"}
+_UNITS = {"training_steps_per_s": "steps/s", "steps": "steps", "peak_memory_gib": "GiB"}
+_UNITS |= dict.fromkeys(("return", "best_return", "final_return"), "")
 
 Row = dict[str, Any]  # the columns of a row as text, `value` as a number, and `source`: the file
 

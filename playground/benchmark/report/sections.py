@@ -1,5 +1,6 @@
 """The page's sections, each from the rows that its benchmark left; what is missing is said to be."""
 
+import functools
 import re
 from collections.abc import Iterable, Sequence
 
@@ -7,6 +8,7 @@ from playground.benchmark.report import figures
 from playground.benchmark.report.evidence import Evidence, Figure
 from playground.benchmark.report.page import NOT_MEASURED, Block, Heading, Picture, Table, Text
 from playground.benchmark.suites import SUITES, paper_table
+from playground.config import compose
 
 TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipulation": "Manipulation"}
 SPEED = "training_steps_per_s"
@@ -139,19 +141,50 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   """One device and several."""
   yield Heading(2, "Devices")
-  yield Text("The paper prints for LeapCubeReorient about 2080 s on one RTX 4090 and 670 s on eight H100 (IV-D).")
+  yield Text(
+    "The paper prints for LeapCubeReorient about 2080 s on one RTX 4090 and 670 s on eight H100 (IV-D). Times one "
+    "device: the rate over that of one device; efficiency: this over the number of devices. What a budget takes is "
+    "derived: the task's own number of steps over the rate, so training alone, without compiling and evaluation."
+  )
+  found = evidence.find(benchmark="topology", who="ours", quantity=SPEED)
+  single: dict[tuple[str, ...], float] = {}  # rates on one device; of several commits' the newest, or the same one's
+  for figure in found:
+    if figure["devices"] == "1" and _hyperparameters(figure) == "fixed":
+      single.setdefault(_of_topology(figure), figure.mean)
+      single.setdefault((*_of_topology(figure), figure["commit"]), figure.mean)
   groups: dict[str, dict[str, float]] = {}
   rows = []
-  for figure in evidence.find(benchmark="topology", who="ours", quantity="training_steps_per_s"):
-    kind = "scaled" if "scale_envs=true" in figure["setting"] else "fixed"
+  for figure in found:
     count, device, note = figure["devices"], figure["device"], notes.number(figure)
+    kind, same = _hyperparameters(figure), _of_topology(figure)
+    one = single.get((*same, figure["commit"]), single.get(same))
+    times = [f"{figure.mean / one:.2f}", f"{figure.mean / one / int(count):.2f}"] if one else ["", ""]
     groups.setdefault(f"{figure['task']}, {count}", {})[kind] = figure.mean
-    rows.append([figure["task"], count, kind, _with_ci(figure), device, note])
+    seconds = f"{_budget(figure['task'], figure['agent']) / figure.mean:,.0f}"
+    rows.append([figure["task"], count, kind, _with_ci(figure), *times, seconds, device, note])
   if not rows:
     yield _nothing("topology")
     return
   yield Picture("topology", figures.bars("training steps/s", dict(sorted(groups.items())), "steps/s"), "Devices.")
-  yield Table(["task", "devices", "hyperparameters", "steps/s", "device", "note"], sorted(rows))
+  derived = ["times one device", "efficiency", "its budget takes (s)"]
+  yield Table(["task", "devices", "hyperparameters", "steps/s", *derived, "device", "note"], sorted(rows))
+
+
+def _hyperparameters(figure: Figure) -> str:
+  return "scaled" if "hardware.scale_envs=true" in figure["setting"] else "fixed"
+
+
+def _of_topology(figure: Figure) -> tuple[str, ...]:
+  """What figures agree in that differ in their devices alone."""
+  varied = ("hardware.devices=", "hardware.scale_envs=")
+  setting = (text for text in figure["setting"].split() if not text.startswith(varied))
+  return figure["task"], figure["agent"], figure["device"], " ".join(setting)
+
+
+@functools.cache
+def _budget(task: str, agent: str) -> int:
+  """A task's own number of control steps."""
+  return compose([f"env={task}", f"agent={agent}"]).agent.num_timesteps
 
 
 def breakdown(evidence: Evidence, notes: Notes) -> Iterable[Block]:
