@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
@@ -70,5 +71,50 @@ def jit_on_mesh(function: Callable[..., Any], mesh: Mesh, in_specs: Any, out_spe
     **kwargs: for `jax.jit` (`donate_argnums`).
   """
   sharding = lambda specs: jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs)
-  mapped = jax.shard_map(function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+  over_mesh = lambda function: jax.shard_map(
+    function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
+  )
+  mapped = over_mesh(function) if mesh.size == 1 else _without_empty_arrays(function, over_mesh)
   return jax.jit(mapped, in_shardings=sharding(in_specs), out_shardings=sharding(out_specs), **kwargs)
+
+
+def _without_empty_arrays(function: Callable[..., Any], over_mesh: Callable[..., Any]) -> Callable[..., Any]:
+  """`over_mesh(function)`, but that arrays of no elements have some while they go in and out.
+
+  A mocap body's pose in a model without one is such an array. JAX 0.11.2 dies of a segmentation fault compiling
+  a shard_map over several devices that takes and returns one (Shardy's ManualComputationUnusedInputsPattern).
+  """
+
+  def mapped(*args: Any) -> Any:
+    out_axes: Any = None
+
+    def body(*filled: Any) -> Any:
+      nonlocal out_axes
+      out = function(*_cut(filled, in_axes))
+      out_axes = _empty_axes(out)
+      return _fill(out)
+
+    in_axes = _empty_axes(args)
+    return _cut(over_mesh(body)(*_fill(args)), out_axes)
+
+  return mapped
+
+
+def _empty_axes(tree: Any) -> list[list[int]]:
+  """Of each leaf, the axes of length 0."""
+  return [[axis for axis, size in enumerate(jnp.shape(x)) if size == 0] for x in jax.tree.leaves(tree)]
+
+
+def _fill(tree: Any) -> Any:
+  """The tree with axes of length 0 made 1 long."""
+  some = lambda x: jnp.zeros([size or 1 for size in x.shape], x.dtype) if 0 in jnp.shape(x) else x
+  return jax.tree.map(some, tree)
+
+
+def _cut(tree: Any, axes: list[list[int]]) -> Any:
+  """The tree with these axes of its leaves made empty."""
+  leaves, structure = jax.tree.flatten(tree)
+  for i, empty in enumerate(axes):
+    for axis in empty:
+      leaves[i] = jax.lax.slice_in_dim(leaves[i], 0, 0, axis=axis)
+  return jax.tree.unflatten(structure, leaves)
