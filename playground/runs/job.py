@@ -219,7 +219,8 @@ class Job:
       self._warned_of_buffers = True
       self._progress.print(
         f"{overflows:.0f} of {taken:,} steps needed more than Warp's buffers hold, and lost contacts or constraints: "
-        f"`playground tune-buffers {self._config.choices['env']}` says how large env.njmax and the like should be."
+        f"`playground tune-buffers {self._config.choices['env']} --run {self._run_dir.path}` says how large "
+        "env.njmax and the like should be, once a checkpoint is there."
       )
 
   def _check_numbers(self, step: int, taken: int, metrics: Metrics, captured: Step | None) -> None:
