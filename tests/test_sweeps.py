@@ -8,7 +8,18 @@ import pytest
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from playground.config import combinations, compose_all, compose_settings, expand, options, sweeps, task_names, varying
+from playground.config import (
+  combinations,
+  compose_all,
+  compose_settings,
+  expand,
+  listed_jobs,
+  options,
+  sweeps,
+  task_names,
+  varying,
+  with_listed,
+)
 from playground.errors import ConfigError, UnknownNameError
 
 
@@ -121,11 +132,17 @@ def test_what_is_refused(folder: Path, line: str, message: str):
   ("text", "message"),
   {
     "params: [": "sweep=bad: its file cannot be read: ",
-    "": "sweep=bad: its file must hold `params:`, a mapping from keys to values, and nothing else.",
+    "": "sweep=bad: its file must hold `params:` or `jobs:` or both, and nothing else.",
     "- seed": "sweep=bad: its file must hold `params:`",
     "parms: {seed: 1}": "sweep=bad: its file must hold `params:`",
     "params: {seed: 1}\nagent: ppo": "sweep=bad: its file must hold `params:`",
-    "params: {}": "sweep=bad: its file must hold `params:`",
+    "params: {}": "sweep=bad: `params:` must be a mapping from keys to values.",
+    "jobs: seed=1": "sweep=bad: `jobs:` must be a list of command lines.",
+    "jobs: [seed=1, {seed: 1}]": "sweep=bad: `jobs:` must be a list of command lines.",
+    "jobs: ['seed=1 sed']": "'sed' is not an override",
+    "jobs: ['env=CartpoleBalanc']": "env=CartpoleBalanc does not exist",
+    "jobs: ['seed=1 launcher.mps=true']": "sweep=bad: launcher.mps=true in its job 'seed=1 launcher.mps=true' is of",
+    "jobs: ['seed=1 run_dir=x']": "run_dir=x cannot be given with -m",
     "params: {seed: []}": "sweep=bad: params.seed=[] must be a value or a list of values.",
     "params: {agent: {num_envs: 1}}": "sweep=bad: params.agent={num_envs: 1} must be a value or a list of values.",
     "params: {env: CartpoleBalanc}": "env=CartpoleBalanc does not exist",
@@ -135,8 +152,30 @@ def test_files_that_are_no_sweep(folder: Path, text: str, message: str):
   (folder / "bad.yaml").write_text(text)
   with pytest.raises(ConfigError) as caught:
     expand(["sweep=bad"])
+    listed_jobs(["sweep=bad"])
   assert str(caught.value).startswith(message)
   assert "\n" not in str(caught.value)
+
+
+def test_listed_jobs_are_combined_with_what_all_have(folder: Path):
+  (folder / "these.yaml").write_text(
+    "params: {seed: range(2), agent.num_envs: 64}\n"
+    "jobs:\n- env=CartpoleBalance\n- env=CheetahRun,WalkerRun agent=sac agent.num_envs=128\n- seed=7 agent.num_envs=8\n"
+  )
+
+  def sets(*given: str) -> list[list[str]]:
+    return with_listed(expand(["sweep=these", *given]), listed_jobs(["sweep=these", *given]))
+
+  assert sets() == [
+    ["seed=range(2)", "agent.num_envs=64", "env=CartpoleBalance"],
+    ["seed=range(2)", "env=CheetahRun,WalkerRun", "agent=sac", "agent.num_envs=128"],
+    ["seed=7", "agent.num_envs=8"],
+  ]
+  assert [len(combinations(lines)) for lines in sets()] == [2, 4, 1]
+  assert varying(*sets()) == ["seed", "agent.num_envs", "env", "agent"]
+  assert varying(*sets("seed=3", "agent.num_envs=8")) == ["env", "agent"]  # the command line's word is the last
+  assert [lines[0] for lines in sets("seed=3")] == ["agent.num_envs=64", "seed=3", "seed=3"]
+  assert with_listed(["seed=1"], []) == [["seed=1"]] and listed_jobs(["seed=1"]) == []
 
 
 def test_every_job_is_checked_and_named(folder: Path):

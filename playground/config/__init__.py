@@ -21,7 +21,7 @@ from playground.config.composition import compose, compose_all, compose_settings
 from playground.config.files import ENTRY_POINTS, config_roots, options, search_path_override, task_names
 from playground.config.overrides import DEFAULT_EXPERIMENT, is_hydras, is_of_sweep, with_default_experiment
 from playground.config.run_config import RunConfig, Section, from_dict, load, to_yaml, tree
-from playground.config.sweeps import combinations, expand, split, varying
+from playground.config.sweeps import combinations, expand, listed_jobs, split, varying, with_listed
 from playground.config.text import format_value
 
 __all__ = [
@@ -41,6 +41,7 @@ __all__ = [
   "in_stage",
   "is_hydras",
   "is_of_sweep",
+  "listed_jobs",
   "load",
   "options",
   "override_section",
@@ -52,4 +53,5 @@ __all__ = [
   "tree",
   "varying",
   "with_default_experiment",
+  "with_listed",
 ]

@@ -8,9 +8,20 @@ params:
   agent: sac
   seed: range(5)
 ```
+
+It may list jobs that have more of their own, each a command line, which together with `params` is combined as well:
+
+```yaml
+params:
+  seed: range(2)
+jobs:
+  - experiment=go1_joystick_chain curriculum.scale=0.5
+  - env=CheetahRun agent=sac
+```
 """
 
 import itertools
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,13 +55,39 @@ def expand(overrides: Sequence[str], config_dir: Path | None = None) -> list[str
   if len(named) > 1 or any(override.is_sweep_override() for override in named):
     raise ConfigError(f"{' '.join(str(o.input_line) for o in named)}: one sweep at a time.")
   keys = {override.key_or_group for override in given}
-  listed = [parse_with_hydra(text) for override in named for text in _read(str(override.value()))]
+  listed = [parse_with_hydra(text) for override in named for text in _read(str(override.value()))[0]]
   chosen = [*(o for o in listed if o.key_or_group not in keys), *(o for o in given if o not in named)]
-  lines = [_spell_out(override, roots) for override in chosen]
-  for line in lines:
-    for one in _values(line):
-      parse(one, roots)
-  return [*lines, *filter(is_hydras, overrides)]
+  return [*_checked(chosen, roots), *filter(is_hydras, overrides)]
+
+
+def listed_jobs(overrides: Sequence[str], config_dir: Path | None = None) -> list[list[str]]:
+  """The `jobs` of the sweep file that `-m` is given, spelt out, without what the command line says otherwise.
+
+  Raises:
+    ConfigError: a job that cannot be, or one that says something of the whole sweep.
+    UnknownNameError: as `expand`.
+  """
+  given = [parse_with_hydra(text) for text in overrides if not is_hydras(text)]
+  keys = {override.key_or_group for override in given}
+  found = []
+  for override in given:
+    for text in _read(str(override.value()))[1] if override.key_or_group == "sweep" else []:
+      parsed = [parse_with_hydra(part) for part in shlex.split(text)]
+      lines = _checked([o for o in parsed if o.key_or_group not in keys], config_roots(config_dir))
+      if settings := split(lines)[0]:
+        raise ConfigError(f"{override.input_line}: {settings[0]} in its job {text!r} is of the whole sweep.")
+      found.append(lines)
+  return found
+
+
+def with_listed(lines: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[list[str]]:
+  """The lines of each listed job: what it says replaces what `lines` say of the same key. Without jobs, `lines`."""
+  key = lambda line: parse_with_hydra(line).key_or_group
+  together = []
+  for job in jobs or [[]]:
+    own = set(map(key, job))
+    together.append([*(line for line in lines if key(line) not in own), *job])
+  return together
 
 
 def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
@@ -84,10 +121,15 @@ def combinations(lines: Sequence[str]) -> list[list[str]]:
   return [list(job) for job in dict.fromkeys(itertools.product(*map(_values, lines)))]
 
 
-def varying(lines: Iterable[str]) -> list[str]:
-  """The keys and groups that have more than one value."""
-  parsed = [(parse_with_hydra(line), line) for line in lines]
-  return [o.key_or_group for o, line in parsed if o.is_sweep_override() and len(_values(line)) != 1]
+def varying(*sets: Iterable[str]) -> list[str]:
+  """The keys and groups that have more than one value, in one set of lines or among several."""
+  said: dict[str, set[tuple[str, ...] | None]] = {}
+  for i, lines in enumerate(sets):
+    parsed = {parse_with_hydra(line).key_or_group: line for line in lines}
+    for key in {**said, **parsed}:
+      missing: list[tuple[str, ...] | None] = [None] if i else []
+      said.setdefault(key, set(missing)).add(tuple(_values(parsed[key])) if key in parsed else None)
+  return [key for key, values in said.items() if len(values) > 1 or any(v is not None and len(v) != 1 for v in values)]
 
 
 def sweep_names() -> list[str]:
@@ -103,6 +145,15 @@ def _values(text: str) -> list[str]:
   if not override.is_discrete_sweep():  # an interval: a search draws from it
     return []
   return [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+
+
+def _checked(overrides: Iterable[HydraOverride], roots: Sequence[Path]) -> list[str]:
+  """The overrides as lines, their globs spelt out, every value of them one that can be."""
+  lines = [_spell_out(override, roots) for override in overrides]
+  for line in lines:
+    for one in _values(line):
+      parse(one, roots)
+  return lines
 
 
 def _spell_out(override: HydraOverride, roots: Sequence[Path]) -> str:
@@ -121,8 +172,8 @@ def _spell_out(override: HydraOverride, roots: Sequence[Path]) -> str:
   return f"{override.get_key_element()}={','.join(dict.fromkeys(names))}"
 
 
-def _read(name: str) -> list[str]:
-  """What a sweep file says, as overrides."""
+def _read(name: str) -> tuple[list[str], list[str]]:
+  """What a sweep file says: `params` as overrides, and `jobs`."""
   known = sweep_names()
   if name not in known:
     raise UnknownNameError(f"sweep={name} does not exist: choose from {', '.join(known)}.{nearest(name, known)}")
@@ -130,10 +181,14 @@ def _read(name: str) -> list[str]:
     content = OmegaConf.to_container(OmegaConf.load(shipped("sweeps") / f"{name}.yaml"))
   except (YAMLError, OmegaConfBaseException) as error:
     raise ConfigError(f"sweep={name}: its file cannot be read: {first_line(error)}.") from None
-  params = content.get("params") if isinstance(content, Mapping) and set(content) == {"params"} else None
-  if not isinstance(params, Mapping) or not params:
-    raise ConfigError(f"sweep={name}: its file must hold `params:`, a mapping from keys to values, and nothing else.")
-  return [_override(name, str(key), value) for key, value in params.items()]
+  if not isinstance(content, Mapping) or not content or not set(content) <= {"params", "jobs"}:
+    raise ConfigError(f"sweep={name}: its file must hold `params:` or `jobs:` or both, and nothing else.")
+  params, jobs = content.get("params"), content.get("jobs")
+  if "params" in content and (not isinstance(params, Mapping) or not params):
+    raise ConfigError(f"sweep={name}: `params:` must be a mapping from keys to values.")
+  if "jobs" in content and not (isinstance(jobs, list) and jobs and all(isinstance(job, str) for job in jobs)):
+    raise ConfigError(f"sweep={name}: `jobs:` must be a list of command lines.")
+  return [_override(name, str(key), value) for key, value in (params or {}).items()], list(jobs or [])
 
 
 def _override(name: str, key: str, value: Any) -> str:

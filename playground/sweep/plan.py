@@ -16,12 +16,12 @@ ROOT = Path("results/sweeps")
 
 def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
   """The configurations of all jobs that `-m` is given; of a search, of its first one."""
-  settings, lines = configs.split(configs.expand(overrides))
+  settings, sets = _lines(overrides)
   if configs.compose_settings(settings).search.name != "grid":
     from playground.sweep.search import first_values
 
-    return configs.compose_all([first_values(lines)])
-  return configs.compose_all(configs.combinations(configs.with_default_experiment(lines)))
+    return configs.compose_all([first_values(sets[0])])
+  return configs.compose_all([job for lines in sets for job in configs.combinations(lines)])
 
 
 def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
@@ -36,19 +36,18 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
   Raises:
     ConfigError: whatever cannot work; nothing is written then.
   """
-  settings, lines = configs.split(configs.expand(overrides))
-  chosen = configs.compose_settings(settings)
-  lines = configs.with_default_experiment(lines)
+  settings, sets = _lines(overrides)
+  chosen, lines = configs.compose_settings(settings), sets[0]
   if chosen.search.name != "grid":
     from playground.sweep.search import first_values
 
     (config,), jobs = configs.compose_all([first_values(lines)]), []
     name = _name(overrides, [config])
   else:
-    combinations = configs.combinations(lines)
+    combinations = [job for lines in sets for job in configs.combinations(lines)]
     composed = configs.compose_all(combinations)
     name = _name(overrides, composed)
-    varying = configs.varying(lines)
+    varying = configs.varying(*sets)
     jobs = [
       make_job(number, job, varying, config)
       for number, (job, config) in enumerate(zip(combinations, composed, strict=True))
@@ -59,6 +58,19 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
   path = chosen.sweep_dir or _new(ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
   settings = [line for line in settings if not line.startswith("sweep_dir=")]
   return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen
+
+
+def _lines(overrides: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+  """What is said of the sweep, and of its jobs: one set of lines, or one for each job that its file lists.
+
+  Raises:
+    ConfigError: what `configs.expand`, `split` and `listed_jobs` raise; a search of listed jobs.
+  """
+  settings, lines = configs.split(configs.expand(overrides))
+  listed = configs.listed_jobs(overrides)
+  if listed and configs.compose_settings(settings).search.name != "grid":
+    raise ConfigError("A search draws from what one job may be: its sweep file cannot list jobs.")
+  return settings, [configs.with_default_experiment(one) for one in configs.with_listed(lines, listed)]
 
 
 def make_job(number: int, overrides: Sequence[str], varying: Sequence[str], config: RunConfig) -> Job:
@@ -74,7 +86,9 @@ def make_job(number: int, overrides: Sequence[str], varying: Sequence[str], conf
     ConfigError: it takes several machines.
   """
   varies = {key: _value(config, key) for key in varying}
-  said = [str(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={v}" for k, v in varies.items()]
+  own = {text.partition("=")[0].lstrip("+~") for text in overrides}  # a listed job says less than others
+  named = {key: value for key, value in varies.items() if key in own}
+  said = [str(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={v}" for k, v in named.items()]
   words = re.sub(r"[^A-Za-z0-9._=+-]+", "-", "_".join(said or [config.name]))[:80].strip("-.")
   if config.hardware.distributed.enable:
     raise ConfigError("hardware=multi_node cannot be given with -m: a job of a sweep runs on one machine.")
