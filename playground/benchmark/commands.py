@@ -8,6 +8,7 @@ from typing import Any
 
 from playground.benchmark.arguments import option
 from playground.benchmark.jobs import Job, Plan, probe, run_jobs
+from playground.benchmark.peer import PEERS, check_peer
 from playground.benchmark.schema import Table
 from playground.benchmark.suites import check_agent, choose_tasks
 from playground.config import RunConfig, compose
@@ -267,8 +268,6 @@ class BesidePeer(OfTasks):
   ours = "ppo_v020"  # our side's `agent`
 
   def check(self) -> None:
-    from playground.benchmark.peer import check_peer
-
     super().check()
     if self.agent != "ppo":
       raise ConfigError(f"agent={self.agent}: the comparison is of PPO.")
@@ -277,7 +276,7 @@ class BesidePeer(OfTasks):
   def peer_job(self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: Any) -> Job:
     """A job of the peer; overrides are of our run and do not reach it."""
     peer = {"peer": self.peer, "python": self.peer_python, "path": self.peer_path, "menagerie": self.peer_menagerie}
-    columns = self.columns(task, self.agent, setting, self.peer)
+    columns = self.columns(task, self.agent, setting, PEERS[self.peer].label)
     return Job(measure, {"task": task, **peer, **arguments}, columns, {"quantity": quantity})
 
 

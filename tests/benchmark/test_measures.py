@@ -78,7 +78,7 @@ def test_a_peer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.
   result |= {"versions": "JAX 1", "settings": "num_envs 8", "peak_memory_gib": 1.5}
   driver = tmp_path / "driver.py"
   driver.write_text(f"print('noise'); print('RESULT ' + {json.dumps(result)!r})")
-  monkeypatch.setitem(peers.PEERS, "some", (driver, ("some", "1")))
+  monkeypatch.setitem(peers.PEERS, "some", peers.Peer(driver, "some", "1"))
   arguments = {"task": "CheetahRun", "seconds": 1.0, "python": sys.executable, "path": "", "menagerie": ""}
   peer.measure(Facts(), **arguments, peer="some", backend="jax", seeds=[1], lock=None)
   found = {row["quantity"]: row["value"] for row in rows(capsys)}
@@ -99,7 +99,7 @@ def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
   driver.write_text(f"import sys; print(sys.argv[1], file=open({str(tmp_path / 'job')!r}, 'w'))\n")
   with driver.open("a") as file:
     file.write(f"print('RESULT ' + {json.dumps(result)!r})")
-  monkeypatch.setitem(peers.PEERS, "some", (driver, ("some", "1")))
+  monkeypatch.setitem(peers.PEERS, "some", peers.Peer(driver, "some", "1"))
   arguments = {"task": "CheetahRun", "num_timesteps": None, "python": sys.executable, "path": "", "menagerie": ""}
   arguments |= {"peer": "some", "backend": "warp", "told": ["env.impl=warp"], "seeds": [2], "lock": None}
   peer_run.measure(Facts(), **arguments)
@@ -160,7 +160,7 @@ def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytes
   ]  # fmt: skip
   assert [job.columns["setting"] for job in own[:3]] == ["", "env.impl=jax", "env.impl=warp"]
   assert [(job.columns["agent"], job.columns["who"]) for job in own[:2]] == [
-    ("ppo_v020", "ours"), ("ppo", "playground020"),
+    ("ppo_v020", "ours"), ("ppo", "playground 0.2.0"),
   ]  # fmt: skip
   assert all(job.last == {"quantity": "final_return"} for job in own)
 
@@ -213,7 +213,7 @@ module("config", dm_control_suite_params=params, locomotion_params=params, manip
 def test_the_peers_driver_trains_with_brax(tmp_path: Path):
   (tmp_path / "mujoco_playground").mkdir()
   (tmp_path / "mujoco_playground" / "__init__.py").write_text(FAKE)
-  driver, _ = peers.PEERS["playground020"]
+  driver = peers.PEERS["playground020"].driver
 
   def drive(**job: Any) -> dict[str, Any]:
     job |= {"task": "CartpoleBalance", "backend": "jax", "seed": 1}

@@ -67,7 +67,7 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
     tmp_path,
     {"benchmark": "compare", "seed": 1, "value": 200.0, **speed},
     {"benchmark": "compare", "seed": 2, "value": 300.0, **speed},
-    {"benchmark": "compare", "who": "playground020", "seed": 1, "value": 150.0, **speed},
+    {"benchmark": "compare", "who": "playground 0.2.0", "seed": 1, "value": 150.0, **speed},
     {"benchmark": "startup", "setting": "cold", "quantity": "start_to_first_update_s", "value": 12.5},
     {"benchmark": "scaling", "setting": "agent.num_envs=64", "value": 1e4, **speed},
     {"benchmark": "scaling", "setting": "agent.num_envs=128", "value": 2e4, **speed},
@@ -82,7 +82,7 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
     {"benchmark": "topology", "setting": "hardware.devices=4", "devices": 4, "device": "NVIDIA Y", "value": 3e4},
     *(
       {"benchmark": "learning", "who": who, "setting": setting, "seed": 1, "quantity": quantity, "value": value}
-      for who, score in (("ours", 612.5), ("playground020", 598.5))
+      for who, score in (("ours", 612.5), ("playground 0.2.0", 598.5))
       for setting, quantity, value in (("step=0", "return", 1.5), ("", "best_return", 9.0), ("", "final_return", score))
     ),
     {"benchmark": "chain", "task": "a_chain", "setting": "stage=all", "quantity": "wall_clock_s", "value": 100.0},
@@ -100,7 +100,7 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
   assert devices["2"] == ["scaled", "15,000", "1.50", "0.75", "4,000", "NVIDIA X"]
   assert devices["4"] == ["fixed", "30,000", "", "", "2,000", "NVIDIA Y"], "of another device than the one alone"
   scores = [list(row[:4]) for row in table_with(blocks, "return of each run").rows]
-  assert scores == [["CheetahRun", "ppo", "ours", "612.5"], ["CheetahRun", "ppo", "playground020", "598.5"]]
+  assert scores == [["CheetahRun", "ppo", "ours", "612.5"], ["CheetahRun", "ppo", "playground 0.2.0", "598.5"]]
   shares = table_with(blocks, "update (µs)").rows[0]
   assert list(shares[1:8]) == ["1", "2", "", "", "", "", "7"]
 

@@ -53,12 +53,10 @@ def drive(facts: Facts, peer: str, python: str, path: str, menagerie: str, job: 
   Raises:
     PeerFailedError: it ended with an error, or was ended.
   """
-  driver, _ = PEERS[peer]
   env = {**os.environ, "PYTHONPATH": path, "PEER_MENAGERIE": menagerie}
   env.pop("JAX_COMPILATION_CACHE_DIR", None)  # the peer keeps no compiled programs
-  done = subprocess.run(
-    [python, "-W", "ignore", str(driver), json.dumps(job)], capture_output=True, text=True, errors="replace", env=env
-  )
+  command = [python, "-W", "ignore", str(PEERS[peer].driver), json.dumps(job)]
+  done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=env)
   lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
   if done.returncode or not lines:
     raise PeerFailedError(f"{peer} failed: {(done.stderr.strip().splitlines() or ['nothing said'])[-1]}")

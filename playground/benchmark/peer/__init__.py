@@ -3,11 +3,24 @@
 import os
 import subprocess
 from pathlib import Path
+from typing import NamedTuple
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 
-FOLDER = Path(__file__).parent
-PEERS = {"playground020": (FOLDER / "playground020.py", ("playground", "0.2.0"))}  # driver, distribution and version
+
+class Peer(NamedTuple):
+  """A package, and the program that drives it."""
+
+  driver: Path
+  distribution: str
+  version: str
+
+  @property
+  def label(self) -> str:
+    return f"{self.distribution} {self.version}"
+
+
+PEERS = {"playground020": Peer(Path(__file__).parent / "playground020.py", "playground", "0.2.0")}
 
 
 def check_peer(peer: str, python: str, path: str) -> None:
@@ -19,7 +32,7 @@ def check_peer(peer: str, python: str, path: str) -> None:
   """
   if peer not in PEERS:
     raise UnknownNameError(f"peer={peer} does not exist: choose from {', '.join(PEERS)}.{nearest(peer, PEERS)}")
-  _, (distribution, version) = PEERS[peer]
+  _, distribution, version = PEERS[peer]
   ask = f"import importlib.metadata as m; print(m.version({distribution!r}))"
   env = {**os.environ, "PYTHONPATH": path}
   try:
