@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from playground import registry
+from playground.benchmark import commands
 from playground.benchmark import peer as peers
 from playground.benchmark.commands import Learning, Topology
 from playground.benchmark.worker import ROW, Facts
@@ -173,7 +174,7 @@ def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytes
   assert peer.columns["setting"] == " ".join(peer.arguments["told"]) == setting
   assert peer.arguments["num_timesteps"] == 5000 and peer.arguments["backend"] == "warp"
 
-  monkeypatch.setattr(peers, "check_peer", lambda *_: None)
+  monkeypatch.setattr(commands, "check_peer", lambda *_: None)
   given.check()
   with pytest.raises(ConfigError, match=r"give num_timesteps="):
     Learning(tasks=("CheetahRun",), overrides=("agent.num_timesteps=5",)).check()
