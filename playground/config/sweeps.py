@@ -70,8 +70,8 @@ def listed_jobs(overrides: Sequence[str], config_dir: Path | None = None) -> lis
   given = [parse_with_hydra(text) for text in overrides if not is_hydras(text)]
   keys = {override.key_or_group for override in given}
   found = []
-  for override in given:
-    for text in _read(str(override.value()))[1] if override.key_or_group == "sweep" else []:
+  for override in (override for override in given if override.key_or_group == "sweep"):
+    for text in _read(str(override.value()))[1]:
       parsed = [parse_with_hydra(part) for part in shlex.split(text)]
       lines = _checked([o for o in parsed if o.key_or_group not in keys], config_roots(config_dir))
       if settings := split(lines)[0]:
@@ -108,28 +108,26 @@ def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
   return settings, ours
 
 
-def combinations(lines: Sequence[str]) -> list[list[str]]:
-  """The overrides of each job that a sweep's lines stand for: every combination of their values.
+def combinations(*sets: Sequence[str]) -> list[list[str]]:
+  """The overrides of each job that a sweep's lines stand for: every combination of their values, of each set of lines.
 
   Raises:
     ConfigError: an interval, which has no values to combine.
   """
-  for line in lines:
+  for line in itertools.chain(*sets):
     override = parse_with_hydra(line)
     if override.is_sweep_override() and not override.is_discrete_sweep():
       raise ConfigError(f"{line} is a range to draw from: add search=optuna, or list values.")
-  return [list(job) for job in dict.fromkeys(itertools.product(*map(_values, lines)))]
+  jobs = (job for lines in sets for job in itertools.product(*map(_values, lines)))
+  return [list(job) for job in dict.fromkeys(jobs)]
 
 
 def varying(*sets: Iterable[str]) -> list[str]:
   """The keys and groups that have more than one value, in one set of lines or among several."""
-  said: dict[str, set[tuple[str, ...] | None]] = {}
-  for i, lines in enumerate(sets):
-    parsed = {parse_with_hydra(line).key_or_group: line for line in lines}
-    for key in {**said, **parsed}:
-      missing: list[tuple[str, ...] | None] = [None] if i else []
-      said.setdefault(key, set(missing)).add(tuple(_values(parsed[key])) if key in parsed else None)
-  return [key for key, values in said.items() if len(values) > 1 or any(v is not None and len(v) != 1 for v in values)]
+  said = [{parse_with_hydra(line).key_or_group: tuple(_values(line)) for line in lines} for lines in sets]
+  differs = lambda key: len({values.get(key) for values in said}) > 1
+  listed = lambda key: any(len(values[key]) != 1 for values in said if key in values)
+  return [key for key in dict.fromkeys(itertools.chain(*said)) if differs(key) or listed(key)]
 
 
 def sweep_names() -> list[str]:

@@ -16,12 +16,12 @@ ROOT = Path("results/sweeps")
 
 def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
   """The configurations of all jobs that `-m` is given; of a search, of its first one."""
-  settings, sets = _lines(overrides)
-  if configs.compose_settings(settings).search.name != "grid":
+  _, chosen, sets = _lines(overrides)
+  if chosen.search.name != "grid":
     from playground.sweep.search import first_values
 
     return configs.compose_all([first_values(sets[0])])
-  return configs.compose_all([job for lines in sets for job in configs.combinations(lines)])
+  return configs.compose_all(configs.combinations(*sets))
 
 
 def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
@@ -36,15 +36,15 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
   Raises:
     ConfigError: whatever cannot work; nothing is written then.
   """
-  settings, sets = _lines(overrides)
-  chosen, lines = configs.compose_settings(settings), sets[0]
+  settings, chosen, sets = _lines(overrides)
+  lines = sets[0]
   if chosen.search.name != "grid":
     from playground.sweep.search import first_values
 
     (config,), jobs = configs.compose_all([first_values(lines)]), []
     name = _name(overrides, [config])
   else:
-    combinations = [job for lines in sets for job in configs.combinations(lines)]
+    combinations = configs.combinations(*sets)
     composed = configs.compose_all(combinations)
     name = _name(overrides, composed)
     varying = configs.varying(*sets)
@@ -60,17 +60,17 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
   return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen
 
 
-def _lines(overrides: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-  """What is said of the sweep, and of its jobs: one set of lines, or one for each job that its file lists.
+def _lines(overrides: Sequence[str]) -> tuple[list[str], Section, list[list[str]]]:
+  """What is said of the sweep, what that makes, and what is said of its jobs: a set of lines for each that is listed.
 
   Raises:
     ConfigError: what `configs.expand`, `split` and `listed_jobs` raise; a search of listed jobs.
   """
   settings, lines = configs.split(configs.expand(overrides))
-  listed = configs.listed_jobs(overrides)
-  if listed and configs.compose_settings(settings).search.name != "grid":
+  chosen, listed = configs.compose_settings(settings), configs.listed_jobs(overrides)
+  if listed and chosen.search.name != "grid":
     raise ConfigError("A search draws from what one job may be: its sweep file cannot list jobs.")
-  return settings, [configs.with_default_experiment(one) for one in configs.with_listed(lines, listed)]
+  return settings, chosen, [configs.with_default_experiment(one) for one in configs.with_listed(lines, listed)]
 
 
 def make_job(number: int, overrides: Sequence[str], varying: Sequence[str], config: RunConfig) -> Job:
