@@ -145,11 +145,12 @@ def learn(task: str, backend: str, seed: int, num_timesteps: int | None) -> dict
   arguments, evaluations, rates = arguments_of(task, backend, seed), [], []
   if num_timesteps is not None:
     arguments["num_timesteps"] = num_timesteps
+  stretches = max(arguments.get("num_resets_per_eval", 0), 1)
 
   def note(step: int, metrics: Any) -> None:
     evaluations.append((int(step), float(metrics["eval/episode_reward"]), time.perf_counter()))
-    if step:  # the rate is of the last stretch between resets; that of the first evaluation may have compiling in it
-      rates.append(float(metrics["training/sps"]))
+    if step:  # Brax divides the steps of all stretches between resets by the time of the last one
+      rates.append(float(metrics["training/sps"]) / stretches)
 
   ppo.train(**arguments, run_evals=True, progress_fn=note)
   begin = evaluations[0][2]
