@@ -257,7 +257,7 @@ class Chain(Measuring):
 
 @dataclasses.dataclass(frozen=True)
 class BesidePeer(OfTasks):
-  """Options of what is measured for another package, too: PPO with the hyperparameters of that one on both sides."""
+  """Options of what is measured for another package, too, with the hyperparameters of that one on both sides."""
 
   peer: str = option("playground020", "the package to compare with")
   peer_python: str = option("python3", "interpreter of the environment that it is installed in")
@@ -265,12 +265,17 @@ class BesidePeer(OfTasks):
   peer_menagerie: str = option("", "folder of its robot models, where it should not fetch them")
   backends: tuple[str, ...] = option(("jax", "warp"), "the peer's backends; ours is the task's own choice")
 
-  ours = "ppo_v020"  # our side's `agent`
+  agents = ("ppo",)  # that can be compared
+
+  @property
+  def ours(self) -> str:
+    """Our side's `agent`."""
+    return f"{self.agent}_v020"
 
   def check(self) -> None:
     super().check()
-    if self.agent != "ppo":
-      raise ConfigError(f"agent={self.agent}: the comparison is of PPO.")
+    if self.agent not in self.agents:
+      raise ConfigError(f"agent={self.agent}: {self.name} is of {' or '.join(self.agents)}.")
     check_peer(self.peer, self.peer_python, self.peer_path)
 
   def peer_job(self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: Any) -> Job:
@@ -303,7 +308,7 @@ class Compare(BesidePeer):
 
 @dataclasses.dataclass(frozen=True)
 class Learning(BesidePeer):
-  """Ours and the public package's PPO trained for as many steps, with their own evaluations: returns, wall-clock."""
+  """Ours and the public package trained for as many steps, with their own evaluations: returns, wall-clock."""
 
   backends: tuple[str, ...] = option(("warp",), "the peer's backends; ours is the task's own choice")
   num_timesteps: int | None = option(
@@ -312,9 +317,12 @@ class Learning(BesidePeer):
   seeds: int = option(1, "trainings of each side, seeds 1 to this")
 
   name = "learning"
+  agents = ("ppo", "sac")
 
   def check(self) -> None:
     super().check()
+    if self.agent == "sac" and (others := set(self.chosen()) - set(choose_tasks("dm_control", ()))):
+      raise ConfigError(f"agent=sac: the package trains SAC on DM Control alone, not {', '.join(sorted(others))}.")
     if any(text.startswith("agent.num_timesteps=") for text in self.overrides):
       raise ConfigError("agent.num_timesteps= would be our side's alone: give num_timesteps=, which is both's.")
     self.configured(self.chosen()[0], *self.budget())
@@ -331,7 +339,7 @@ class Learning(BesidePeer):
         jobs.append(self.on_one_device(Job("run", arguments, columns, {"quantity": "final_return"})))
         for backend in self.backends:
           setting = [f"env.impl={backend}", *self.budget()]
-          of_it = {"num_timesteps": self.num_timesteps, "backend": backend, "seeds": [seed]}
+          of_it = {"agent": self.agent, "num_timesteps": self.num_timesteps, "backend": backend, "seeds": [seed]}
           of_it["told"] = [*self.overrides, *setting]
           jobs.append(self.peer_job("peer_run", "final_return", task, setting, **of_it))
     return jobs

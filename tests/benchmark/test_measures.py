@@ -13,7 +13,7 @@ import pytest
 from playground import registry
 from playground.benchmark import commands
 from playground.benchmark import peer as peers
-from playground.benchmark.commands import Learning, Topology
+from playground.benchmark.commands import Compare, Learning, Topology
 from playground.benchmark.worker import ROW, Facts
 from playground.errors import ConfigError
 from playground.runs.files import write_json
@@ -102,7 +102,8 @@ def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
     file.write(f"print('RESULT ' + {json.dumps(result)!r})")
   monkeypatch.setitem(peers.PEERS, "some", peers.Peer(driver, "some", "1"))
   arguments = {"task": "CheetahRun", "num_timesteps": None, "python": sys.executable, "path": "", "menagerie": ""}
-  arguments |= {"peer": "some", "backend": "warp", "told": ["env.impl=warp"], "seeds": [2], "lock": None}
+  arguments |= {"peer": "some", "agent": "sac", "backend": "warp", "told": ["env.impl=warp"]}
+  arguments |= {"seeds": [2], "lock": None}
   peer_run.measure(Facts(), **arguments)
   found = rows(capsys)
   assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
@@ -112,7 +113,7 @@ def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
   ]  # fmt: skip
   assert all(row["seed"] == 2 and row["backend"] == "warp" and "num_evals 3" in row["conditions"] for row in found)
   assert found[1]["conditions"].endswith("; after 30.2 s") and "after" not in found[-1]["conditions"].split(";")[-1]
-  job = {"task": "CheetahRun", "backend": "warp", "seed": 2, "evaluate": True, "num_timesteps": None}
+  job = {"task": "CheetahRun", "agent": "sac", "backend": "warp", "seed": 2, "evaluate": True, "num_timesteps": None}
   assert json.loads((tmp_path / "job").read_text()) == job
 
   driver.write_text("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
@@ -180,8 +181,19 @@ def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytes
     Learning(tasks=("CheetahRun",), overrides=("agent.num_timesteps=5",)).check()
   with pytest.raises(ConfigError, match=r"num_timesteps"):
     Learning(tasks=("CheetahRun",), num_timesteps=0).check()
-  with pytest.raises(ConfigError, match=r"of PPO"):
-    Learning(tasks=("CheetahRun",), agent="sac").check()
+
+
+def test_sac_is_compared_in_learning_alone(monkeypatch: pytest.MonkeyPatch):
+  monkeypatch.setattr(commands, "check_peer", lambda *_: None)
+  learning = Learning(tasks=("CheetahRun",), agent="sac")
+  learning.check()
+  ours, peer = learning.jobs({})
+  assert (ours.arguments["agent"], ours.columns["agent"]) == ("sac_v020", "sac_v020")
+  assert (peer.arguments["agent"], peer.columns["agent"]) == ("sac", "sac")
+  with pytest.raises(ConfigError, match=r"compare is of ppo"):
+    Compare(tasks=("CheetahRun",), agent="sac").check()
+  with pytest.raises(ConfigError, match=r"SAC on DM Control alone, not PandaPickCube"):
+    Learning(tasks=("CheetahRun", "PandaPickCube"), agent="sac").check()
 
 
 def test_topology_has_all_devices_and_may_have_several_workers():
@@ -206,6 +218,9 @@ params = types.SimpleNamespace(brax_ppo_config=lambda name, impl: dict(
   num_timesteps=1, num_evals=3, num_resets_per_eval=1, num_eval_envs=2, episode_length=20,
   num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2,
   num_updates_per_batch=1, action_repeat=1, network_factory=dict(policy_hidden_layer_sizes=(8,))))
+params.brax_sac_config = lambda name, impl: dict(
+  num_timesteps=1, num_evals=3, num_eval_envs=2, episode_length=20, num_envs=8, batch_size=8, grad_updates_per_step=2,
+  min_replay_size=16, max_replay_size=64, action_repeat=1, network_factory=dict(hidden_layer_sizes=(8,)))
 module("config", dm_control_suite_params=params, locomotion_params=params, manipulation_params=params)
 """
 
@@ -216,8 +231,8 @@ def test_the_peers_driver_trains_with_brax(tmp_path: Path):
   (tmp_path / "mujoco_playground" / "__init__.py").write_text(FAKE)
   driver = peers.PEERS["playground020"].driver
 
-  def drive(**job: Any) -> dict[str, Any]:
-    job |= {"task": "CartpoleBalance", "backend": "jax", "seed": 1}
+  def drive(agent: str, **job: Any) -> dict[str, Any]:
+    job |= {"task": "CartpoleBalance", "agent": agent, "backend": "jax", "seed": 1}
     done = subprocess.run(
       [sys.executable, str(driver), json.dumps(job)], capture_output=True, text=True,
       env={"PYTHONPATH": f"{tmp_path}:{CHECKOUT}", "PATH": "", "JAX_PLATFORMS": "cpu"},
@@ -225,14 +240,18 @@ def test_the_peers_driver_trains_with_brax(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1].removeprefix("RESULT "))
 
-  result = drive(steps=40, epochs=3)
+  result = drive("ppo", steps=40, epochs=3)
   assert len(result["epochs"]) == 3 and result["epoch_steps"] == 48 and result["update_steps"] == 16
-  result = drive(evaluate=True, num_timesteps=64)  # three evaluations, two updates between them
+  result = drive("ppo", evaluate=True, num_timesteps=64)  # three evaluations, two updates between them
   assert [step for step, _, _ in result["evaluations"]] == [0, 32, 64] and result["steps"] == 64
   scores, moments = [score for _, score, _ in result["evaluations"]], [moment for _, _, moment in result["evaluations"]]
   assert all(0 < score <= 20 for score in scores), "sums of rewards of at most 1"
   assert moments == sorted(moments) and moments[0] == 0 and result["wall_clock_s"] == moments[-1]
   assert result["training_steps_per_s"] > 0 and "num_evals 3, num_resets_per_eval 1" in result["settings"]
+  result = drive("sac", evaluate=True, num_timesteps=64)
+  steps = [step for step, _, _ in result["evaluations"]]
+  assert len(steps) == 3 and steps[0] == 0 and result["steps"] == steps[-1] >= 64
+  assert result["training_steps_per_s"] > 0 and "grad_updates_per_step 2" in result["settings"]
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from playground.benchmark.worker import Facts
 def measure(
   facts: Facts,
   task: str,
+  agent: str,
   num_timesteps: int | None,
   peer: str,
   python: str,
@@ -24,7 +25,8 @@ def measure(
   What a run's time is differs: the peer compiles its training while it runs, so that this is in it.
   """
   (seed,) = seeds
-  job = {"task": task, "backend": backend, "seed": seed, "evaluate": True, "num_timesteps": num_timesteps}
+  job = {"task": task, "agent": agent, "backend": backend, "seed": seed}
+  job |= {"evaluate": True, "num_timesteps": num_timesteps}
   with alone(lock):
     result = drive(facts, peer, python, path, menagerie, job)
   when = "time from the end of the evaluation before training to that of the last, compiling the training in it"

@@ -5,6 +5,7 @@ names that it calls and that are gone are put back first.
 """
 
 import functools
+import importlib
 import itertools
 import json
 import os
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-SIZES = ("num_envs", "batch_size", "num_minibatches")
+SIZES = ("num_envs", "batch_size", "num_minibatches", "grad_updates_per_step")
 EVALUATION = ("num_evals", "num_resets_per_eval", "num_eval_envs")
 
 
@@ -57,8 +58,8 @@ def use_menagerie(folder: str) -> None:
   mjx_env.MENAGERIE_PATH = epath.Path(folder)
 
 
-def tuned(task: str, backend: str) -> dict[str, Any]:
-  """The package's own PPO settings for a task."""
+def tuned(task: str, backend: str, agent: str) -> dict[str, Any]:
+  """The package's own settings for a task; it has SAC's for DM Control only."""
   from mujoco_playground import dm_control_suite, locomotion  # pyright: ignore[reportMissingImports]
   from mujoco_playground.config import dm_control_suite_params, locomotion_params, manipulation_params  # pyright: ignore[reportMissingImports]
 
@@ -66,7 +67,7 @@ def tuned(task: str, backend: str) -> dict[str, Any]:
     params = dm_control_suite_params
   else:
     params = locomotion_params if task in locomotion._envs else manipulation_params
-  return dict(params.brax_ppo_config(task, backend))
+  return dict(getattr(params, f"brax_{agent}_config")(task, backend))
 
 
 def load(task: str, backend: str, num_envs: int) -> Any:
@@ -81,18 +82,18 @@ def load(task: str, backend: str, num_envs: int) -> Any:
   return registry.load(task, config_overrides=changes)
 
 
-def arguments_of(task: str, backend: str, seed: int) -> dict[str, Any]:
+def arguments_of(task: str, backend: str, seed: int, agent: str = "ppo") -> dict[str, Any]:
   """What Brax's trainer takes to train a task on one device as the package does."""
-  from brax.training.agents.ppo import networks
   from mujoco_playground import registry, wrapper  # pyright: ignore[reportMissingImports]
 
-  settings = tuned(task, backend)
+  networks = importlib.import_module(f"brax.training.agents.{agent}.networks")
+  settings = tuned(task, backend, agent)
   settings.update(json.loads(os.environ.get("PEER_SETTINGS", "{}")))  # smaller ones, to try the driver out
   network = dict(settings.pop("network_factory", None) or {})
   return {
     **settings,
     "environment": load(task, backend, settings["num_envs"]),
-    "network_factory": functools.partial(networks.make_ppo_networks, **network),
+    "network_factory": functools.partial(getattr(networks, f"make_{agent}_networks"), **network),
     "wrap_env_fn": wrapper.wrap_for_brax_training,
     "randomization_fn": registry.get_domain_randomizer(task),
     "max_devices_per_host": 1,
@@ -134,15 +135,14 @@ def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: An
   }
 
 
-def learn(task: str, backend: str, seed: int, num_timesteps: int | None) -> dict[str, Any]:
+def learn(task: str, backend: str, seed: int, num_timesteps: int | None, agent: str) -> dict[str, Any]:
   """Trains to the end with the package's own evaluations and resets; None is its own budget.
 
   The clock starts when the evaluation before training is done. Brax has compiled and run that one by then; compiling
   the training, all training and resets, and the evaluations after are in the time.
   """
-  from brax.training.agents.ppo import train as ppo
-
-  arguments, evaluations, rates = arguments_of(task, backend, seed), [], []
+  brax = importlib.import_module(f"brax.training.agents.{agent}.train")
+  arguments, evaluations, rates = arguments_of(task, backend, seed, agent), [], []
   if num_timesteps is not None:
     arguments["num_timesteps"] = num_timesteps
   stretches = max(arguments.get("num_resets_per_eval", 0), 1)
@@ -152,7 +152,7 @@ def learn(task: str, backend: str, seed: int, num_timesteps: int | None) -> dict
     if step:  # Brax divides the steps of all stretches between resets by the time of the last one
       rates.append(float(metrics["training/sps"]) / stretches)
 
-  ppo.train(**arguments, run_evals=True, progress_fn=note)
+  brax.train(**arguments, progress_fn=note)
   begin = evaluations[0][2]
   return {
     "evaluations": [(step, score, moment - begin) for step, score, moment in evaluations],
@@ -176,7 +176,7 @@ def main() -> None:
     use_menagerie(os.environ["PEER_MENAGERIE"])
   subject = job["task"], job["backend"], job["seed"]
   if job.get("evaluate"):
-    result = learn(*subject, job["num_timesteps"])
+    result = learn(*subject, job["num_timesteps"], job["agent"])
   else:
     result = train(*subject, job["steps"], job["epochs"], process_age_s)
   names = {"jax": "JAX", "mujoco": "MuJoCo", "mujoco-mjx": "MJX", "brax": "Brax", "warp-lang": "Warp"}
