@@ -220,7 +220,8 @@ params = types.SimpleNamespace(brax_ppo_config=lambda name, impl: dict(
   num_updates_per_batch=1, action_repeat=1, network_factory=dict(policy_hidden_layer_sizes=(8,))))
 params.brax_sac_config = lambda name, impl: dict(
   num_timesteps=1, num_evals=3, num_eval_envs=2, episode_length=20, num_envs=8, batch_size=8, grad_updates_per_step=2,
-  min_replay_size=16, max_replay_size=64, action_repeat=1, network_factory=dict(hidden_layer_sizes=(8,)))
+  min_replay_size=16, max_replay_size=64, action_repeat=1, num_resets_per_eval=1,
+  network_factory=dict(hidden_layer_sizes=(8,)))
 module("config", dm_control_suite_params=params, locomotion_params=params, manipulation_params=params)
 """
 
