@@ -111,6 +111,30 @@ class OfTasks(Measuring):
 
 
 @dataclasses.dataclass(frozen=True)
+class OfRuns(OfTasks):
+  """Options of what trains whole runs, too."""
+
+  num_timesteps: int | None = option(None, "control steps of a whole run")
+
+  def check(self) -> None:
+    super().check()
+    if any(text.lstrip("+").startswith("agent.num_timesteps=") for text in self.overrides):
+      raise ConfigError(f"agent.num_timesteps= is no override of {self.name}: give num_timesteps=, for all whole runs.")
+    if self.num_timesteps is not None and self.num_timesteps < 1:
+      raise ConfigError(f"num_timesteps={self.num_timesteps} must be at least 1.")
+
+  def budget(self) -> list[str]:
+    return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
+
+  def whole_run(self, task: str, agent: str, seed: int, setting: Sequence[str] = ()) -> Job:
+    """A job that trains from beginning to end, for the budget."""
+    setting = [*setting, *self.budget()]
+    told = [*self.overrides, *setting]
+    arguments = {"task": task, "agent": agent, "overrides": told, "told": told, "seeds": [seed]}
+    return Job("run", arguments, self.columns(task, agent, setting), {"quantity": "final_return"})
+
+
+@dataclasses.dataclass(frozen=True)
 class Throughput(OfTasks):
   """Training steps/s of each task at the paper's hyperparameters on one device, compile and start time, memory."""
 
@@ -201,12 +225,13 @@ class Pixels(OfTasks):
 
 
 @dataclasses.dataclass(frozen=True)
-class Topology(OfTasks):
-  """Training steps/s on 1, 2, 4, ... devices of this machine, with hyperparameters as they are and scaled."""
+class Topology(OfRuns):
+  """Training steps/s, and whole runs, on 1, 2, 4, ... devices, with hyperparameters as they are and scaled."""
 
   devices: tuple[int, ...] = option((), "numbers of devices; none is 1, 2, 4, ... as many as there are")
   hyperparameters: tuple[str, ...] = option(("fixed", "scaled"), "scaled: environments and batch times the devices")
-  seeds: int = option(3, "trainings timed")
+  seeds: int = option(3, "trainings timed, and whole runs of each, seeds 1 to this")
+  num_timesteps: int | None = option(None, "control steps of a whole run on each, after the rates; null is rates alone")
 
   name = "topology"
 
@@ -220,14 +245,16 @@ class Topology(OfTasks):
 
   def jobs(self, facts: dict[str, Any]) -> list[Job]:
     counts = self.devices or [2**i for i in range(facts["devices"].bit_length())]
-    jobs = []
+    seeds = list(range(1, self.seeds + 1))
+    rates, runs = [], []
     for task in self.chosen():
       for count in counts:
         for kind in self.hyperparameters if count > 1 else ("fixed",):
           setting = [f"hardware.devices={count}"]
           setting += ["hardware.scale_envs=true"] * (kind == "scaled")
-          jobs.append(self.job("training", task, setting, seeds=list(range(1, self.seeds + 1))))
-    return jobs
+          rates.append(self.job("training", task, setting, seeds=seeds))
+          runs += [self.whole_run(task, self.agent, seed, setting) for seed in seeds]
+    return rates if self.num_timesteps is None else rates + runs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,7 +334,7 @@ class Compare(BesidePeer):
 
 
 @dataclasses.dataclass(frozen=True)
-class Learning(BesidePeer):
+class Learning(BesidePeer, OfRuns):
   """Ours and the public package trained for as many steps, with their own evaluations: returns, wall-clock."""
 
   backends: tuple[str, ...] = option(("warp",), "the peer's backends; ours is the task's own choice")
@@ -323,20 +350,12 @@ class Learning(BesidePeer):
     super().check()
     if self.agent == "sac" and (others := set(self.chosen()) - set(choose_tasks("dm_control", ()))):
       raise ConfigError(f"agent=sac: the package trains SAC on DM Control alone, not {', '.join(sorted(others))}.")
-    if any(text.startswith("agent.num_timesteps=") for text in self.overrides):
-      raise ConfigError("agent.num_timesteps= would be our side's alone: give num_timesteps=, which is both's.")
-    self.configured(self.chosen()[0], *self.budget())
-
-  def budget(self) -> list[str]:
-    return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
 
   def jobs(self, facts: dict[str, Any]) -> list[Job]:
     jobs = []
     for task in self.chosen():
       for seed in range(1, self.seeds + 1):
-        columns = self.columns(task, self.ours, self.budget())
-        arguments = {"task": task, "agent": self.ours, "overrides": [*self.overrides, *self.budget()], "seeds": [seed]}
-        jobs.append(self.on_one_device(Job("run", arguments, columns, {"quantity": "final_return"})))
+        jobs.append(self.on_one_device(self.whole_run(task, self.ours, seed)))
         for backend in self.backends:
           setting = [f"env.impl={backend}", *self.budget()]
           of_it = {"agent": self.agent, "num_timesteps": self.num_timesteps, "backend": backend, "seeds": [seed]}

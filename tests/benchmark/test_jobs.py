@@ -1,5 +1,6 @@
 """Measurements as processes: rows as they come, what is there is left out, failures do not stop the others."""
 
+import dataclasses
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 
 from playground.benchmark import jobs
+from playground.benchmark.commands import Topology
 from playground.benchmark.jobs import Job, Plan, probe, run_jobs
 from playground.benchmark.schema import Table
 from playground.errors import HardwareError
@@ -111,6 +113,16 @@ def test_more_workers_than_gpus_take_turns_at_each(tmp_path: Path):
   assert {Path(lock).name for lock in locks(workers=4, gpus=(4, 7))} <= {"gpu4.lock", "gpu7.lock"}
   whole = locks(workers=3)
   assert len(whole) == 4 and len(set(whole)) == 1 and whole[0] != "None", "one lock, the machine's"
+
+
+def test_all_of_a_topology_takes_turns_at_the_machine(tmp_path: Path):
+  of_it = Topology(tasks=("CartpoleBalance",), num_timesteps=5000, seeds=1, workers=3).jobs({"devices": 2})
+  assert {job.measure for job in of_it} == {"training", "run"}
+  path = tmp_path / "rows.csv"
+  jobs = [dataclasses.replace(job, measure="lock") for job in of_it]
+  assert run_jobs(jobs, Table(path), FACTS, Plan(**{**vars(PLAN), "workers": 3})) == 0
+  locks = [line.split("lock ")[1].split(";")[0] for line in path.read_text().splitlines() if "lock " in line]
+  assert len(locks) == 6 and len(set(locks)) == 1 and locks[0] != "None"
 
 
 def test_the_machine_is_asked_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch):

@@ -1,5 +1,7 @@
 """What the workers measure: the rows of a training, a chain and a peer; all as commands in the slow tests."""
 
+import dataclasses
+import inspect
 import json
 import math
 import subprocess
@@ -14,6 +16,8 @@ from playground import registry
 from playground.benchmark import commands
 from playground.benchmark import peer as peers
 from playground.benchmark.commands import Compare, Learning, Topology
+from playground.benchmark.measures import run
+from playground.benchmark.schema import Table
 from playground.benchmark.worker import ROW, Facts
 from playground.errors import ConfigError
 from playground.runs.files import write_json
@@ -22,6 +26,7 @@ from tests.dummy import Point
 CHECKOUT = Path(__file__).parents[2]
 SMALL = ["agent.num_envs=16", "agent.batch_size=16", "agent.num_minibatches=1", "agent.unroll_length=5"]
 SMALL += ["agent.num_updates_per_batch=1", "agent.num_eval_envs=2"]
+TOPOLOGIES = ("hardware.devices=1", "hardware.devices=2", "hardware.devices=2 hardware.scale_envs=true")
 
 
 def rows(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
@@ -123,8 +128,6 @@ def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
 
 
 def test_a_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-  from playground.benchmark.measures import run
-
   given = []
 
   def train(overrides: list[str]) -> None:
@@ -139,7 +142,8 @@ def test_a_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
     (folder / "metrics.csv").write_text("\n".join(lines))
 
   monkeypatch.setattr(run, "run_training", train)
-  run.measure(Facts(), "CheetahRun", "ppo", ["agent.num_timesteps=200", "hardware.devices=1"], seeds=[3], lock=None)
+  overrides, told = ["agent.num_timesteps=200", "hardware.devices=1"], ["agent.num_timesteps=200"]
+  run.measure(Facts(), "CheetahRun", "ppo", overrides, told, seeds=[3], lock=None)
   found = rows(capsys)
   setting = "agent.num_timesteps=200 step="
   assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
@@ -169,18 +173,29 @@ def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytes
   given = Learning(tasks=("CheetahRun",), num_timesteps=5000, overrides=("env.impl=jax",))
   ours, peer = given.jobs({})
   assert ours.columns["setting"] == "env.impl=jax agent.num_timesteps=5000"
-  overrides = ["env.impl=jax", "agent.num_timesteps=5000", "hardware.devices=1"]
-  assert ours.arguments == {"task": "CheetahRun", "agent": "ppo_v020", "overrides": overrides, "seeds": [1]}
+  told = ["env.impl=jax", "agent.num_timesteps=5000"]
+  overrides = [*told, "hardware.devices=1"]
+  assert ours.arguments == {
+    "task": "CheetahRun", "agent": "ppo_v020", "overrides": overrides, "told": told, "seeds": [1],
+  }  # fmt: skip
   setting = "env.impl=jax env.impl=warp agent.num_timesteps=5000"
   assert peer.columns["setting"] == " ".join(peer.arguments["told"]) == setting
   assert peer.arguments["num_timesteps"] == 5000 and peer.arguments["backend"] == "warp"
 
   monkeypatch.setattr(commands, "check_peer", lambda *_: None)
   given.check()
-  with pytest.raises(ConfigError, match=r"give num_timesteps="):
-    Learning(tasks=("CheetahRun",), overrides=("agent.num_timesteps=5",)).check()
-  with pytest.raises(ConfigError, match=r"num_timesteps"):
-    Learning(tasks=("CheetahRun",), num_timesteps=0).check()
+
+
+@pytest.mark.parametrize("command", [Learning, Topology])
+def test_the_budget_of_whole_runs_is_checked(monkeypatch: pytest.MonkeyPatch, command: type[Learning | Topology]):
+  monkeypatch.setattr(commands, "check_peer", lambda *_: None)
+  command(tasks=("CheetahRun",), num_timesteps=1).check()
+  for overrides in (("agent.num_timesteps=5",), ("env.impl=jax", "++agent.num_timesteps=5")):
+    for steps in (None, 5):
+      with pytest.raises(ConfigError, match=rf"no override of {command.name}: give num_timesteps="):
+        command(tasks=("CheetahRun",), num_timesteps=steps, overrides=overrides).check()
+  with pytest.raises(ConfigError, match=r"^num_timesteps=0 must be at least 1\.$"):
+    command(tasks=("CheetahRun",), num_timesteps=0).check()
 
 
 def test_sac_is_compared_in_learning_alone(monkeypatch: pytest.MonkeyPatch):
@@ -200,6 +215,33 @@ def test_topology_has_all_devices_and_may_have_several_workers():
   Topology(tasks=("CheetahRun",), workers=4).check()
   with pytest.raises(ConfigError, match=r"gpus=\[0, 1\]: topology uses the devices itself"):
     Topology(tasks=("CheetahRun",), gpus=(0, 1)).check()
+
+
+def test_topology_trains_whole_runs_after_the_rates():
+  rates = Topology(tasks=("CheetahRun",), seeds=2, overrides=("env.impl=jax",))
+  both = dataclasses.replace(rates, num_timesteps=5000).jobs({"devices": 2})
+  assert both[:3] == rates.jobs({"devices": 2}) and {job.measure for job in both[3:]} == {"run"}
+  settings = [f"env.impl=jax {text} agent.num_timesteps=5000" for text in TOPOLOGIES]
+  assert [(job.columns["setting"], job.arguments["seeds"]) for job in both[3:]] == [
+    (setting, [seed]) for setting in settings for seed in (1, 2)
+  ]
+  for job in both[3:]:
+    assert job.last == {"quantity": "final_return"} and job.columns["benchmark"] == "topology"
+    assert job.arguments["overrides"] == job.arguments["told"] == job.columns["setting"].split()
+    job_of_run = inspect.signature(run.measure).parameters
+    assert set(job.arguments) == set(job_of_run) - {"facts", "lock"}
+
+
+def test_whole_runs_that_were_stopped_go_on_where_they_are_missing(tmp_path: Path):
+  jobs = Topology(tasks=("CheetahRun",), seeds=2, devices=(1,), num_timesteps=5000).jobs({})
+  table, facts = Table(tmp_path / "rows.csv"), {"device": "a device"}
+  left = lambda: [(job.measure, job.arguments["seeds"]) for each in jobs if (job := each.left(table, facts))]
+  whole = {**jobs[1].columns, **facts, "seed": 1}
+  table.add({**whole, "quantity": "training_steps_per_s", "value": 1.0})
+  assert left() == [("training", [1, 2]), ("run", [1]), ("run", [2])], "its rate is not that of the rates, nor its end"
+  table.add({**whole, "quantity": "final_return", "value": 1.0})
+  table.add({**jobs[0].columns, **facts, "seed": 1, "quantity": "training_steps_per_s", "value": 1.0})
+  assert left() == [("training", [2]), ("run", [2])]
 
 
 FAKE = """
@@ -263,7 +305,7 @@ def test_every_measuring_command_runs(tmp_path: Path):
     "throughput": ["seeds=2"],
     "breakdown": [],
     "scaling": ["num_envs=8,32"],
-    "topology": [two, "seeds=1", "devices=1,2"],
+    "topology": [two, "seeds=1", "devices=1,2", "hyperparameters=scaled", "num_timesteps=320", "agent.num_evals=2"],
     "startup": [],
   }
   for name, extra in given.items():
@@ -275,5 +317,11 @@ def test_every_measuring_command_runs(tmp_path: Path):
   assert [text.split()[-1] for text in parts] == [
     f"part={part}" for part in ("physics", "task", "episodes", "inference", "storing", "update")
   ]
-  assert set(pd.read_csv(tmp_path / "topology.csv")["devices"]) == {1, 2}
+  topology = pd.read_csv(tmp_path / "topology.csv")
+  assert set(topology["devices"]) == {1, 2}
+  runs = topology[topology["setting"].str.contains("agent.num_timesteps=320")]
+  assert len(topology[topology["quantity"] == "training_steps_per_s"]) == 4 and set(runs["devices"]) == {1, 2}
+  for quantity, ending in (("wall_clock_s", ""), ("final_return", ""), ("return", " step=320")):
+    settings = {text.partition("agent.num_evals=2 ")[2] for text in runs[runs["quantity"] == quantity]["setting"]}
+    assert {f"{text} agent.num_timesteps=320{ending}" for text in (TOPOLOGIES[0], TOPOLOGIES[2])} <= settings
   assert {"env_steps_per_s", "training_steps_per_s"} <= set(pd.read_csv(tmp_path / "scaling.csv")["quantity"])

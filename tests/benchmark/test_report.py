@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from playground.benchmark.report import Options, page, run
+from playground.benchmark.report import Options, page, run, sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.page import Block, Heading, Picture, Table, Text, to_html, to_markdown
 from playground.benchmark.schema import Table as Rows
@@ -92,17 +92,66 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
     ),
   )
   blocks = page(found)
-  assert {block.name for block in blocks if isinstance(block, Picture)} == {"scaling", "topology", "breakdown"}
+  assert {block.name for block in blocks if isinstance(block, Picture)} == {"scaling", "topology", "breakdown", "runs"}
   cells = {cell for block in blocks if isinstance(block, Table) for row in block.rows for cell in row}
   assert {"2.00", "12.5", "20,000", "a_chain", "100"} <= cells  # 300 / 150: the best of the turns
   devices = {row[1]: list(row[2:8]) for row in table_with(blocks, "efficiency").rows}
   assert devices["1"] == ["fixed", "10,000", "1.00", "1.00", "6,000", "NVIDIA X"]  # 60 M steps are the task's own
   assert devices["2"] == ["scaled", "15,000", "1.50", "0.75", "4,000", "NVIDIA X"]
   assert devices["4"] == ["fixed", "30,000", "", "", "2,000", "NVIDIA Y"], "of another device than the one alone"
-  scores = [list(row[:4]) for row in table_with(blocks, "return of each run").rows]
-  assert scores == [["CheetahRun", "ppo", "ours", "612.5"], ["CheetahRun", "ppo", "playground 0.2.0", "598.5"]]
+  scores = [list(row[:5]) for row in table_with(blocks, "return of each run").rows]
+  assert scores == [["CheetahRun", "ppo", "ours", "", "612.5"], ["CheetahRun", "ppo", "playground 0.2.0", "", "598.5"]]
   shares = table_with(blocks, "update (µs)").rows[0]
   assert list(shares[1:8]) == ["1", "2", "", "", "", "", "7"]
+
+
+def whole_run(devices: int, setting: str, seed: int, **quantities: float) -> list[dict[str, Any]]:
+  columns = {"benchmark": "topology", "devices": devices, "seed": seed}
+  columns["setting"] = " ".join(filter(None, (f"hardware.devices={devices}", setting, "agent.num_timesteps=1000")))
+  rows = [{**columns, "quantity": name, "value": value} for name, value in quantities.items()]
+  curve = ((0, 1.0), (1000, quantities["final_return"]))
+  return rows + [
+    {**columns, "setting": f"{columns['setting']} step={step}", "quantity": "return", "value": score}
+    for step, score in curve
+  ]
+
+
+def test_whole_runs_stand_beside_the_rates_of_a_topology(tmp_path: Path):
+  rate = {"benchmark": "topology", "quantity": "training_steps_per_s", "seed": 1}
+  result = {"steps": 1024, "training_steps_per_s": 77.0}
+  found = evidence(
+    tmp_path,
+    {**rate, "setting": "hardware.devices=1", "value": 100.0},
+    {**rate, "setting": "hardware.devices=10", "devices": 10, "value": 400.0},
+    {**rate, "setting": "hardware.devices=2 hardware.scale_envs=true", "devices": 2, "value": 160.0},
+    *whole_run(1, "", 1, **result, wall_clock_s=15.0, final_return=5.0),
+    *whole_run(1, "", 2, **result, wall_clock_s=25.0, final_return=7.0),
+    *whole_run(2, "hardware.scale_envs=true", 1, **result, wall_clock_s=8.0, final_return=4.0),
+    *whole_run(4, "", 1, **result, wall_clock_s=5.0, final_return=3.0),
+  )
+  blocks = page(found)
+  rates = [list(row[1:6]) for row in table_with(blocks, "efficiency").rows]
+  assert rates == [
+    ["1", "fixed", "100.0", "1.00", "1.00"],
+    ["2", "scaled", "160.0", "1.60", "0.80"],
+    ["10", "fixed", "400.0", "4.00", "0.40"],
+  ], "a whole run's own rate is none of them"
+  runs = [list(row[1:8]) for row in table_with(blocks, "measured (s)").rows]
+  assert runs == [
+    ["1", "fixed", "1,024", "20.0 ± 63.5", "1.00", "10.24", "6.0 ± 12.7"],
+    ["2", "scaled", "1,024", "8.0", "2.50", "6.4", "4.0"],
+    ["4", "fixed", "1,024", "5.0", "4.00", "", "3.0"],
+  ], "no rate of four was measured"
+  settings = [row[3] for row in table_with(blocks, "return of each run").rows]
+  assert "hardware.devices=2 hardware.scale_envs=true agent.num_timesteps=1000" in settings and len(settings) == 3
+  curves = sections.runs_by_step(found)
+  assert curves == {
+    "CheetahRun": {
+      "devices=1": [(0, 1.0), (1000, 6.0)],
+      "devices=2 scale_envs=true": [(0, 1.0), (1000, 4.0)],
+      "devices=4": [(0, 1.0), (1000, 3.0)],
+    }
+  }
 
 
 def test_the_committed_results_make_a_page(tmp_path: Path):

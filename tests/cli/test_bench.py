@@ -38,7 +38,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     (["compare", "tasks=CheetahRun", "peer=playground021"], "Did you mean 'playground020'?"),
     (["compare", "tasks=CheetahRun", "peer_python=no_such_python"], "cannot be run"),
     (["compare", "tasks=CheetahRun", f"peer_python={sys.executable}"], "playground 0.2.0 is not installed"),
-    (["compare", "tasks=CheetahRun", "agent=sac"], "the comparison is of PPO"),
+    (["compare", "tasks=CheetahRun", "agent=sac"], "compare is of ppo"),
     (["report", "rows=no_such_folder"], "no measured row"),
   ],
 )

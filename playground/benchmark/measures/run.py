@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from playground.benchmark.measures.startup import facts_of, run_training
-from playground.benchmark.measures.subject import alone, told
+from playground.benchmark.measures.subject import alone
 from playground.benchmark.worker import Facts
 from playground.runs.run_dir import RunDirectory
 
@@ -17,10 +17,13 @@ _UNITS = {"steps": "steps", "wall_clock_s": "s", "training_steps_per_s": "steps/
 _RETURN, _TIME = "eval/episode_reward", "time/wall_clock_s"
 
 
-def measure(facts: Facts, task: str, agent: str, overrides: list[str], seeds: list[int], lock: str | None) -> None:
+def measure(
+  facts: Facts, task: str, agent: str, overrides: list[str], told: list[str], seeds: list[int], lock: str | None
+) -> None:
   """A row for each evaluation, `step=<steps trained>`, then those of the whole run, the last evaluation's return last.
 
-  The whole run has the device to itself, its compiling too.
+  The whole run has the device to itself, its compiling too. `told` is the job's setting, to which an evaluation's row
+  adds its step.
   """
   (seed,) = seeds
   with tempfile.TemporaryDirectory() as folder:
@@ -30,7 +33,7 @@ def measure(facts: Facts, task: str, agent: str, overrides: list[str], seeds: li
       run_training([*chosen, "video.enable=false", "tracking=csv", f"run_dir={run.path}"])
     facts.update(facts_of(run.manifest), conditions="a whole run, evaluations and saving in its time, compiling not")
     evaluations = pd.read_csv(run.metrics_csv).dropna(subset=[_RETURN])
-    emit_returns(facts, evaluations[["step", _RETURN, _TIME]].itertuples(index=False), told(overrides), seed)
+    emit_returns(facts, evaluations[["step", _RETURN, _TIME]].itertuples(index=False), told, seed)
     result = {**run.summary, "training_steps_per_s": run.manifest["timings"]["steady_steps_per_second"]}
     emit_result(facts, result, RESULT, seed=seed)
 

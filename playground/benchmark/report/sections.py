@@ -14,6 +14,8 @@ TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipul
 SPEED = "training_steps_per_s"
 PARTS = ("physics", "task", "episodes", "pixels", "inference", "storing", "update")
 SEEN = {"episodes": "state", "pixels": "+ pictures", "inference": "+ inference", "update": "+ training"}
+_BUDGET = re.compile(r" ?agent\.num_timesteps=\S+")  # in the setting of a whole run on a topology
+_KEY = re.compile(r"^[\w.]+\.(?=\w+=)")  # what an override's key has before its last word
 _CURVE = re.compile(r"(.+?)_((?:ours|peer|ppo|sac|seed)(?:_.*)?)")  # a curve's name: task and run
 
 
@@ -139,7 +141,7 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """One device and several."""
+  """One device and several: rates and what they make of a budget, then whole runs."""
   yield Heading(2, "Devices")
   yield Text(
     "The paper prints for LeapCubeReorient about 2080 s on one RTX 4090 and 670 s on eight H100 (IV-D). Times one "
@@ -147,27 +149,61 @@ def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     "derived: the task's own number of steps over the rate, so training alone, without compiling and evaluation."
   )
   found = evidence.find(benchmark="topology", who="ours", quantity=SPEED)
-  single: dict[tuple[str, ...], float] = {}  # rates on one device; of several commits' the newest, or the same one's
-  for figure in found:
-    if figure["devices"] == "1" and _hyperparameters(figure) == "fixed":
-      single.setdefault(_of_topology(figure), figure.mean)
-      single.setdefault((*_of_topology(figure), figure["commit"]), figure.mean)
   groups: dict[str, dict[str, float]] = {}
   rows = []
-  for figure in found:
-    count, device, note = figure["devices"], figure["device"], notes.number(figure)
-    kind, same = _hyperparameters(figure), _of_topology(figure)
-    one = single.get((*same, figure["commit"]), single.get(same))
+  for figure, one in _beside_one(figure for figure in found if not _BUDGET.search(figure["setting"])):
+    count, kind, device, note = figure["devices"], _hyperparameters(figure), figure["device"], notes.number(figure)
     times = [f"{figure.mean / one:.2f}", f"{figure.mean / one / int(count):.2f}"] if one else ["", ""]
     groups.setdefault(f"{figure['task']}, {count}", {})[kind] = figure.mean
     seconds = f"{_budget(figure['task'], figure['agent']) / figure.mean:,.0f}"
     rows.append([figure["task"], count, kind, _with_ci(figure), *times, seconds, device, note])
-  if not rows:
+  if rows:
+    yield Picture("topology", figures.bars("training steps/s", groups, "steps/s"), "Devices.")
+    derived = ["times one device", "efficiency", "its budget takes (s)"]
+    yield Table(["task", "devices", "hyperparameters", "steps/s", *derived, "device", "note"], rows)
+  else:
     yield _nothing("topology")
-    return
-  yield Picture("topology", figures.bars("training steps/s", dict(sorted(groups.items())), "steps/s"), "Devices.")
-  derived = ["times one device", "efficiency", "its budget takes (s)"]
-  yield Table(["task", "devices", "hyperparameters", "steps/s", *derived, "device", "note"], sorted(rows))
+  yield from _whole_runs(evidence, notes)
+
+
+def _whole_runs(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """Measured wall-clock and return of runs on each topology, beside what the rate makes of as many steps."""
+  yield Text(
+    "Whole runs, as measured: the wall-clock of so many control steps with evaluations and saving, without compiling, "
+    "and the return of the last evaluation. Times one device: how much faster than on one. Derived: the seconds of as "
+    "many steps at the rate above."
+  )
+  rows = []
+  for figure, one in _beside_one(evidence.find(benchmark="topology", who="ours", quantity="wall_clock_s")):
+    of_it = {name: figure[name] for name in ("benchmark", "task", "agent", "who", "backend", "devices", "device")}
+    same = {**of_it, "setting": figure["setting"], "commit": figure["commit"], "source": figure["source"]}
+    steps, score = (evidence.best(**same, quantity=quantity) for quantity in ("steps", "final_return"))
+    of_it |= {"setting": _BUDGET.sub("", figure["setting"]), "quantity": SPEED}
+    rate = evidence.best(**of_it, commit=figure["commit"]) or evidence.best(**of_it)
+    count = f"{steps.mean:,.0f}" if steps else NOT_MEASURED
+    times = f"{one / figure.mean:.2f}" if one else ""
+    derived = _short(steps.mean / rate.mean) if steps and rate else ""
+    result = [count, _with_ci(figure), times, derived, _with_ci(score) if score else NOT_MEASURED]
+    topology = [figure["task"], figure["devices"], _hyperparameters(figure)]
+    rows.append([*topology, *result, figure["device"], notes.number(figure)])
+  measured = ["steps", "measured (s)", "times one device", "derived (s)", "final return"]
+  header = ["task", "devices", "hyperparameters", *measured, "device", "note"]
+  yield Table(header, rows) if rows else _nothing("topology num_timesteps=<steps>")
+
+
+def _beside_one(found: Iterable[Figure]) -> list[tuple[Figure, float | None]]:
+  """Figures in the order of their devices, each with one device's number: of several commits' its own or the newest."""
+  order = lambda figure: (figure["task"], int(figure["devices"]), _hyperparameters(figure))
+  single: dict[tuple[str, ...], float] = {}
+  pairs = []
+  for figure in sorted(found, key=order):  # a task's one device comes first, of several the newest
+    same = _of_topology(figure)
+    own = (*same, figure["commit"])
+    if figure["devices"] == "1":
+      single.setdefault(same, figure.mean)
+      single.setdefault(own, figure.mean)
+    pairs.append((figure, single.get(own, single.get(same))))
+  return pairs
 
 
 def _hyperparameters(figure: Figure) -> str:
@@ -262,15 +298,33 @@ def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     groups.setdefault(task, {})[run] = points
   if groups:
     yield Picture("curves", figures.curves(dict(sorted(groups.items()))), "Return of evaluations over control steps.")
+  if runs := runs_by_step(evidence):
+    yield Picture("runs", figures.curves(runs), "Return of runs that were measured whole, means over seeds.")
   rows = []
   for figure in evidence.find(quantity="final_return"):
     if figure["benchmark"] != "chain":
-      who = [figure["task"], figure["agent"], figure["who"]]
+      who = [figure["task"], figure["agent"], figure["who"], figure["setting"]]
       each = ", ".join(f"{row['value']:,.1f}" for row in figure.rows)
       result = [each, figure["backend"], figure["device"]]
       rows.append([*who, *result, notes.number(figure)])
   if rows:
-    yield Table(["task", "agent", "who", "return of each run", "backend", "device", "note"], sorted(rows))
+    yield Table(["task", "agent", "who", "setting", "return of each run", "backend", "device", "note"], sorted(rows))
+
+
+def runs_by_step(evidence: Evidence) -> dict[str, dict[str, list[tuple[float, float]]]]:
+  """Curves from the rows `return`, whose setting ends in `step=`; a task's runs are named by what they differ in."""
+  tasks: dict[str, dict[tuple[str, ...], dict[float, float]]] = {}
+  for figure in evidence.find(quantity="return"):
+    setting, by_step, step = figure["setting"].rpartition("step=")
+    if by_step:
+      run = (figure["who"], figure["agent"], figure["device"], *setting.split())
+      tasks.setdefault(figure["task"], {}).setdefault(run, {}).setdefault(float(step), figure.mean)  # the newest counts
+  curves = {}
+  for task, runs in tasks.items():
+    shared = set.intersection(*map(set, runs))
+    names = {run: [_KEY.sub("", word) for word in run if word not in shared] or [run[0]] for run in runs}
+    curves[task] = {" ".join(names[run]): sorted(points.items()) for run, points in sorted(runs.items())}
+  return dict(sorted(curves.items()))
 
 
 def _with_ci(figure: Figure) -> str:
