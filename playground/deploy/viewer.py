@@ -11,6 +11,7 @@ from playground.deploy.player import STEP, Player
 from playground.deploy.policy import ExportedPolicy
 from playground.envs.base import Env
 from playground.errors import HardwareError
+from playground.rendering.video import follow
 
 # GLFW's codes of the keys -> component of the command, direction.
 _STEERING = {265: (0, 1), 264: (0, -1), 263: (2, 1), 262: (2, -1), ord(","): (1, 1), ord("."): (1, -1)}
@@ -47,6 +48,8 @@ def view(env: Env, exported: ExportedPolicy, seed: int, console: Console) -> Non
 
   console.print(_HELP, soft_wrap=True)
   with mujoco.viewer.launch_passive(env.mj_model, data, key_callback=on_key) as window:
+    with window.lock():
+      follow(window.cam, env.mj_model)
     while window.is_running():
       began = time.perf_counter()
       state = player.decide()

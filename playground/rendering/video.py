@@ -185,10 +185,17 @@ def choose_camera(model: Any, name: str | None = None) -> Any:
     return chosen
   view = mujoco.MjvCamera()
   mujoco.mjv_defaultFreeCamera(model, view)
+  follow(view, model)
+  return view
+
+
+def follow(view: Any, model: Any) -> None:
+  """Has a free camera (an MjvCamera) follow a robot that walks; on others it stays as it is."""
+  import mujoco
+
   if walks(model):
     view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, model.jnt_bodyid[0]
     view.distance = min(view.distance, 3.0)  # terrain makes the model's extent, and so the default, huge
-  return view
 
 
 def walks(model: Any) -> bool:

@@ -65,10 +65,12 @@ def test_an_episode_that_breaks_begins_anew() -> None:
   assert np.isfinite(player.decide().data.qpos).all() and player.state.info["age"] == 1
 
 
-def test_the_viewer_shows_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
-  env = on_c_physics(load("CartpoleBalance"))
+@pytest.mark.parametrize("task, followed", [("CartpoleBalance", False), ("Go1JoystickFlatTerrain", True)])
+def test_the_viewer_shows_the_policy(task: str, followed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+  env = on_c_physics(load(task))
   shown: list[np.ndarray] = []
   keys: list[Any] = []
+  camera = mujoco.MjvCamera()
 
   @contextlib.contextmanager
   def window(model: mujoco.MjModel, data: mujoco.MjData, key_callback: Any) -> Iterator[Any]:
@@ -77,12 +79,15 @@ def test_the_viewer_shows_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
     yield SimpleNamespace(
       is_running=lambda: len(shown) < 3,
       lock=contextlib.nullcontext,
+      cam=camera,
       perturb=mujoco.MjvPerturb(),
       sync=lambda: shown.append(data.qpos.copy()),
     )
 
   monkeypatch.setattr(mujoco.viewer, "launch_passive", window)
-  full: Any = SimpleNamespace(actions=lambda obs: np.ones(1))
+  full: Any = SimpleNamespace(actions=lambda obs: np.ones(env.action_size))
   view(env, full, 0, Console(quiet=True))
-  assert shown[0][0] < shown[1][0] < shown[2][0]  # the cart drives off
-  keys[0](265)  # a command to a task that takes none
+  assert len(shown) == 3 and not np.array_equal(shown[0], shown[2])
+  assert followed or shown[0][0] < shown[1][0] < shown[2][0]  # the cart drives off
+  assert (camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING) == followed
+  keys[0](265)  # a command, also to a task that takes none
