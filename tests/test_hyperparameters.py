@@ -140,6 +140,13 @@ def test_the_hoppers_experiments_take_our_set_for_sparse_rewards_and_other_agent
   assert compose(ppo.overrides).resolved == ppo.resolved
 
 
+def test_the_panda_sees_with_the_papers_cnn_unpooled_and_020_with_its_small_one():
+  of = lambda agent: compose(["env=PandaPickCubeCartesianVision", f"agent={agent}"]).resolved["agent"]["network"]["cnn"]
+  keys = ("channels", "max_pool", "global_pool", "normalize_channels")
+  assert [of("ppo")[key] for key in keys] == [[32, 64, 64], False, "none", True]
+  assert [of("ppo_v020")[key] for key in keys] == [[16, 32], True, "none", False]
+
+
 def test_a_variant_can_do_without_a_tuned_set():
   untuned = compose(["agent=ppo_v020", "env=CartpoleBalance", "tuned=null"])
   assert untuned.choices["tuned"] is None
