@@ -275,6 +275,7 @@ ERRORS = {
   "agent=sac agent.min_replay_size=-1": ["agent.min_replay_size=-1 must be a number 0 or more."],
   "agent.discounting=2": ["agent.discounting=2.0 must be a number between 0 and 1."],
   "seed=-1": ["seed=-1 must be a number 0 or more."],
+  "env.vision.brightness=[1]": ["env.vision.brightness=[1.0] must be two numbers, from and to."],
   "env.impl=wrap": ["env.impl=wrap is unknown: choose from auto, jax, warp. Did you mean 'warp'?"],
   "hardware.matmul_precision=higest": ["choose from default, high, highest, ", "Did you mean 'highest'?"],
   "agent.num_envs=100": ["agent.num_envs=100 does not divide", "128 * 8 = 1024"],
@@ -296,6 +297,11 @@ def test_errors_are_one_sentence(line: str):
   assert "\n" not in message
   assert message[-1] in ".?"
   assert isinstance(caught.value, UnknownNameError) == ("does not exist" in message and "=/nowhere" not in line)
+
+
+def test_a_command_of_two_numbers_is_refused():
+  with pytest.raises(ConfigError, match=r"env\.command\.max=\[1\.0, 2\.0\] must be three numbers\."):
+    compose(["env=Go1JoystickFlatTerrain", "env.command.max=[1,2]"])
 
 
 def test_a_key_that_only_a_file_sets_is_refused(configs: Path):

@@ -152,7 +152,7 @@ def _show(args: argparse.Namespace) -> int:
   if args.task.startswith("randomization=") and not args.overrides:
     console.print(describe_randomization(compose([args.task])))
     return 0
-  config = compose([f"env={args.task}", *args.overrides])
+  config = compose([args.task if "=" in args.task else f"env={args.task}", *args.overrides])
   env = registry.build(config.env)
   if args.views:
     from playground.rendering.views import save_views

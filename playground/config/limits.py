@@ -48,6 +48,18 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     "agent.discounting agent.gae_lambda agent.tau hardware.memory_fraction on_nonfinite.max_fraction",
   ),
 )
+_LENGTHS = {
+  "two numbers, from and to": (
+    2,
+    "env.gait.foot_height env.gait.frequency env.pushes.angular_velocity env.pushes.duration env.pushes.interval "
+    "env.pushes.velocity env.reset.joint_scale env.reset.target_height env.reward.clip env.vision.brightness",
+  ),
+  "three numbers": (
+    3,
+    "env.command.min env.command.max env.command.nonzero_probability env.obs_scales.command env.reset.cube_pos "
+    "env.reward.forward env.reward.upvector_target",
+  ),
+}
 
 
 def check_limits(resolved: Mapping[str, Any]) -> None:
@@ -70,6 +82,11 @@ def check_limits(resolved: Mapping[str, Any]) -> None:
       value = _get(resolved, key)
       if value is not None and (isinstance(value, str | bool) or not holds(value)):
         raise ConfigError(f"{key}={format_value(value)} must be a number {what}.")
+  for what, (length, keys) in _LENGTHS.items():
+    for key in keys.split():
+      value = _get(resolved, key)
+      if isinstance(value, list) and len(value) != length:
+        raise ConfigError(f"{key}={format_value(value)} must be {what}.")
   _check_batch(*(_get(resolved, f"agent.{key}") for key in ("num_envs", "batch_size", "num_minibatches")))
 
 

@@ -1,5 +1,6 @@
 """Devices as a mesh of one axis, over which environments are divided (data parallel)."""
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -54,7 +55,9 @@ def own_share(array: jax.Array, axis: int) -> np.ndarray:
 
 
 def device_memory(mesh: Mesh) -> int | None:
-  """Bytes that a program may use on the smallest device, None where the runtime does not say (CPU)."""
+  """Bytes that a program may use on the smallest device, of a CPU its share of the host's; None if nobody says."""
+  if mesh.devices.flat[0].platform == "cpu":
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // len(mesh.local_devices)
   limits = [(device.memory_stats() or {}).get("bytes_limit") for device in mesh.devices.flat]
   known = [limit for limit in limits if limit is not None]
   return min(known) if len(known) == len(limits) else None

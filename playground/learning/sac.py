@@ -30,6 +30,8 @@ from playground.learning.replay import REPLAY_SPEC, Replay, ReplayBuffer
 from playground.learning.rollout import NonfiniteCapture, episode_sums
 from playground.learning.sac_losses import PARTS, Transition, sac_loss
 
+_MOST = 2**31 - 1  # transitions on a device: they are drawn by int32
+
 
 @dataclasses.dataclass(frozen=True)
 class SACConfig:
@@ -71,6 +73,8 @@ class SACConfig:
       if getattr(self, name) > self.max_replay_size:
         size = getattr(self, name)
         raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must not be below agent.{name}={size}.")
+    if self.max_replay_size // num_devices > _MOST:
+      raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must be at most {_MOST} for each device.")
 
 
 class SACState(TrainState):

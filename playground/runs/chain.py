@@ -19,6 +19,7 @@ from playground.errors import ConfigError
 from playground.hardware.setup import setup
 from playground.learning.algorithms import make_learner
 from playground.learning.checkpoints import Checkpoint, describe, find_checkpoints
+from playground.randomization import Randomizer
 from playground.runs.chain_result import write_result
 from playground.runs.interrupts import Interrupts, exit_code
 from playground.runs.provenance import process_age_s
@@ -85,13 +86,15 @@ def _check(config: "RunConfig") -> None:
   """
   if config.resolved["run_dir"] is not None:
     RunDirectory(str(config.run_dir)).must_be_new()
-  print(f"Checking {len(config.stages)} stages: {', '.join(stage_folders(config.resolved['curriculum']))}")
+  print(f"Checking the stages {', '.join(stage_folders(config.resolved['curriculum']))}")
   hardware = setup(config.hardware)
   before: tuple[str, dict[str, Any]] | None = None
   for stage, name in zip(config.stages, stage_folders(config.resolved["curriculum"]), strict=True):
     with in_stage(name):
       env = registry.load(stage.choices["env"], config=stage.env)
+      Randomizer(env.mj_model, stage.randomization.terms)
       learner = make_learner(env, stage.agent, hardware.mesh, hardware.network_precision)
+      learner.notices()
       size = env.observation_size
       facts: dict[str, Any] = {"agent.name": stage.agent.name, "size of the action": env.action_size}
       facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}

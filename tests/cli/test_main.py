@@ -83,6 +83,7 @@ def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   assert command("show", "CartpoleBalanc") == 2
   assert "Did you mean 'CartpoleBalance'?" in capsys.readouterr().err
   assert command("show", "Go1JoystickFlatTerrain", "randomization=g1") == 2
+  assert command("show", "randomization=go1", "env=CartpoleBalance") == 2
   out, err = capsys.readouterr()
   assert "target 'left_foot_floor' is no pair of the model" in err and not out
   assert command("show", "randomization=go2") == 2

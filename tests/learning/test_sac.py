@@ -184,6 +184,7 @@ def test_another_buffer_is_refused(tmp_path: Path) -> None:
 
 
 def test_memory_is_stated_and_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(sac, "device_memory", lambda mesh: None)
   (said,) = point_learner(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
   assert said.startswith("Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device, and as much ")
   monkeypatch.setattr(sac, "device_memory", lambda mesh: 10 * 10**9)
@@ -201,6 +202,7 @@ def test_memory_is_stated_and_must_be_there(monkeypatch: pytest.MonkeyPatch) -> 
     ({"num_eval_envs": 15}, ["agent.num_eval_envs=15", "devices, 2"]),
     ({"batch_size": 15}, ["agent.batch_size=15", "devices, 2"]),
     ({"max_replay_size": 60}, ["agent.max_replay_size=60", "agent.min_replay_size=64"]),
+    ({"max_replay_size": 10**10}, ["agent.max_replay_size=10000000000", "2147483647 for each device"]),
     ({"max_replay_size": 8, "min_replay_size": 0}, ["agent.max_replay_size=8", "agent.num_envs=16"]),
   ],
 )

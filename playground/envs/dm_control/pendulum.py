@@ -20,7 +20,8 @@ class PendulumSwingup(SuiteTask):
   else 0.
 
   An episode starts at rest, anywhere on the circle; Playground 0.2.0 starts on one half of it. There, a cosine that
-  rounding took above 1 earns nothing, too. With `env.parity=true` both are so here.
+  rounding took above 1 earns nothing, too. With `env.parity=true` both are so here. What 0.2.0 sets for this task's
+  training never applies, for it misspells the name: `agent=ppo_v020` and `sac_v020` are as it trains.
   """
 
   derived = ("xmat",)

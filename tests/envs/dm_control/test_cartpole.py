@@ -34,6 +34,14 @@ def test_rewards_by_hand(name: str) -> None:
   np.testing.assert_allclose(off, 0.0 if env.config.sparse else 0.5 * 0.55 * 0.8 * 0.55, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+  ("cart", "cosine", "reward"), [(0.24, 1.0, 1), (-0.26, 1.0, 0), (0.26, 1.0, 0), (0.0, 0.996, 1), (0.0, 0.994, 0)]
+)
+def test_the_sparse_reward_is_paid_near_the_middle_upright(cart: float, cosine: float, reward: int) -> None:
+  env = load_task("CartpoleSwingupSparse")
+  assert env.evaluate(state_at(env, qpos=[cart, np.arccos(cosine)]), {}, jnp.zeros(1)).reward == reward
+
+
 def test_the_terms_in_use_are_logged() -> None:
   tasks = {name: load_task(name) for name in TERMS}
   metrics = {name: env.evaluate(state_at(env), {}, jnp.zeros(1)).metrics for name, env in tasks.items()}

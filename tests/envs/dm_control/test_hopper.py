@@ -41,6 +41,15 @@ def test_standing_asks_for_small_control(stand: Hopper, action: float, reward: f
   assert stand.evaluate(state_at(stand, qpos=LYING), {}, jnp.full(4, action)).reward == 0
 
 
+@pytest.mark.parametrize(("shift", "standing"), [(0.001, 1), (-0.001, 0)])
+def test_standing_is_0_6_m_from_foot_to_torso(stand: Hopper, shift: float, standing: int) -> None:
+  data = state_at(stand, qpos=UPRIGHT)
+  torso, foot = (stand.mj_model.body(name).id for name in ("torso", "foot"))
+  height = data.xipos[foot, 2] + 0.6 + shift
+  data = data.replace(xipos=data.xipos.at[torso, 2].set(height))
+  assert stand.evaluate(data, {}, jnp.zeros(4)).metrics["reward/standing"] == standing
+
+
 def test_observation(stand: Hopper) -> None:
   qpos, qvel = [9, -0.061, 0, 0, 0, 0, 0], np.arange(7)
   obs = np.array(stand.observe(state_at(stand, qpos=qpos, qvel=qvel)))
