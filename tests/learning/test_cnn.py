@@ -57,7 +57,7 @@ def test_experiments_have_the_networks_of_their_sources() -> None:
   assert (cartpole.cnn.max_pool, tuple(cartpole.cnn.channels), cartpole.policy_obs_key) == (True, (16, 32), "")
   panda = PPOConfig.from_config(compose(["experiment=panda_pick_pixels"]).agent).network
   assert panda.cnn == dataclasses.replace(
-    CNNConfig([32, 64, 64], [8, 4, 3], [4, 2, 1], "relu", max_pool=False), global_pool="avg", normalize_channels=True
+    CNNConfig([32, 64, 64], [8, 4, 3], [4, 2, 1], "relu", max_pool=False), global_pool="none", normalize_channels=True
   )
   assert panda.policy_hidden_layer_sizes == [256, 256]
 
