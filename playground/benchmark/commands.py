@@ -10,7 +10,7 @@ from playground.benchmark.arguments import option
 from playground.benchmark.jobs import Job, Plan, probe, run_jobs
 from playground.benchmark.peer import PEERS, check_peer
 from playground.benchmark.schema import Table
-from playground.benchmark.suites import check_agent, choose_tasks
+from playground.benchmark.suites import check_agent, choose_tasks, tasks_of
 from playground.config import RunConfig, compose
 from playground.errors import ConfigError
 
@@ -348,7 +348,7 @@ class Learning(BesidePeer, OfRuns):
 
   def check(self) -> None:
     super().check()
-    if self.agent == "sac" and (others := set(self.chosen()) - set(choose_tasks("dm_control", ()))):
+    if self.agent == "sac" and (others := set(self.chosen()) - set(tasks_of("dm_control"))):
       raise ConfigError(f"agent=sac: the package trains SAC on DM Control alone, not {', '.join(sorted(others))}.")
 
   def jobs(self, facts: dict[str, Any]) -> list[Job]:

@@ -94,7 +94,7 @@ def _check(config: "RunConfig") -> None:
       env = registry.load(stage.choices["env"], config=stage.env)
       Randomizer(env.mj_model, stage.randomization.terms)
       learner = make_learner(env, stage.agent, hardware.mesh, hardware.network_precision)
-      learner.notices()
+      learner.notices()  # raises for a replay buffer that the device cannot hold
       size = env.observation_size
       facts: dict[str, Any] = {"agent.name": stage.agent.name, "size of the action": env.action_size}
       facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}

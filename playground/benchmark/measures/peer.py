@@ -34,8 +34,7 @@ def measure(
   """Rows for the best epoch's steps a second, time to the first update and memory, as `training` has them of ours."""
   del lock  # a comparison has the machine to itself
   (seed,) = seeds
-  job = {"task": task, "agent": "ppo", "backend": backend, "seed": seed}
-  job |= {"steps": _epoch_steps(task, seconds), "epochs": EPOCHS}
+  job = {"task": task, "backend": backend, "seed": seed, "steps": _epoch_steps(task, seconds), "epochs": EPOCHS}
   with used_memory(facts, seed):
     result = drive(facts, peer, python, path, menagerie, job)
   epochs = result["epochs"]  # seconds of each
