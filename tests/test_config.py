@@ -275,6 +275,8 @@ ERRORS = {
   "agent=sac agent.min_replay_size=-1": ["agent.min_replay_size=-1 must be a number 0 or more."],
   "agent.discounting=2": ["agent.discounting=2.0 must be a number between 0 and 1."],
   "seed=-1": ["seed=-1 must be a number 0 or more."],
+  "env=PandaPickCube env.njmax=-1": ["env.njmax=-1 must be a number 0 or more."],
+  "env=PandaPickCube env.naccdmax_per_env=30": ["env.naccdmax_per_env=30 must not be above env.naconmax_per_env=24."],
   "env.vision.brightness=[1]": ["env.vision.brightness=[1.0] must be two numbers, from and to."],
   "env.impl=wrap": ["env.impl=wrap is unknown: choose from auto, jax, warp. Did you mean 'warp'?"],
   "hardware.matmul_precision=higest": ["choose from default, high, highest, ", "Did you mean 'highest'?"],

@@ -1,14 +1,21 @@
 """`playground tune-buffers <task>`: what Warp's buffers must hold."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rich.console import Console
 from rich.table import Table
 
-from playground.config import compose
+from playground.config import compose, format_value
 from playground.errors import ConfigError
-from playground.learning.buffers import ROOM, Act, measure_buffers
+from playground.learning.buffers import ROOM, Act, BufferSizes, measure_buffers
 from playground.runs.trained import load_trained
+
+# By key of a task's config: what it bounds, and how much of that was needed.
+_BUFFERS: dict[str, tuple[str, Callable[[BufferSizes], str]]] = {
+  "njmax": ("constraint rows of one environment", lambda sizes: str(sizes.constraints)),
+  "naconmax_per_env": ("contacts or candidate pairs, mean", lambda sizes: f"{sizes.contacts:.2f}"),
+  "naccdmax_per_env": ("of these convex, to a power of 2", lambda sizes: str(sizes.convex)),
+}
 
 
 def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: int, steps: int) -> int:
@@ -36,15 +43,14 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
     if trained.task != task:
       raise ConfigError(f"--run={run} is one of {trained.task}, not of {task}.")
     policies[f"policy of {run}"] = trained.act
-  table = Table(title=f"{task} on Warp, {envs} environments, {steps} decisions")
-  for column in ("", "constraint rows of one environment", "contacts and candidate pairs, mean of all"):
-    table.add_column(column, justify="right" if column else "left")
   found = [measure_buffers(config.env, act, envs, steps) for act in policies.values()]
-  for name, sizes in zip(policies, found, strict=True):
-    table.add_row(name, str(sizes.constraints), f"{sizes.contacts:.2f}")
   advice = [sizes.advised() for sizes in found]
-  keys = ("njmax", "naconmax_per_env")
-  table.add_row(f"advised, {ROOM:g} x the most", *(f"{key}: {max(sizes[key] for sizes in advice)}" for key in keys))
-  table.add_row("configured", *(f"{key}: {config.env[key]}" for key in keys))
+  table = Table(title=f"{task} on Warp, {envs} environments, {steps} decisions: the most that was needed")
+  table.add_column("buffer")
+  for column in (*policies, f"advised, {ROOM:g} x the most", "configured"):
+    table.add_column(column, justify="right", overflow="fold")
+  for key, (what, needed) in _BUFFERS.items():
+    sizes = [str(max(advised[key] for advised in advice)), format_value(config.env[key])]
+    table.add_row(f"env.{key}\n  {what}", *map(needed, found), *sizes)
   Console().print(table)
   return 0

@@ -39,8 +39,8 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     "0 or more",
     lambda x: x >= 0,
     "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient agent.min_replay_size "
-    "agent.augment_pixels curriculum.scale launcher.grace launcher.gpus launcher.gpus_per_job launcher.requeues "
-    "launcher.retries search.seed",
+    "agent.augment_pixels curriculum.scale env.njmax env.naconmax_per_env env.naccdmax_per_env launcher.grace "
+    "launcher.gpus launcher.gpus_per_job launcher.requeues launcher.retries search.seed",
   ),
   (
     "between 0 and 1",
@@ -87,6 +87,9 @@ def check_limits(resolved: Mapping[str, Any]) -> None:
       value = _get(resolved, key)
       if isinstance(value, list) and len(value) != length:
         raise ConfigError(f"{key}={format_value(value)} must be {what}.")
+  contacts, convex = (_get(resolved, f"env.{key}") for key in ("naconmax_per_env", "naccdmax_per_env"))
+  if contacts is not None and convex is not None and convex > contacts:
+    raise ConfigError(f"env.naccdmax_per_env={convex} must not be above env.naconmax_per_env={contacts}.")
   _check_batch(*(_get(resolved, f"agent.{key}") for key in ("num_envs", "batch_size", "num_minibatches")))
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.base import Env, State
-from playground.envs.physics import STATE_FIELDS, WORLDS, mjx
+from playground.envs.physics import STATE_FIELDS, WORLDS, BufferUse, mjx
 
 ModelFields = Mapping[str, jax.Array]
 # `info` keys that wrappers own; a fresh reset of a task never touches them.
@@ -131,18 +131,21 @@ class Episode(Wrapper):
     return state.replace(info=state.info | info)
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    def repeat(carry: tuple[State, jax.Array, jax.Array], _: None) -> tuple[Any, None]:
-      state, reward, done = carry
+    def repeat(carry: tuple[State, jax.Array, jax.Array, BufferUse | None], _: None) -> tuple[Any, None]:
+      state, reward, done, used = carry
       state = self.env.step(state, action, model)
-      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done)), None
+      used = None if used is None else used.join(state.data.buffers)
+      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done), used), None
 
     was_done = state.info["episode_done"]
     if self.repeat == 1:
       after = self.env.step(state, action, model)
       reward, ended = after.reward, after.done
     else:
-      start = (state, jnp.zeros_like(state.reward), jnp.zeros_like(state.done))
-      (after, reward, ended), _ = jax.lax.scan(repeat, start, None, self.repeat)
+      unused = jax.tree.map(jnp.zeros_like, state.data.buffers)
+      start = (state, jnp.zeros_like(state.reward), jnp.zeros_like(state.done), unused)
+      (after, reward, ended, used), _ = jax.lax.scan(repeat, start, None, self.repeat)
+      after = after.replace(data=after.data.replace(buffers=used))
 
     steps = state.info["steps"] + self.repeat
     timed_out = steps >= self.length

@@ -15,21 +15,32 @@ from playground.envs.wrappers import wrap_for_training
 from playground.errors import ConfigError
 
 ROOM = 1.25  # buffers are advised to be so much larger than what was needed
-_TRIES = 8
+_TRIES = 12
+_CCD = 1 << 4  # mujoco_warp's OverflowType.CCD
 
 Act = Callable[[Any, jax.Array], jax.Array]  # (observation [N, ...], key) -> actions [N, action_size]
 
 
 @dataclasses.dataclass(frozen=True)
 class BufferSizes:
-  """Sizes of Warp's buffers: constraint rows of one environment, and contacts or candidate pairs of each on average."""
+  """What a task needed of Warp's buffers.
+
+  Attributes:
+    constraints: constraint rows of one environment.
+    contacts: contacts or candidate pairs of each environment, the mean of all.
+    convex: of those the ones that convex collision routines compute: the least of 1, 2, 4, ... that was enough, as
+      Warp does not say how many they were.
+  """
 
   constraints: int
   contacts: float
+  convex: int
 
   def advised(self) -> dict[str, int]:
-    """`njmax` and `naconmax_per_env`, with some room."""
-    return {"njmax": _round_up(self.constraints * ROOM, 4), "naconmax_per_env": _round_up(self.contacts * ROOM, 1)}
+    """`njmax`, `naconmax_per_env` and `naccdmax_per_env`, with some room."""
+    pairs = _round_up(self.contacts * ROOM, 1)
+    convex = min(_round_up(self.convex * ROOM, 1), pairs)  # Warp takes no more of them
+    return {"njmax": _round_up(self.constraints * ROOM, 4), "naconmax_per_env": pairs, "naccdmax_per_env": convex}
 
 
 def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_steps: int, seed: int = 0) -> BufferSizes:
@@ -46,22 +57,27 @@ def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_step
     ConfigError: Warp is not installed, or some buffer that cannot be set overflowed.
   """
   configured: int | None = config.njmax  # pyright: ignore[reportAssignmentType]
-  rows, pairs = max(configured or 0, 32), 32
+  rows, pairs, convex = max(configured or 0, 32), 32, 1
   for _ in range(_TRIES):
-    sizes = {"impl": "warp", "njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": None}
+    sizes = {"impl": "warp", "njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": convex}
     env = registry.build(ConfigDict(config.to_dict() | sizes))
     use = _roll(env, act, num_envs, num_steps, seed)
     if not use.overflow:
-      return BufferSizes(int(use.constraints), int(use.contacts) / num_envs)
+      return BufferSizes(int(use.constraints), int(use.contacts) / num_envs, convex)
     grew = False
     if use.constraints > rows:
       rows, grew = _round_up(int(use.constraints) * ROOM, 4), True
     if use.contacts > pairs * num_envs:
       pairs, grew = 2 * pairs, True
+    if use.overflow & _CCD and convex < pairs:
+      convex, grew = 2 * convex, True
     if not grew:
       break
   bits = _overflow_names(int(use.overflow))
-  raise ConfigError(f"env.impl=warp: buffers overflowed that njmax={rows} and naconmax_per_env do not bound ({bits}).")
+  raise ConfigError(
+    f"env.impl=warp: buffers ({bits}) still overflow with njmax={rows}, naconmax_per_env={pairs} and "
+    f"naccdmax_per_env={convex}."
+  )
 
 
 def _roll(env: Env, act: Act | None, num_envs: int, num_steps: int, seed: int) -> BufferUse:

@@ -217,10 +217,11 @@ class Job:
     overflows = metrics.get("training/overflows", 0.0)
     if overflows and not self._warned_of_buffers:
       self._warned_of_buffers = True
+      tune = f"playground tune-buffers {self._config.choices['env']} --run {self._run_dir.path}"
       self._progress.print(
-        f"{overflows:.0f} of {taken:,} steps needed more than Warp's buffers hold, and lost contacts or constraints: "
-        f"`playground tune-buffers {self._config.choices['env']} --run {self._run_dir.path}` says how large "
-        "env.njmax and the like should be, once a checkpoint is there."
+        f"{overflows:.0f} of {taken // self._env.action_repeat:,} actions needed more than Warp's buffers hold, and "
+        f"lost contacts or constraints: `{tune}` says how large env.njmax and the like should be, once a checkpoint "
+        "is there."
       )
 
   def _check_numbers(self, step: int, taken: int, metrics: Metrics, captured: Step | None) -> None:

@@ -26,8 +26,10 @@ def test_joining_keeps_the_most_and_every_overflow():
 
 
 def test_advice_has_room():
-  assert BufferSizes(constraints=28, contacts=4.1).advised() == {"njmax": 36, "naconmax_per_env": 6}
-  assert BufferSizes(0, 0.0).advised() == {"njmax": 0, "naconmax_per_env": 0}
+  sizes = {"njmax": 36, "naconmax_per_env": 6, "naccdmax_per_env": 3}
+  assert BufferSizes(constraints=28, contacts=4.1, convex=2).advised() == sizes
+  assert BufferSizes(28, 4.1, convex=8).advised() == sizes | {"naccdmax_per_env": 6}, "all contacts are convex ones"
+  assert set(BufferSizes(0, 0.0, 1).advised().values()) == {0}
 
 
 def test_shared_buffers_grow_with_the_batch(monkeypatch):
@@ -45,14 +47,18 @@ def test_shared_buffers_grow_with_the_batch(monkeypatch):
 
 @pytest.fixture
 def simulated(monkeypatch):
-  """Stands in for the simulation: it needs rows of an environment and pairs of all, and says if that is too many."""
+  """Stands in for the simulation: it needs rows of an environment and pairs of all, some of them convex, and says if
+  that is too many.
+  """
   tried = []
 
-  def simulate(rows: int, pairs: int, stubborn: int = 0):
+  def simulate(rows: int, pairs: int, convex: int = 0, stubborn: int = 0):
     def roll(env, act, num_envs, num_steps, seed):
-      tried.append((env.njmax, env.naconmax_per_env * num_envs))
-      overflow = stubborn | (rows > env.njmax) * 1 | (pairs > env.naconmax_per_env * num_envs) * 8
-      return use(rows, pairs, overflow)
+      tried.append((env.njmax, env.naconmax_per_env * num_envs, env.naccdmax_per_env * num_envs))
+      assert env.naccdmax_per_env <= env.naconmax_per_env, "Warp refuses this"
+      have = dict(zip((1, 8, 16), tried[-1], strict=True))
+      need = {1: rows, 8: pairs, 16: convex}
+      return use(rows, pairs, stubborn | sum(bit for bit, size in have.items() if need[bit] > size))
 
     monkeypatch.setattr(buffers, "_roll", roll)
     monkeypatch.setattr(registry, "build", lambda config: config)
@@ -61,19 +67,21 @@ def simulated(monkeypatch):
   return simulate
 
 
-@pytest.mark.parametrize(("rows", "pairs", "tries"), [(28, 16, 1), (200, 16, 2), (28, 1000, 5), (60, 60, 1)])
-def test_buffers_grow_until_they_are_large_enough(simulated, rows, pairs, tries):
-  tried = simulated(rows, pairs)
+@pytest.mark.parametrize(
+  ("rows", "pairs", "convex", "tries", "found"),
+  [(28, 16, 2, 1, 1), (200, 16, 3, 2, 2), (28, 1000, 0, 5, 1), (60, 60, 60, 6, 32), (28, 1000, 1000, 10, 512)],
+)
+def test_buffers_grow_until_they_are_large_enough(simulated, rows, pairs, convex, tries, found):
+  tried = simulated(rows, pairs, convex)
   config = registry.config("Go1Getup")  # njmax: 160
-  found = measure_buffers(config, None, num_envs=2, num_steps=3)
-  assert found == BufferSizes(rows, pairs / 2)
-  assert len(tried) == tries and tried[-1][0] >= rows and tried[-1][1] >= pairs
+  assert measure_buffers(config, None, num_envs=2, num_steps=3) == BufferSizes(rows, pairs / 2, found)
+  assert len(tried) == tries and all(have >= need for have, need in zip(tried[-1], (rows, pairs, convex), strict=True))
 
 
 def test_other_buffers_are_named(simulated):
   pytest.importorskip("warp")
   simulated(1, 1, stubborn=32)
-  with pytest.raises(ConfigError, match=r"do not bound \(HFIELD\)"):
+  with pytest.raises(ConfigError, match=r"\(HFIELD\) still overflow with njmax=160"):
     measure_buffers(registry.config("Go1Getup"), None, 2, 3)
 
 
