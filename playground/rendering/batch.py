@@ -6,6 +6,7 @@ it is traced for a batch of a new size, so that training, evaluation and a singl
 """
 
 import dataclasses
+import operator
 from functools import partial
 from typing import Any
 
@@ -86,23 +87,42 @@ class BatchRenderer:
       with. Two renderings write into the same buffers of the context: whatever renders next must come from that state,
       or nothing tells the compiler which of them is first.
     """
+    # Rays are computed once for all environments, unless the lens is another than the task's.
+    task = self._physics.model
+    lenses = model.cam_fovy is not task.cam_fovy or model.cam_intrinsic is not task.cam_intrinsic
+    shared = jax.tree.map(lambda _: False, model)
+    batch = jax.tree.map(lambda x: x[None], data)
+    pictures, token = jax.tree.map(lambda x: x[0], self._draw(lenses, shared, model, batch))
+    return pictures, data.replace(time=data.time + token)
+
+  def _draw(self, lenses: bool, own: mjx.Model, model: mjx.Model, data: PhysicsData) -> Any:
+    """What `_render` returns, of a batch [N] of states; `own` says which of the model's fields have that axis, too."""
 
     @jax.custom_batching.custom_vmap
-    def one(model: mjx.Model, data: PhysicsData) -> Any:
-      batch = jax.tree.map(lambda x: x[None], data)
-      pictures = jax.vmap(partial(self._render, self._context(1, False)), (None, 0))(model, batch)
-      return jax.tree.map(lambda x: x[0], pictures)
+    def draw(model: mjx.Model, data: PhysicsData) -> Any:
+      context = self._context(len(data.time), lenses)
+      axes = jax.tree.map(lambda is_own: 0 if is_own else None, own)
+      return jax.vmap(partial(self._render, context), (axes, 0))(model, data)
 
-    @one.def_vmap
-    def many(size: int, mapped: Any, model: mjx.Model, data: PhysicsData) -> Any:
-      # Rays are computed once for all environments, unless each has a lens of its own.
-      lenses = bool(mapped[0].cam_fovy or mapped[0].cam_intrinsic)
-      axes = jax.tree.map(lambda is_mapped: 0 if is_mapped else None, tuple(mapped))
-      pictures = jax.vmap(partial(self._render, self._context(size, lenses)), axes)(model, data)
-      return pictures, jax.tree.map(lambda _: True, pictures)
+    @draw.def_vmap
+    def widen(count: int, mapped: Any, model: mjx.Model, data: PhysicsData) -> Any:
+      # A map over a batch is a larger batch: what both of them share stays shared.
+      size = data.time.shape[-1]
 
-    pictures, token = one(model, data)
-    return pictures, data.replace(time=data.time + token)
+      def merge(x: jax.Array, is_mapped: bool, is_own: bool) -> jax.Array:
+        if not is_mapped and not is_own:
+          return x
+        each = x if is_mapped else x[None]
+        each = each if is_own else each[:, None]
+        return jnp.broadcast_to(each, (count, size, *each.shape[2:])).reshape(count * size, *each.shape[2:])
+
+      fields = jax.tree.map(merge, model, mapped[0], own)
+      states = jax.tree.map(lambda x, is_mapped: merge(x, is_mapped, True), data, mapped[1])
+      wide = self._draw(lenses, jax.tree.map(operator.or_, mapped[0], own), fields, states)
+      split = jax.tree.map(lambda x: x.reshape(count, size, *x.shape[1:]), wide)
+      return split, jax.tree.map(lambda _: True, split)
+
+    return draw(model, data)
 
   def _render(self, context: Any, model: mjx.Model, data: PhysicsData) -> tuple[dict[str, Pictures], jax.Array]:
     """The pictures, and a zero that is there only when they are."""

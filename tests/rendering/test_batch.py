@@ -84,6 +84,16 @@ def test_a_batch_is_what_its_environments_are_one_by_one_and_under_scan() -> Non
   jax.tree.map(np.testing.assert_array_equal, batch, jax.device_get(one_by_one))
 
 
+def test_a_map_over_a_batch_is_a_larger_batch_with_what_each_map_is_over() -> None:
+  wide = task().mjx_model.cam_fovy * jnp.array([1.0, 1.5])[:, None]
+  over_lenses = jax.vmap(lambda pose, fovy: render(pose, {"cam_fovy": fovy})[0]["fixed"], (None, 0))
+  seen = jax.device_get(jax.jit(jax.vmap(over_lenses, (0, None)))(POSES, wide))
+  jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[:, 0], y), seen, pictures()["fixed"])
+  alone = jax.jit(lambda: render(POSES[1], {"cam_fovy": wide[1]})[0]["fixed"])()
+  jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[1, 1], y), seen, jax.device_get(alone))
+  assert (seen["rgb"][1, 0] != seen["rgb"][1, 1]).any()
+
+
 def test_each_environment_has_its_own_lens_light_and_colour() -> None:
   model = task().mjx_model
   pose = jnp.broadcast_to(POSES[0], (3, 2))
