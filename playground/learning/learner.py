@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from playground.envs.base import Env, Observation, State
-from playground.envs.wrappers import ModelFields, wrap_for_training
+from playground.envs.wrappers import PRESERVE_INFO, ModelFields, wrap_for_training
 from playground.errors import ConfigError
 from playground.hardware.distributed import several
 from playground.hardware.mesh import AXIS, gather_on_mesh, jit_on_mesh, put
@@ -60,7 +60,8 @@ class Learner(abc.ABC):
     steps_per_update: control steps of one training step, over all devices.
     init: (key, model fields) -> state.
     train: (state, model fields, number of training steps) -> (state, metrics); takes the state's buffers over.
-    reset: (state, key, model fields) -> state with freshly reset environments; takes the state's buffers over.
+    reset: (state, key, model fields) -> state with freshly reset environments, but for what outlasts a full reset;
+      takes the state's buffers over.
     copy: (state) -> state in buffers of its own.
   """
 
@@ -185,7 +186,9 @@ class Learner(abc.ABC):
     return jit_on_mesh(copy, self.mesh, (self._spec,), keep(self._spec))
 
   def _reset(self, state: Any, key: jax.Array, model: ModelFields) -> Any:
-    return state.replace(env_state=self._fresh(key, model))
+    fresh = self._fresh(key, model)
+    kept = {k: v for k, v in state.env_state.info.items() if k == PRESERVE_INFO}
+    return state.replace(env_state=fresh.replace(info=fresh.info | kept))
 
   def _fresh(self, key: jax.Array, model: ModelFields) -> State:
     """Freshly reset environments: this device's share, with keys no other device has."""

@@ -4,13 +4,28 @@ from functools import cache
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from playground.envs.base import State
+from playground.envs.wrappers import PRESERVE_INFO
+from playground.hardware.mesh import make_mesh
 from playground.learning.evaluation import make_evaluator
 from playground.learning.learner import Learner
 from playground.learning.loop import Loop, Program, compile_program, schedule
-from tests.dummy import SMALL_PPO, SMALL_RSL_RL, SMALL_SAC, Config, Recorder, needs_rsl_rl, numbers, point_learner
+from tests.dummy import (
+  ALGORITHMS,
+  SMALL_PPO,
+  SMALL_RSL_RL,
+  SMALL_SAC,
+  Config,
+  PointTask,
+  Recorder,
+  needs_rsl_rl,
+  numbers,
+  point_learner,
+)
 
 RSL_RL = pytest.param(SMALL_RSL_RL, id="rsl_rl_ppo", marks=needs_rsl_rl)
 JITTED = [pytest.param(SMALL_PPO, id="ppo"), pytest.param(SMALL_SAC, id="sac")]
@@ -97,6 +112,30 @@ def test_nan_is_counted_captured_and_kept_from_the_parameters(config: Config) ->
   captured = [captured for captured in hooks.captured if captured]
   assert np.isfinite(captured[0].state.data.qpos).all()
   assert np.isnan(captured[0].after["qpos"]).any()
+
+
+class Rising(PointTask):
+  """Its level rises with every step and outlasts full resets."""
+
+  def reset(self, rng: jax.Array, model: Any = None) -> State:
+    state = super().reset(rng)
+    return state.replace(info=state.info | {PRESERVE_INFO: {"level": jnp.zeros(())}})
+
+  def evaluate(self, data: Any, info: Any, action: jax.Array) -> State:
+    state = super().evaluate(data, info, action)
+    return state.replace(info=state.info | {PRESERVE_INFO: {"level": info[PRESERVE_INFO]["level"] + 1}})
+
+
+@every_algorithm
+def test_a_fresh_start_of_all_environments_keeps_what_outlasts_a_reset(config: Config) -> None:
+  learner = ALGORITHMS[type(config)](Rising(), config, make_mesh(1), {})
+  model: dict[str, Any] = {}
+  state, _ = learner.train(learner.init(jax.random.PRNGKey(0), model), model, np.int32(1))
+  before = jax.device_get(state.env_state)
+  after = jax.device_get(learner.reset(state, jax.random.PRNGKey(1), model).env_state)
+  assert (before.info[PRESERVE_INFO]["level"] > 0).all()
+  np.testing.assert_array_equal(after.info[PRESERVE_INFO]["level"], before.info[PRESERVE_INFO]["level"])
+  assert not after.info["age"].any() and not np.array_equal(after.data.qpos, before.data.qpos)
 
 
 @every_algorithm
