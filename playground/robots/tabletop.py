@@ -116,6 +116,12 @@ def _add_sun(spec: mujoco.MjSpec, height: float) -> None:
   spec.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, height], diffuse=[0.3] * 3)
 
 
+def _add_camera(spec: mujoco.MjSpec) -> None:
+  """A view from the arm's right, for `env.vision`; the public models have none."""
+  quat = [0.845515, 0.526346, 0.047461, 0.07624]
+  spec.worldbody.add_camera(name="workspace", pos=[0.75, -1.1, 0.7], quat=quat)
+
+
 def _add_cube(spec: mujoco.MjSpec) -> None:
   attach(spec, "props/cube")
   for geom in _GUARDED:
@@ -129,6 +135,7 @@ def _panda_single_cube() -> mujoco.MjSpec:
   _add_floor(spec)
   _add_top_light(spec)
   _add_sun(spec, 1.5)
+  _add_camera(spec)
   _add_cube(spec)
   cube = (0.7, 0, 0.03, 1, 0, 0, 0)
   spec.add_key(name="home", qpos=[*_ARM_HOME, *_FINGERS_OPEN, *cube], ctrl=[*_ARM_HOME, 0.04])
@@ -165,6 +172,11 @@ def _panda_single_cube_pixels() -> mujoco.MjSpec:
   floor = spec.geom("floor")
   floor.material, floor.rgba = "", [0.125, 0.125, 0.125, 1]
   spec.body("mocap_target").geoms[0].rgba = [0, 0, 0, 0]  # the ray caster knows no other transparency than all of it
+  coat = spec.material("off_white")
+  for body in ("hand", "left_finger", "right_finger"):  # painted with the arm's material, so that it can be randomised
+    for geom in spec.body(body).geoms:
+      if np.allclose(geom.rgba, coat.rgba):
+        geom.material, geom.rgba = coat.name, [0.5, 0.5, 0.5, 1]  # MuJoCo's default: no colour of its own
   light = spec.light("top")
   light.type, light.mode = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, mujoco.mjtCamLight.mjCAMLIGHT_FIXED
   light.pos, light.dir = [2.25, 0, 1.15], [-1.589, -0.001, -0.971]
@@ -196,6 +208,7 @@ def _panda_robotiq_cube() -> mujoco.MjSpec:
   spec.visual.global_.azimuth, spec.visual.global_.elevation = -40, -30
   _add_floor(spec, -0.02297)
   _add_sun(spec, 3)
+  _add_camera(spec)
   wall = {"size": [0.48, 0.75, 0.05], "pos": [0.946, 0, 0.5], "quat": [1, 0, -1, 0]}
   spec.worldbody.add_geom(name="wall", type=mujoco.mjtGeom.mjGEOM_PLANE, **wall)
   table = {"size": [0.315, 0.6, 0.01], "pos": [0.54586, 0.02337, -0.02], "contype": 0, "conaffinity": 0}

@@ -107,6 +107,16 @@ def test_each_environment_has_its_own_lens_light_and_colour() -> None:
   np.testing.assert_array_equal(seen["segmentation"][0], pictures()["fixed"]["segmentation"][0])
 
 
+def test_shadows_and_textures_are_chosen() -> None:
+  looks = [{}, {"shadows": True}, {"textures": True}]
+  renderers = [BatchRenderer(task().physics, View(("fixed",), WIDTH, HEIGHT, **look)) for look in looks]
+  data = task().physics.make(qpos=POSES[1])
+  plain, shadows, textures = (
+    np.asarray(jax.jit(lambda r=r: r.render(task().mjx_model, data)[0]["fixed"]["rgb"])(), int) for r in renderers
+  )
+  assert (shadows <= plain).all() and (shadows < plain).any() and (textures != plain).any()
+
+
 def test_the_state_goes_on_unchanged() -> None:
   data = batched()(POSES, {})[1]
   np.testing.assert_array_equal(data.qpos, POSES)
