@@ -207,6 +207,13 @@ class Pixels(OfTasks):
 
   def check(self) -> None:
     super().check()
+    if self.agent != "ppo":
+      raise ConfigError(f"agent={self.agent} reads no pictures: pixels is of agent=ppo.")
+    for name in ("sizes", "num_envs"):
+      if min(getattr(self, name), default=0) < 1:
+        raise ConfigError(f"{name}={list(getattr(self, name))} must be numbers above 0.")
+    if self.compared and self.chosen() != ["CartpoleBalanceVision"]:
+      raise ConfigError("compared=true is of CartpoleBalanceVision alone: leave tasks= and suite= away.")
     for task in self.chosen():
       if not self.configured(task).env.vision.enable:
         raise ConfigError(f"{task} sees nothing: add env.vision.enable=true env.vision.camera=<name>.")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def main() -> None:
   """Runs a command and exits with its code; 2 for what the user can act on."""
   withhold_gl()
-  args = _parser().parse_args()
+  args = _arguments()
   try:
     code = args.command(args)
   except PlaygroundError as error:
@@ -29,6 +29,18 @@ def main() -> None:
     sys.stderr.close()
     code = 0
   sys.exit(code)
+
+
+def _arguments() -> argparse.Namespace:
+  """What the command line says; overrides may stand after options, too."""
+  parser = _parser()
+  args, rest = parser.parse_known_args()
+  unknown = [text for text in rest if text.startswith("-") or "=" not in text or "overrides" not in args]
+  if unknown:
+    parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+  if rest:
+    args.overrides += rest
+  return args
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -150,6 +162,8 @@ def _show(args: argparse.Namespace) -> int:
 
   console = Console()
   if args.task.startswith("randomization=") and not args.overrides:
+    if args.views:
+      raise ConfigError("--views shows a task: playground show <task> randomization=<name> --views <file>.")
     console.print(describe_randomization(compose([args.task])))
     return 0
   config = compose([args.task if "=" in args.task else f"env={args.task}", *args.overrides])

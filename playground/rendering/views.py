@@ -28,18 +28,24 @@ def save_views(env: Env, terms: Iterable[Mapping[str, Any]], path: str | Path, c
     seed: of episodes and models.
 
   Raises:
-    ConfigError: the task sees nothing, or the file is not a .png.
+    ConfigError: the task sees nothing, no views, or the file is not a .png that can be written.
   """
   import matplotlib.image
 
-  path = Path(path)
+  path = Path(path).expanduser()
   if path.suffix != ".png":
     raise ConfigError(f"--views {path}: the picture must be a .png.")
+  if count < 1:
+    raise ConfigError(f"--num-views={count} must be above 0.")
   sizes = env.observation_size
   cameras = [key for key in sizes if key.startswith(PIXELS)] if isinstance(sizes, Mapping) else []
   if not cameras:
     have = ", ".join(camera_names(env.mj_model)) or "none"
     raise ConfigError(f"The task sees nothing: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
+  try:
+    path.parent.mkdir(parents=True, exist_ok=True)
+  except OSError as error:
+    raise ConfigError(f"--views {path}: its folder cannot be made: {error.strerror}.") from None
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
   model = Randomizer(env.mj_model, terms).sample_batch(jax.random.split(model_key, count))
   state: Any = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)

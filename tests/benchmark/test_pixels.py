@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -33,6 +34,20 @@ def test_a_task_without_a_camera_is_refused() -> None:
     Pixels(tasks=("CartpoleBalance",)).check()
   camera = ("env.vision.enable=true", "env.vision.camera=fixed")
   Pixels(tasks=("CartpoleBalance",), overrides=camera).check()
+
+
+@pytest.mark.parametrize(
+  ("options", "message"),
+  [
+    ({"agent": "sac"}, "agent=sac reads no pictures: pixels is of agent=ppo"),
+    ({"sizes": (64, 0)}, r"sizes=\[64, 0\] must be numbers above 0"),
+    ({"num_envs": ()}, r"num_envs=\[\] must be numbers above 0"),
+    ({"compared": True, "tasks": ("PandaPickCubeCartesianVision",)}, "compared=true is of CartpoleBalanceVision alone"),
+  ],
+)
+def test_what_cannot_be_measured(options: dict[str, Any], message: str) -> None:
+  with pytest.raises(ConfigError, match=message):
+    Pixels(**options).check()
 
 
 def test_the_report_has_ours_beside_the_papers(tmp_path: Path) -> None:

@@ -68,6 +68,7 @@ def test_list_needs_no_jax():
       ],
     ),
     (["CartpoleBalance", "env.impl=jax"], ["state 5", "upright", "backend jax", "randomization: none none"]),
+    (["CartpoleBalance", "--num-views", "2", "env.impl=jax"], ["backend jax"]),
     (["randomization=go1"], ["randomization: go1", "trunk: add uniform(-1, 1)", "geom_friction[:, 0] floor"]),
     (["joystick", "robot=go1"], ["joystick", "robot go1", "ppo (defaults, not tuned for this task)"]),
   ],
@@ -86,6 +87,8 @@ def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   assert command("show", "randomization=go1", "env=CartpoleBalance") == 2
   out, err = capsys.readouterr()
   assert "target 'left_foot_floor' is no pair of the model" in err and not out
+  assert command("show", "randomization=go1", "--views", "views.png") == 2
+  assert "--views shows a task: playground show <task> randomization=" in capsys.readouterr().err
   assert command("show", "randomization=go2") == 2
   assert "Did you mean 'go1'?" in capsys.readouterr().err
 
@@ -104,6 +107,8 @@ def test_eval_and_replay(command: Command, monkeypatch: pytest.MonkeyPatch, caps
   assert capsys.readouterr().err == "error: No dump there.\n"
 
 
-@pytest.mark.parametrize("args", [[], ["lst"], ["eval"]])
+@pytest.mark.parametrize(
+  "args", [[], ["lst"], ["eval"], ["doctor", "env.impl=jax"], ["show", "CartpoleBalance", "--veiws"]]
+)
 def test_usage(command: Command, args: list[str]):
   assert command(*args) == 2

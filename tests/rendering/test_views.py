@@ -26,6 +26,12 @@ def test_what_cannot_be_shown(tmp_path: Path) -> None:
     save_views(blind, [], tmp_path / "views.png")
   with pytest.raises(ConfigError, match=r"--views views.jpg: the picture must be a .png"):
     save_views(blind, [], "views.jpg")
+  with pytest.raises(ConfigError, match="--num-views=0 must be above 0"):
+    save_views(blind, [], "views.png", count=0)
+  (tmp_path / "file").touch()
+  seeing = registry.load("CartpoleBalanceVision")
+  with pytest.raises(ConfigError, match="its folder cannot be made: File exists"):
+    save_views(seeing, [], tmp_path / "file/views.png")
 
 
 @pytest.mark.slow
