@@ -60,7 +60,9 @@ def evaluate_run(
   real = [row for row in paper_table("hardware") if row["task"] == trained.task]
   console.print(_table(title, {name.removeprefix("episode_"): value for name, value in scores.items()}, real))
   for row in real:
-    console.print(f"hardware, {row['metric']}: {row['what']}; {row['trials']} trials (paper, {row['where']})")
+    median = f"median {row['median']}, " if row["median"] else ""
+    console.print(f"hardware, {row['metric']}: {row['what']}; {median}{row['trials']} trials (paper, {row['where']})")
+    console.print(f"simulation, {row['metric']}: by default {row['simulation']}")
   report = {"checkpoint": str(checkpoint.path), "episodes": count, "seed": seed, "scores": scores} | hardware.facts
   report |= {"hardware_in_paper": real} if real else {}
   out = trained.run_dir.path / "eval" / f"step_{checkpoint.step:012d}_seed_{seed}.json"

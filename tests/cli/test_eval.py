@@ -6,10 +6,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from playground import registry
+from playground.benchmark.suites import paper_table
 from playground.cli import eval as eval_command
 from playground.cli.main import main
 from playground.config import compose
@@ -71,14 +73,27 @@ def test_what_the_paper_measured_on_a_real_robot_stands_beside(
   command: Command, trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
   row = {"task": "CartpoleBalance", "metric": "length", "median": "3", "mean": "4", "ci95": "0.5", "trials": "9"}
-  rows = [row | {"what": "seconds upright", "where": "Section X"}, row | {"task": "Other"}]
+  row |= {"what": "seconds upright", "simulation": "steps upright", "where": "Section X"}
+  rows = [row, row | {"task": "Other"}]
   monkeypatch.setattr(eval_command, "paper_table", lambda name: rows)
   assert command(str(trained)) == 0
   out = capsys.readouterr().out
   assert "simulation, mean" in out and "hardware, mean (paper)" in out
   assert re.search(r"length\W+20\W+4 ± 0.5\b", out)
-  assert "hardware, length: seconds upright; 9 trials (paper, Section X)" in out
+  assert "hardware, length: seconds upright; median 3, 9 trials (paper, Section X)" in out
+  assert "simulation, length: by default steps upright" in out
   assert report(trained, 4000)["hardware_in_paper"] == rows[:1]
+
+
+def test_the_papers_trials_on_hardware_are_of_metrics_that_our_tasks_have() -> None:
+  rows = paper_table("hardware")
+  means = {(row["task"], row["metric"]): float(row["mean"]) for row in rows}
+  assert means[("LeapCubeReorient", "rotations")] == np.mean([3, 27, 8, 2, 15, 3, 4, 1, 3, 5])
+  for task, metric in means:
+    env = registry.build(registry.config(task)) if "Vision" not in task else None  # which needs Warp
+    assert env is None or metric in [*env.summaries, "rotations"]
+  assert ("PandaPickCubeCartesianVision", "success") in means, "the paper's policy sees"
+  assert all(row["what"] and row["simulation"] and row["where"] for row in rows)
 
 
 def test_the_mode_of_the_policy_is_another_score(command: Command, trained: Path) -> None:

@@ -40,7 +40,7 @@ class PushCube(TabletopTask):
   some steps old and noisy. The closed gripper pushes with its sides. Once the block has stayed at a goal, within
   `success_distance` and `success_angle`, for `success_steps` steps, that goal is reached and the next one appears: an
   environment's level rises with every goal, and with it how far a goal is moved and turned. The level outlasts
-  episodes, of which each begins with a goal of level 0, and a trainer's fresh starts; an evaluation begins with level 0.
+  episodes, of which each begins with a goal of level 0, and the fresh starts of a training. Evaluations begin with 0.
 
   The defaults differ from Playground 0.2.0 as follows; `env.parity=true` has its ways:
   - The first observation shows the scene (0.2.0 computes no kinematics at reset: poses are 0), and is what is observed
