@@ -79,6 +79,14 @@ def test_a_finger_on_the_table_costs(name: str, finger: int, request: pytest.Fix
   assert (float(clear.metrics[term]), float(touching.metrics[term])) == (pytest.approx(0.3), 0)
 
 
+@pytest.mark.parametrize("name", [HANDOVER, PEG])
+def test_numbers_that_are_not_finite_end_an_episode(name: str) -> None:
+  env, state = compiled(name), amid(name)
+  for field in ("qpos", "qvel"):
+    spoilt = state.data.replace(**{field: getattr(state.data, field).at[3].set(jnp.inf)})
+    assert env.evaluate(spoilt, state.info, jnp.zeros(14)).done == 1
+
+
 # Peg
 
 INSERTED = {"socket_entrance": [0.048, 0, 0.15], "socket_rear": [0, 0, 0.15], "peg_end2": [0, 0, 0.15]}

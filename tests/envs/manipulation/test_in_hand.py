@@ -223,6 +223,14 @@ def test_a_cube_that_falls_ends_the_episode_and_costs(name: str) -> None:
   assert (held.metrics["reward/termination"], fallen.metrics["reward/termination"]) == (0, -100)
 
 
+@pytest.mark.parametrize("field", ["qpos", "qvel"])
+@pytest.mark.parametrize("name", TASKS)
+def test_numbers_that_are_not_finite_end_an_episode(name: str, field: str) -> None:
+  state, env = amid(name), golden(name).env
+  spoilt = state.data.replace(**{field: getattr(state.data, field).at[3].set(jnp.nan)})
+  assert env.evaluate(spoilt, state.info, jnp.zeros(env.action_size)).done == 1
+
+
 @pytest.mark.parametrize("name", TASKS)
 def test_an_episode_forgets_the_one_before(name: str) -> None:
   env = build(name)
@@ -253,7 +261,7 @@ def test_starts(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
   joints, cube = np.asarray(data.qpos[:, :16]), np.asarray(data.qpos[:, 16:])
   lower, upper = env.mj_model.jnt_range[:16].T
   assert (joints >= lower - 1e-6).all() and (joints <= upper + 1e-6).all() and (joints.std(axis=0) > 0.03).all()
-  assert np.abs(cube[:, :3] - [0.1, 0.0, 0.05]).max() <= 0.01 + 1e-6
+  assert np.abs(cube[:, :3] - [0.1, 0.0, 0.05]).max() <= 0.01 + 1e-6 and np.ptp(cube[:, :3], axis=0).min() > 0.018
   np.testing.assert_allclose(np.linalg.norm(cube[:, 3:], axis=1), 1, rtol=1e-5)
   target = joints if name.startswith("Leap") else np.tile(env.mj_model.key("home").ctrl, (200, 1))
   np.testing.assert_allclose(data.ctrl, target, rtol=1e-6)

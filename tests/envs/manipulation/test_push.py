@@ -122,6 +122,8 @@ def test_noise(push: Any, state: State, parity: bool) -> None:
   assert np.abs(noise[:, 45:]).max() <= 0.0151
   cosines = np.asarray(seen[:, 39:42] @ exact[39:42])
   assert np.cos(np.radians(7.6)) < cosines.min() < np.cos(np.radians(6))
+  cosines = np.asarray(seen[:, 36:39] @ exact[36:39])  # of the gripper's axes
+  assert np.cos(np.radians(5.1)) < cosines.min() < np.cos(np.radians(4))
 
 
 def test_terms_by_hand(push: Any, state: State) -> None:
@@ -171,12 +173,16 @@ def test_fast_joints_cost(push: Any, state: State) -> None:
     ({"joint": (3, -0.2)}, 1),
     ({"joint": (3, -0.25)}, 0),
     ({"joint": (0, 2.7)}, 1),
+    ({"gripper": (0.5, 0.0, 0.51)}, 1),
+    ({"gripper": (0.76, 0.0, 0.3)}, 1),
   ],
 )
 def test_what_ends_an_episode(push: Any, state: State, change: dict[str, Any], done: int) -> None:
   data = state.data
   if "box" in change:
     data = moved(state, push, change["box"])
+  if "gripper" in change:
+    data = data.replace(site_xpos=data.site_xpos.at[push.mj_model.site("gripper").id].set(jnp.array(change["gripper"])))
   if "sensor" in change:
     data = data.replace(sensordata=data.sensordata.at[change["sensor"]].set(1.0))
   if "joint" in change:
@@ -185,6 +191,12 @@ def test_what_ends_an_episode(push: Any, state: State, change: dict[str, Any], d
   after = step(push, state, data=data)
   assert (after.done, after.metrics["out_of_bounds"]) == (done, done)
   assert (after.reward < 0) == bool(done)
+
+
+@pytest.mark.parametrize("field", ["qpos", "qvel"])
+def test_numbers_that_are_not_finite_end_an_episode(push: Any, state: State, field: str) -> None:
+  finger = getattr(state.data, field).at[9].set(jnp.nan)  # which is in no bounds
+  assert step(push, state, data=state.data.replace(**{field: finger})).done == 1
 
 
 def test_a_goal_is_reached_after_31_steps_and_the_next_appears(push: Any, state: State) -> None:
