@@ -148,6 +148,16 @@ class Env(abc.ABC):
     return self
 
 
+def newest_picture(env: Env, obs: Observation) -> jax.Array | None:
+  """The newest frame of an observation's first camera, [..., H, W, 1 or 3] uint8; None without pictures."""
+  cameras = sorted(key for key in obs if key.startswith(PIXELS)) if isinstance(obs, Mapping) else []
+  if not cameras:
+    return None
+  pictures = obs[cameras[0]]
+  frames = len(env.observation_parts.get(cameras[0], {})) or 1
+  return pictures[..., -(pictures.shape[-1] // frames) :]
+
+
 def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
   """Resolves `impl: auto` to the backend that was measured faster on this kind of device.
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from playground.envs.base import Env, State
+from playground.envs.base import Env, State, newest_picture
 from playground.envs.wrappers import ModelFields, wrap_for_evaluation
 from playground.hardware.mesh import AXIS, jit_on_mesh
 
@@ -32,8 +32,8 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
     A function (policy, key, model fields [num_envs, ...]) -> (scalars, recording). The scalars: `episode_reward` and
     `episode_length` with their deviation over episodes (`_std`), the mean over episodes of every metric
     (`episode_<metric>`, see `wrappers.Episode`), and `nonfinite`, the number of episodes
-    that ended in NaN. The recording: `qpos`, `mocap_pos`, `mocap_quat` and `active` (1 until the episode ended) before
-    each decision, [decisions, episodes, ...].
+    that ended in NaN. The recording: `qpos`, `mocap_pos`, `mocap_quat`, `seen` (the newest picture, where there are
+    any) and `active` (1 until the episode ended) before each decision, [decisions, episodes, ...].
   """
   wrapped = wrap_for_evaluation(env)
   decisions = -(-env.episode_length // env.action_repeat)
@@ -50,8 +50,10 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
     totals = {name: zeros for name in ("nonfinite", *state.info["episode_metrics"])}
 
     def view(state: State, active: jax.Array) -> dict[str, jax.Array]:
-      seen = {name: getattr(state.data, name) for name in ("qpos", "mocap_pos", "mocap_quat")}
-      return jax.tree.map(lambda x: x[:num_recorded], seen | {"active": active})
+      shown = {name: getattr(state.data, name) for name in ("qpos", "mocap_pos", "mocap_quat")}
+      picture = newest_picture(env, state.obs)
+      shown |= {} if picture is None else {"seen": picture}
+      return jax.tree.map(lambda x: x[:num_recorded], shown | {"active": active})
 
     active = jnp.ones(per_device)
     recording = jax.tree.map(lambda x: jnp.zeros((decisions, *x.shape), x.dtype), view(state, active))

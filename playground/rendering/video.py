@@ -43,7 +43,7 @@ def save_trajectory(
     mocap_pos: [T, nmocap, 3], if bodies are moved by mocap.
     mocap_quat: [T, nmocap, 4].
     dt: seconds between two rows of `qpos`.
-    **view: camera, width, height of the video (`render_video`).
+    **view: camera, width, height, seen of the video (`render_video`).
   """
   import mujoco
 
@@ -67,6 +67,7 @@ def render_video(
   height: int = 480,
   mocap_pos: np.ndarray | None = None,
   mocap_quat: np.ndarray | None = None,
+  seen: np.ndarray | None = None,
   timeout_s: float | None = None,
   notify: Callable[[str], None] = print,
 ) -> Path | None:
@@ -82,6 +83,7 @@ def render_video(
     height: pixels, even.
     mocap_pos: [T, nmocap, 3].
     mocap_quat: [T, nmocap, 4].
+    seen: [T, H, W, 1 or 3] uint8, what a policy sees of it: shown on the right, as high as the video, its pixels apart.
     timeout_s: when to give up; by default a minute and a half second a frame.
     notify: takes one sentence if there is no video.
 
@@ -96,7 +98,7 @@ def render_video(
   timeout_s = timeout_s or 60.0 + 0.5 * len(qpos)
   scratch = tempfile.TemporaryDirectory(prefix="playground_video_", ignore_cleanup_errors=True)
   with scratch as folder, open(f"{folder}/stderr", "w+") as stderr:
-    view = {"camera": camera, "width": width, "height": height}
+    view = {"camera": camera, "width": width, "height": height, "seen": seen}
     trajectory = save_trajectory(Path(folder) / "trajectory.npz", mj_model, qpos, mocap_pos, mocap_quat, dt, **view)
     out_path.parent.mkdir(parents=True, exist_ok=True)
     environment = gl_environment(backend) | {
@@ -150,10 +152,11 @@ def _render(trajectory: Path, out_path: Path) -> None:
   # Measured without a GPU, 640x480: 18 ms a frame instead of 30 at MuJoCo's 4096, and no difference to the eye.
   model.vis.quality.shadowsize = min(2048, model.vis.quality.shadowsize)
   stride = frame_stride(dt)
+  seen = saved.get("seen")
   fps: Any = 1 / (dt * stride)  # declared int by imageio_ffmpeg, which prints it with two decimals
   writer = imageio_ffmpeg.write_frames(
     str(out_path),
-    (width, height),
+    (width if seen is None else width + enlarged(seen[0], height).shape[1], height),
     fps=fps,
     codec="libx264",
     quality=7,
@@ -169,8 +172,17 @@ def _render(trajectory: Path, out_path: Path) -> None:
           getattr(data, name)[:] = saved[name][t]
       mujoco.mj_forward(model, data)
       renderer.update_scene(data, camera)
-      writer.send(renderer.render())
+      frame = renderer.render()
+      writer.send(frame if seen is None else np.hstack([frame, enlarged(seen[t], height)]))
   writer.close()
+
+
+def enlarged(picture: np.ndarray, height: int) -> np.ndarray:
+  """A picture [H, W, 1 or 3] of `height` rows and an even number of columns, [height, width, 3]; pixels stay sharp."""
+  rows, columns = picture.shape[:2]
+  width = 2 * max(1, round(height * columns / rows / 2))
+  picture = picture[np.arange(height)[:, None] * rows // height, np.arange(width) * columns // width]
+  return np.broadcast_to(picture, (height, width, 3))
 
 
 def choose_camera(model: Any, name: str | None = None) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from playground.envs.base import PIXELS, Env
+from playground.envs.base import PIXELS, Env, newest_picture
 from playground.envs.wrappers import Vectorize
 from playground.errors import ConfigError
 from playground.randomization import Randomizer
@@ -38,8 +38,7 @@ def save_views(env: Env, terms: Iterable[Mapping[str, Any]], path: str | Path, c
   if count < 1:
     raise ConfigError(f"--num-views={count} must be above 0.")
   sizes = env.observation_size
-  cameras = [key for key in sizes if key.startswith(PIXELS)] if isinstance(sizes, Mapping) else []
-  if not cameras:
+  if not isinstance(sizes, Mapping) or not any(key.startswith(PIXELS) for key in sizes):
     have = ", ".join(camera_names(env.mj_model)) or "none"
     raise ConfigError(f"The task sees nothing: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
   try:
@@ -49,9 +48,7 @@ def save_views(env: Env, terms: Iterable[Mapping[str, Any]], path: str | Path, c
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
   model = Randomizer(env.mj_model, terms).sample_batch(jax.random.split(model_key, count))
   state: Any = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)
-  frames = len(env.observation_parts[cameras[0]])  # of which the newest is shown
-  pictures = np.asarray(state.obs[cameras[0]])
-  matplotlib.image.imsave(path, sheet(pictures[..., -(pictures.shape[-1] // frames) :]))
+  matplotlib.image.imsave(path, sheet(np.asarray(newest_picture(env, state.obs))))
   return path
 
 

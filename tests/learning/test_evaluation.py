@@ -12,6 +12,7 @@ from playground.envs.base import State
 from playground.envs.physics import PhysicsData, mjx
 from playground.hardware.mesh import make_mesh
 from playground.learning.evaluation import make_evaluator
+from playground.runs.job import episodes_of
 from tests.dummy import PointTask
 
 
@@ -60,3 +61,32 @@ def test_metrics_of_an_episode(action_repeat: int) -> None:
   for name, values in means.items():
     np.testing.assert_allclose(scores[f"episode_{name}"], np.mean(values), rtol=1e-6, err_msg=name)
   assert recording["active"][:, 0].sum() == steps[0]
+
+
+class Seeing(Counting):
+  """Two frames of what it sees: one brighter, and then the number of the step."""
+
+  @property
+  def observation_parts(self) -> dict[str, dict[str, int]]:
+    return {"pixels/eye": {"gray[-1]": 1, "gray[0]": 1}}
+
+  def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
+    return self._with_picture(super().reset(rng, model), 0)
+
+  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+    state = super().evaluate(data, info, action)
+    return self._with_picture(state, state.info["age"])
+
+  def _with_picture(self, state: State, age: Any) -> State:
+    frame = jnp.full((3, 2, 1), age).astype(jnp.uint8)
+    own: Any = state.obs
+    return state.replace(obs=own | {"pixels/eye": jnp.concatenate([frame + 100, frame], axis=-1)})
+
+
+def test_what_is_seen_is_recorded() -> None:
+  env = Seeing(episode_length=20)
+  act = lambda policy, obs, key: jnp.zeros((len(obs["state"]), 2))
+  _, recording = make_evaluator(env, act, 4, make_mesh(1), 2)(jnp.zeros(()), jax.random.PRNGKey(0), {})
+  tape = episodes_of(recording, 1)
+  assert tape["seen"].shape == (len(tape["qpos"]), 3, 2, 1) and tape["seen"].dtype == np.uint8
+  np.testing.assert_array_equal(tape["seen"][:, 0, 0, 0], np.arange(len(tape["qpos"])))

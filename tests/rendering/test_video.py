@@ -114,6 +114,19 @@ def test_video_is_real_time_and_shows_motion(tmp_path: Path, model: Any, needs_g
   assert np.abs(frames[0].astype(int) - frames[-1].astype(int)).max() > 30
 
 
+def test_what_a_policy_sees_is_beside_it(tmp_path: Path, model: Any, needs_gl: str):
+  seen = np.zeros((4, 2, 3, 1), np.uint8)
+  seen[:, 1, 2] = 255
+  qpos = path_of_ball(model, 4)
+  out = render_video(model, qpos, tmp_path / "out.mp4", dt=0.04, width=64, height=48, seen=seen)
+  reader = imageio_ffmpeg.read_frames(str(out))
+  assert next(reader)["size"] == (64 + 72, 48)
+  frame = np.frombuffer(next(reader), np.uint8).reshape(48, 64 + 72, 3)
+  panel = frame[:, 64:]
+  assert panel[28:, 52:].min() > 200 and panel[:20].max() < 50 and panel[:, :44].max() < 50
+  assert frame[:, :64].std() > 10
+
+
 def test_rows_after_a_nan_are_left_out(tmp_path: Path, model: Any, needs_gl: str):
   qpos = path_of_ball(model, 20)
   qpos[10:] = np.nan
