@@ -1,6 +1,10 @@
 """Pictures of a batch by MuJoCo-Warp, on the CPU: of a cart and its pole at several poses."""
 
+import os
+import subprocess
+import sys
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -105,6 +109,30 @@ def test_each_environment_has_its_own_lens_light_and_colour() -> None:
   assert areas[1] < 0.7 * areas[0] and areas[2] == areas[0]
   assert seen["rgb"][2].mean() < seen["rgb"][0].mean()
   np.testing.assert_array_equal(seen["segmentation"][0], pictures()["fixed"]["segmentation"][0])
+
+
+SHARES = """
+import jax, numpy as np
+from jax.sharding import PartitionSpec as P
+from playground.hardware.mesh import AXIS, jit_on_mesh, make_mesh
+from tests.rendering.test_batch import POSES, render, renderer
+
+renderer()
+see = jax.vmap(lambda pose: render(pose, {})[0])
+poses = jax.numpy.concatenate([POSES, -2 * POSES[1:], POSES[:1] + 0.3])
+apart = jit_on_mesh(see, make_mesh(2), (P(AXIS),), P(AXIS))(poses)
+jax.tree.map(np.testing.assert_array_equal, jax.device_get(apart), jax.device_get(jax.jit(see)(poses)))
+print(sorted(len(x.sharding.device_set) for x in jax.tree.leaves(apart))[0], [key[0] for key in renderer()._contexts])
+"""
+
+
+@pytest.mark.slow
+def test_each_device_renders_its_share() -> None:
+  root = str(Path(__file__).parents[2])
+  env = os.environ | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
+  done = subprocess.run([sys.executable, "-c", SHARES], env=env, capture_output=True, text=True, cwd=root)
+  assert done.returncode == 0, done.stderr[-2000:]
+  assert done.stdout.splitlines()[-1] == "2 [1, 3, 6]"
 
 
 def test_shadows_and_textures_are_chosen() -> None:
