@@ -35,7 +35,8 @@ test-slow: setup
 
 # RSL-RL brings torch, which `setup` leaves out: without it these tests are skipped.
 test-rsl-rl: setup
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[rsl_rl]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[rsl-rl]'
+	@$(BIN)/python -c 'import rsl_rl, torch'
 	$(CACHES) $(BIN)/python -m pytest -q -m '' -k rsl_rl tests/adapters tests/learning tests/runs $(ARGS)
 
 # A Slurm of one node on this machine, started and ended by the tests; without its programs they are skipped. On Debian

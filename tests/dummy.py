@@ -110,7 +110,7 @@ SMALL_RSL_RL = RslRlPPOConfig(
 Config = PPOConfig | SACConfig | RslRlPPOConfig
 ALGORITHMS: dict[type[Any], type[Any]] = {PPOConfig: PPO, SACConfig: SAC, RslRlPPOConfig: RslRlPPO}
 needs_rsl_rl = pytest.mark.skipif(
-  importlib.util.find_spec("rsl_rl") is None, reason="needs the extra rsl_rl: `make test-rsl-rl`"
+  importlib.util.find_spec("rsl_rl") is None, reason="needs the extra rsl-rl: `make test-rsl-rl`"
 )
 
 

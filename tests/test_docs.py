@@ -24,6 +24,7 @@ from playground.sweep.plan import compose_jobs
 
 REPOSITORY = Path(__file__).parents[1]
 DOCS = REPOSITORY / "docs"
+PAGES = (*DOCS.glob("*.md"), REPOSITORY / "README.md")
 NOTEBOOK = DOCS / "first_policy.ipynb"
 # Names that a page introduces itself, and the one that a page misspells.
 OWN = ("SlideToTarget", "go1_worn", "enrgy")
@@ -42,8 +43,7 @@ def files(page: str) -> dict[str, str]:
 
 def run_commands() -> list[tuple[str, ...]]:
   """What follows `playground-run` on the lines to type, in all pages, but for those with a name to fill in."""
-  pages = [*DOCS.glob("*.md"), REPOSITORY / "README.md"]
-  text = "\n".join(page.read_text(encoding="utf-8") for page in pages).replace("\\\n", " ")
+  text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES).replace("\\\n", " ")
   lines = re.findall(r"^playground-run +(.*)$", text, re.M)
   commands = {tuple(shlex.split(line, comments=True)) for line in lines}
   return sorted(words for words in commands if not any(sign in word for word in words for sign in "<…"))
@@ -60,6 +60,16 @@ def test_a_command_composes(words: tuple[str, ...]):
     assert compose_jobs([word for word in overrides if not word.startswith("seed=")] + ["seed=1"])
   else:
     compose(overrides)
+
+
+def test_every_pip_finds_the_extras_that_are_told():
+  """The pip of Python 3.11 finds no name with an underscore: it warns, and installs the package without the extra."""
+  project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+  extras = project["optional-dependencies"]
+  assert [name for name in extras if re.search("[_.A-Z]", name)] == []
+  told = "\n".join(path.read_text(encoding="utf-8") for path in (*PAGES, REPOSITORY / "Makefile"))
+  names = set(re.findall(r"(?:playground-run|'\.)\[([\w.-]+)\]", told))
+  assert {"rsl-rl", "deploy", "web", "cuda13", "dev"} <= names <= set(extras)
 
 
 def test_the_tutorials_mistake_is_answered_as_it_says():

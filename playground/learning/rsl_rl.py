@@ -76,7 +76,7 @@ class RslRlPPOConfig:
 
   def check(self, num_devices: int) -> None:
     """Raises ConfigError where RSL-RL is not installed, or cannot train on so many devices."""
-    need("rsl_rl", "torch", "rsl_rl")
+    need("rsl-rl", "torch", "rsl_rl")
     if num_devices > 1:
       raise ConfigError(f"agent=rsl_rl_ppo trains on one device and not on {num_devices}: give hardware.devices=1.")
 

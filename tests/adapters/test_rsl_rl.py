@@ -16,8 +16,8 @@ from playground.learning.rsl_rl import RslRlPPOConfig
 from playground.registry import load
 from tests.dummy import Point
 
-torch = pytest.importorskip("torch", reason="needs the extra rsl_rl: `make test-rsl-rl`")
-runners = pytest.importorskip("rsl_rl.runners", reason="needs the extra rsl_rl: `make test-rsl-rl`")
+torch = pytest.importorskip("torch", reason="needs the extra rsl-rl: `make test-rsl-rl`")
+runners = pytest.importorskip("rsl_rl.runners", reason="needs the extra rsl-rl: `make test-rsl-rl`")
 
 from playground.adapters.rsl_rl import OBS_GROUPS, VecEnv, group_entries, to_jax, to_torch, vec_env  # noqa: E402
 

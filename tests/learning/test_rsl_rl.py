@@ -129,7 +129,7 @@ def test_without_the_extra_it_is_one_sentence(
   find = importlib.util.find_spec
   monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in ("torch", "rsl_rl") else find(name))
   assert caller(monkeypatch, "playground-run", main)(*TASK, f"run_dir={tmp_path / 'run'}") == 2
-  sentence = "error: This needs torch, rsl_rl: pip install 'playground-run[rsl_rl]'."
+  sentence = "error: This needs torch, rsl_rl: pip install 'playground-run[rsl-rl]'."
   assert re.search(re.escape(sentence), capsys.readouterr().err)
   assert not (tmp_path / "run").exists()
 
