@@ -40,6 +40,18 @@ def test_structure_and_types_stay(name: str) -> None:
   assert set(env.summaries) <= set(first.metrics)
 
 
+@pytest.mark.parametrize("name", SIZES)
+def test_the_first_observation_is_of_the_start_on_the_model_given(name: str) -> None:
+  """Traced only; 0.2.0 computes none."""
+  for parity in (False, True):
+    env, seen = load_task(name, {"parity": parity}), []
+    env.physics.forward = lambda model, data, seen=seen: seen.append(model) or data
+    randomised = env.mjx_model.replace(opt=env.mjx_model.opt)
+    jax.eval_shape(lambda key, env=env, model=randomised: (env.reset(key), env.reset(key, model)), KEYS[0])
+    expected = [] if parity else [env.mjx_model, randomised]
+    assert len(seen) == len(expected) and all(a is b for a, b in zip(seen, expected, strict=True))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SIZES)
 def test_a_roll(name: str) -> None:
