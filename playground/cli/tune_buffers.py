@@ -13,8 +13,8 @@ from playground.runs.trained import load_trained
 # By key of a task's config: what it bounds, and how much of that was needed.
 _BUFFERS: dict[str, tuple[str, Callable[[BufferSizes], str]]] = {
   "njmax": ("constraint rows of one environment", lambda sizes: str(sizes.constraints)),
-  "naconmax_per_env": ("contacts or candidate pairs, mean", lambda sizes: f"{sizes.contacts:.2f}"),
-  "naccdmax_per_env": ("of these convex, to a power of 2", lambda sizes: str(sizes.convex)),
+  "naconmax_per_env": ("contacts or candidate pairs, mean of the environments", lambda sizes: f"{sizes.contacts:.2f}"),
+  "naccdmax_per_env": ("of these the convex ones, to a power of 2", lambda sizes: str(sizes.convex)),
 }
 
 
@@ -24,7 +24,8 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   Args:
     task: its name.
     overrides: as for playground-run.
-    run: a run or checkpoint of the task whose policy acts, beside a random one.
+    run: a run or checkpoint of the task whose policy acts, beside a random one; without overrides the task is as the
+      run had it.
     envs: environments.
     steps: decisions of each.
 
@@ -36,21 +37,25 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   """
   if envs < 1 or steps < 1:
     raise ConfigError(f"--envs={envs} and --steps={steps} must be above 0.")
-  config = compose([f"env={task}", *overrides])
-  policies: dict[str, Act | None] = {"random actions": None}
+  config = compose([f"env={task}", *overrides]).env
+  policies: dict[str, Act | None] = {"random": None}
   if run is not None:
     trained = load_trained(run)
     if trained.task != task:
       raise ConfigError(f"--run={run} is one of {trained.task}, not of {task}.")
-    policies[f"policy of {run}"] = trained.act
-  found = [measure_buffers(config.env, act, envs, steps) for act in policies.values()]
+    policies["trained"] = trained.act
+    config = config if overrides else trained.config.env
+  found = [measure_buffers(config, act, envs, steps) for act in policies.values()]
   advice = [sizes.advised() for sizes in found]
-  table = Table(title=f"{task} on Warp, {envs} environments, {steps} decisions: the most that was needed")
-  table.add_column("buffer")
-  for column in (*policies, f"advised, {ROOM:g} x the most", "configured"):
-    table.add_column(column, justify="right", overflow="fold")
-  for key, (what, needed) in _BUFFERS.items():
-    sizes = [str(max(advised[key] for advised in advice)), format_value(config.env[key])]
-    table.add_row(f"env.{key}\n  {what}", *map(needed, found), *sizes)
-  Console().print(table)
+  table = Table(title=f"{task} on Warp, {envs} environments, {steps} decisions")
+  table.add_column("most needed", no_wrap=True)
+  for column in (*policies, f"advised (x {ROOM:g})", "configured"):
+    table.add_column(column, justify="right")
+  for key, (_, needed) in _BUFFERS.items():
+    sizes = [str(max(advised[key] for advised in advice)), format_value(config[key])]
+    table.add_row(f"env.{key}", *map(needed, found), *sizes)
+  console = Console()
+  console.print(table)
+  for key, (what, _) in _BUFFERS.items():
+    console.print(f"{key}: {what}")
   return 0

@@ -8,6 +8,7 @@ import pytest
 from playground import registry
 from playground.cli import tune_buffers as command_module
 from playground.cli.main import main
+from playground.config import compose
 from playground.learning.buffers import BufferSizes
 from tests.command import Command, caller
 
@@ -16,6 +17,7 @@ RUN = "results/somewhere"
 
 class Trained:
   task = "PandaPickCube"
+  config = compose(["env=PandaPickCube", "env.success_distance=0.01", "env.njmax=200"])
 
   @staticmethod
   def act(obs: Any, key: jax.Array) -> jax.Array:
@@ -38,7 +40,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch) -> Command:
-  monkeypatch.setenv("COLUMNS", "120")
+  monkeypatch.setenv("COLUMNS", "80")
   call = caller(monkeypatch, "playground", main)
   return lambda *args: call("tune-buffers", *args)
 
@@ -64,13 +66,14 @@ def test_random_actions(command: Command, measured: list[Any], capsys: pytest.Ca
 
 def test_a_policy_beside_them(command: Command, measured: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
   assert command("PandaPickCube", "--run", RUN) == 0
-  assert [act for _, act, *_ in measured] == [None, Trained.act]
-  found = {key: cells[:3] for key, cells in rows(capsys.readouterr().out).items()}
-  assert found == {
-    "njmax": ["19", "49", "64"],
-    "naconmax_per_env": ["4.00", "6.56", "9"],
-    "naccdmax_per_env": ["1", "4", "5"],
+  assert [asked[:2] for asked in measured] == [(0.01, None), (0.01, Trained.act)], "the task as the run had it"
+  assert rows(capsys.readouterr().out) == {
+    "njmax": ["19", "49", "64", "200"],
+    "naconmax_per_env": ["4.00", "6.56", "9", "24"],
+    "naccdmax_per_env": ["1", "4", "5", "null"],
   }
+  assert command("PandaPickCube", "env.success_distance=0.02", "--run", RUN) == 0
+  assert [asked[0] for asked in measured[2:]] == [0.02, 0.02]
 
 
 @pytest.mark.parametrize(

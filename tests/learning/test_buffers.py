@@ -1,5 +1,9 @@
 """Warp's buffers: what a task needs of them, and that a run says when they are too small."""
 
+import csv
+from pathlib import Path
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -90,6 +94,14 @@ def test_overflows_are_counted_for_training():
   assert "overflows" not in episode_sums(state)
   state = state.replace(data=state.data.replace(buffers=use([1, 1, 1], [1, 1, 1], [0, 4, 1])))
   assert episode_sums(state)["overflows"] == 2
+
+
+def test_what_was_measured_fits_into_what_is_configured():
+  with (Path(__file__).parents[2] / "results/reference/buffers.csv").open(newline="") as file:
+    for row in csv.DictReader(file):
+      config: Any = registry.config(row["task"])
+      assert int(row["rows_of_one_env"]) <= config.njmax, row
+      assert row["conditions"].startswith("C MuJoCo") or float(row["contacts_per_env"]) <= config.naconmax_per_env, row
 
 
 @pytest.mark.slow  # compiles Warp's kernels for the CPU: a minute

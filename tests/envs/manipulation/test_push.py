@@ -233,6 +233,7 @@ def test_goals_move_away_with_the_level(push: Any, state: State) -> None:
     assert (goal.metrics["curriculum_level"] == after).all()
     assert 0.85 * reach < np.abs(off[:, 1]).max() <= reach + 1e-6
     assert 0.9 * angle < turned.max() <= angle + 0.1
+    assert np.abs(np.corrcoef(off[:, :2].T, turned)[2, :2]).max() < 0.3, "place and turn have keys of their own"
 
 
 def test_the_level_outlasts_episodes_and_all_else_begins_anew(push: Any) -> None:
