@@ -32,6 +32,7 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     "env.ctrl_dt env.sim_dt env.episode_length env.action_repeat checkpoint.keep "
     "video.every_evals video.episodes video.width video.height hardware.devices profile.steps "
     "env.vision.width env.vision.height env.vision.frames env.vision.farthest "
+    "env.max_torque env.stuck_after env.success_angle env.success_distance env.success_threshold "
     "launcher.timeout launcher.slots_per_gpu launcher.cores_per_job launcher.minutes launcher.memory_gb "
     "launcher.max_parallel search.trials search.parallel",
   ),
@@ -39,13 +40,16 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     "0 or more",
     lambda x: x >= 0,
     "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient agent.min_replay_size "
-    "agent.augment_pixels curriculum.scale env.njmax env.naconmax_per_env env.naccdmax_per_env launcher.grace "
+    "agent.augment_pixels curriculum.scale env.njmax env.naconmax_per_env env.naccdmax_per_env env.gripper_delay "
+    "env.noise.level env.reset.box_xy env.reset.box_y env.reset.cube_spread env.reset.joint_std env.reset.target_angle "
+    "env.reset.target_spread env.reset.target_xy env.success_steps launcher.grace "
     "launcher.gpus launcher.gpus_per_job launcher.requeues launcher.retries search.seed",
   ),
   (
     "between 0 and 1",
     lambda x: 0 <= x <= 1,
-    "agent.discounting agent.gae_lambda agent.tau hardware.memory_fraction on_nonfinite.max_fraction",
+    "agent.discounting agent.gae_lambda agent.tau env.ema_alpha env.guide_probability env.noise.pose.injection "
+    "hardware.memory_fraction on_nonfinite.max_fraction",
   ),
 )
 _LENGTHS = {
@@ -85,7 +89,7 @@ def check_limits(resolved: Mapping[str, Any]) -> None:
   for what, (length, keys) in _LENGTHS.items():
     for key in keys.split():
       value = _get(resolved, key)
-      if isinstance(value, list) and len(value) != length:
+      if isinstance(value, list) and (len(value) != length or (length == 2 and value[0] > value[1])):
         raise ConfigError(f"{key}={format_value(value)} must be {what}.")
   contacts, convex = (_get(resolved, f"env.{key}") for key in ("naconmax_per_env", "naccdmax_per_env"))
   if contacts is not None and convex is not None and convex > contacts:

@@ -80,7 +80,7 @@ class PushCube(TabletopTask):
     for name, low, high in (("action", wait.action_min, wait.action_max), ("obs", wait.obs_min, wait.obs_max)):
       if not 0 <= low <= high - config.parity:
         raise ConfigError(f"env.delays.{name}_min={low} must be from 0 to env.delays.{name}_max={high}.")
-    if len(config.curriculum.distance) != len(config.curriculum.angle):
+    if not len(config.curriculum.distance) == len(config.curriculum.angle) > 0:
       raise ConfigError("env.curriculum.distance and env.curriculum.angle must have an entry for each level.")
     super().__init__(config, build_tabletop("panda_robotiq_cube"))
     model = self.mj_model

@@ -268,6 +268,7 @@ def test_the_level_outlasts_episodes_and_all_else_begins_anew(push: Any) -> None
     ({"delays.action_min": 4}, r"env\.delays\.action_min=4 must be"),
     ({"delays.obs_min": -1}, r"env\.delays\.obs_min=-1 must be"),
     ({"curriculum.angle": [0.5]}, "an entry for each level"),
+    ({"curriculum.angle": [], "curriculum.distance": []}, "an entry for each level"),
   ],
 )
 def test_refuses(overrides: dict[str, Any], message: str) -> None:
