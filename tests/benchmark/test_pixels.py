@@ -8,10 +8,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from playground.benchmark.commands import Pixels
+from playground.benchmark.commands import COMPARED_CONDITIONS, Pixels
 from playground.benchmark.report import sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.page import Table as Shown
+from playground.benchmark.report.pixels import pixels
 from playground.benchmark.schema import Table
 from playground.errors import ConfigError
 
@@ -52,13 +53,32 @@ def test_what_cannot_be_measured(options: dict[str, Any], message: str) -> None:
 
 def test_the_report_has_ours_beside_the_papers(tmp_path: Path) -> None:
   table = Table(tmp_path / "pixels.csv")
-  for part, seconds in (("episodes", 1e-6), ("pixels", 4e-6), ("inference", 5e-6), ("update", 2e-5)):
-    row = {"benchmark": "pixels", "task": "CartpoleBalanceVision", "agent": "ppo", "who": "ours", "device": "GPU"}
-    table.add({**row, "setting": f"a=1 part={part}", "quantity": "seconds_per_step", "value": seconds, "unit": "s"})
-  ours, paper, _, others = (b for b in sections.pixels(Evidence([tmp_path]), sections.Notes()) if isinstance(b, Shown))
-  assert list(ours.rows[0])[:6] == ["CartpoleBalanceVision", "a=1", "1,000,000", "250,000", "200,000", "50,000"]
-  assert list(paper.rows[0]) == ["CartpoleBalance", "1,370,000", "403,000", "341,000", "31,300"]
-  assert {row[0] for row in others.rows} == {"madrona_mjx", "isaac_lab", "maniskill"}
+  sizes = "env.vision.width=64 env.vision.height=64 agent.num_envs=1024"
+  for conditions in ("a=1", COMPARED_CONDITIONS[0]):
+    for part, seconds in (
+      ("episodes", 1e-6),
+      ("pixels", 4e-6),
+      ("inference", 5e-6),
+      ("storing", 6e-6),
+      ("update", 2e-5),
+    ):
+      row = {"benchmark": "pixels", "task": "CartpoleBalanceVision", "agent": "ppo", "who": "ours", "device": "GPU"}
+      setting = f"{conditions} {sizes} part={part}"
+      table.add({**row, "setting": setting, "quantity": "seconds_per_step", "value": seconds, "unit": "s"})
+  blocks = pixels(Evidence([tmp_path]), sections.Notes())
+  speeds, shares, bars = ([list(row) for row in block.rows] for block in blocks if isinstance(block, Shown))
+  of_ours = ["CartpoleBalanceVision", "ours", "64", "1024"]
+  assert speeds[0][:10] == [*of_ours, "1,000,000", "250,000", "200,000", "50,000", "GPU", "a=1"]
+  paper = ["CartpoleBalance", "paper, Madrona", "64", "1024"]
+  assert speeds[2][:8] == [*paper, "1,370,000", "403,000", "341,000", "31,300"]
+  assert shares[0][:8] == [*of_ours, "1 (5%)", "3 (15%)", "1 (5%)", "15 (75%)"]
+  assert shares[2][:8] == [*paper, "0.73 (2%)", "1.75 (5%)", "0.451 (1%)", "29 (91%)"]
+  assert {row[0] for row in bars} == {"ours", "madrona_mjx", "isaac_lab", "maniskill"}
+  ours = [row[1:] for row in bars if row[0] == "ours"]
+  assert ours == [
+    ["CartpoleBalanceVision", conditions, "64", "250,000", "GPU"]
+    for conditions in ("simulator_comparison", "trainable_env")
+  ]
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from playground.benchmark.arguments import option
 from playground.benchmark.report import sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.page import Block, Heading, Picture, Text, to_html, to_markdown
+from playground.benchmark.report.pixels import pixels
 from playground.errors import ConfigError
 from playground.runs.files import write_text
 
@@ -14,7 +15,7 @@ PICTURES = "report_pictures"
 TITLE = "Measured"
 SECTIONS = (
   *(sections.throughput, sections.compared, sections.startup, sections.scaling),
-  *(sections.topology, sections.breakdown, sections.pixels, sections.chains, sections.returns),
+  *(sections.topology, sections.breakdown, pixels, sections.chains, sections.returns),
 )
 
 

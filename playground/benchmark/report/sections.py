@@ -13,7 +13,6 @@ from playground.config import compose
 TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipulation": "Manipulation"}
 SPEED = "training_steps_per_s"
 PARTS = ("physics", "task", "episodes", "pixels", "inference", "storing", "update")
-SEEN = {"episodes": "state", "pixels": "+ pictures", "inference": "+ inference", "update": "+ training"}
 _BUDGET = re.compile(r" ?agent\.num_timesteps=\S+")  # in the setting of a whole run on a topology
 _KEY = re.compile(r"^[\w.]+\.(?=\w+=)")  # what an override's key has before its last word
 _CURVE = re.compile(r"(.+?)_((?:ours|peer|ppo|sac|seed)(?:_.*)?)")  # a curve's name: task and run
@@ -101,7 +100,7 @@ def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   if rows:
     yield Table(["task", "", "ours", "peer", "its", "times better", "ours: note", "its: note"], sorted(rows))
   else:
-    yield _nothing("compare")
+    yield nothing("compare")
 
 
 def startup(evidence: Evidence, notes: Notes) -> Iterable[Block]:
@@ -115,7 +114,7 @@ def startup(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     if figure.rows[0].get("call"):
       name = f"cold, call {figure.rows[0]['call']}"
       rows.append([figure["task"], figure["agent"], name, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
-  yield Table(["task", "agent", "caches", "seconds", "device", "note"], sorted(rows)) if rows else _nothing("startup")
+  yield Table(["task", "agent", "caches", "seconds", "device", "note"], sorted(rows)) if rows else nothing("startup")
 
 
 def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
@@ -133,7 +132,7 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
         device, note = figure["device"], notes.number(figure)
         rows.append([figure["task"], label, count[1], f"{figure.mean:,.0f}", used, device, note])
   if not rows:
-    yield _nothing("scaling")
+    yield nothing("scaling")
     return
   yield Picture("scaling", figures.lines("steps/s", series, "environments", "steps/s", log=True), "Steps a second.")
   order = lambda row: (row[0], row[1], int(row[2]))
@@ -162,7 +161,7 @@ def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     derived = ["times one device", "efficiency", "its budget takes (s)"]
     yield Table(["task", "devices", "hyperparameters", "steps/s", *derived, "device", "note"], rows)
   else:
-    yield _nothing("topology")
+    yield nothing("topology")
   yield from _whole_runs(evidence, notes)
 
 
@@ -188,7 +187,7 @@ def _whole_runs(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     rows.append([*topology, *result, figure["device"], notes.number(figure)])
   measured = ["steps", "measured (s)", "times one device", "derived (s)", "final return"]
   header = ["task", "devices", "hyperparameters", *measured, "device", "note"]
-  yield Table(header, rows) if rows else _nothing("topology num_timesteps=<steps>")
+  yield Table(header, rows) if rows else nothing("topology num_timesteps=<steps>")
 
 
 def _beside_one(found: Iterable[Figure]) -> list[tuple[Figure, float | None]]:
@@ -244,35 +243,7 @@ def breakdown(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     yield Picture("breakdown", figures.stacked("share of training time", bars, "share"), "Where the time goes.")
     yield Table(["task", *(f"{part} (µs)" for part in PARTS), "steps/s", "device", "note"], rows)
   else:
-    yield _nothing("breakdown")
-
-
-def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Steps a second from pixels, beside the paper's and those of other simulators that it quotes."""
-  yield Heading(2, "From pixels")
-  yield Text("Control steps a second with each part added; random actions before inference, a fresh policy after.")
-  groups: dict[tuple[str, str, str], dict[str, Figure]] = {}
-  for figure in reversed(evidence.find(benchmark="pixels", quantity="seconds_per_step")):
-    setting, _, part = figure["setting"].rpartition("part=")
-    groups.setdefault((figure["task"], setting.strip(), figure["device"]), {})[part] = figure
-  rows = []
-  for (task, setting, device), parts in sorted(groups.items()):
-    own = [f"{1 / parts[part].mean:,.0f}" if part in parts else "" for part in SEEN]
-    rows.append([task, setting, *own, device, notes.number(next(iter(parts.values())))])
-  yield Table(["task", "setting", *SEEN.values(), "device", "note"], rows) if rows else _nothing("pixels")
-  yield Text("The paper's, on one RTX 4090 with Madrona, 1024 environments of 64 x 64 pixels:")
-  measured = [row for row in paper_table("pixel_breakdown") if row["kind"] == "measured"]
-  tasks = dict.fromkeys(row["env"] for row in measured)
-  speeds = lambda task: [f"{float(row['fps']):,.0f}" for row in measured if row["env"] == task]
-  yield Table(["task", *SEEN.values()], [[task, *speeds(task)] for task in tasks])
-  derived = [row for row in paper_table("pixel_breakdown") if row["kind"] == "derived"]
-  cells = [[r["env"], r["component"], r["seconds_per_env_step"], r["fraction_of_training"]] for r in derived]
-  yield Table(["task", "part", "seconds", "share"], cells)
-  yield Text("Its bars, 1024 environments with pictures; simulators are compared under `pixels compared=true`:")
-  seen = ("env_step+pixels", "1024")
-  bars = [row for row in paper_table("pixel_benchmark_upstream") if (row["component"], row["num_envs"]) == seen]
-  cells = [[r["simulator"], r["env"], r["setting"], r["image_side"], f"{float(r['fps_mean']):,.0f}"] for r in bars]
-  yield Table(["simulator", "task", "conditions", "side", "steps/s"], cells)
+    yield nothing("breakdown")
 
 
 def chains(evidence: Evidence, notes: Notes) -> Iterable[Block]:
@@ -285,7 +256,7 @@ def chains(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     stage, seconds = figure["setting"].removeprefix("stage="), f"{figure.mean:,.0f}"
     result = _with_ci(score) if score else NOT_MEASURED
     rows.append([figure["task"], stage, result, seconds, figure["device"], notes.number(figure)])
-  yield Table(["chain", "stage", "return", "seconds", "device", "note"], rows) if rows else _nothing("chain")
+  yield Table(["chain", "stage", "return", "seconds", "device", "note"], rows) if rows else nothing("chain")
 
 
 def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
@@ -336,5 +307,6 @@ def _short(value: float) -> str:
   return f"{value:,.0f}" if value >= 1000 else f"{value:.4g}"
 
 
-def _nothing(command: str) -> Block:
+def nothing(command: str) -> Block:
+  """Says what would measure what is missing."""
   return Text(f"{NOT_MEASURED.capitalize()}: `playground-bench {command}` does.")
