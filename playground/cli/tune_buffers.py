@@ -45,7 +45,9 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
       raise ConfigError(f"--run={run} is one of {trained.task}, not of {task}.")
     policies["trained"] = trained.act
     config = config if overrides else trained.config.env
-  found = [measure_buffers(config, act, envs, steps) for act in policies.values()]
+  console = Console()
+  with console.status(f"{task} on Warp with larger and larger buffers: each compiles anew"):
+    found = [measure_buffers(config, act, envs, steps) for act in policies.values()]
   advice = [sizes.advised() for sizes in found]
   table = Table(title=f"{task} on Warp, {envs} environments, {steps} decisions")
   table.add_column("most needed", no_wrap=True)
@@ -54,7 +56,6 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   for key, (_, needed) in _BUFFERS.items():
     sizes = [str(max(advised[key] for advised in advice)), format_value(config[key])]
     table.add_row(f"env.{key}", *map(needed, found), *sizes)
-  console = Console()
   console.print(table)
   for key, (what, _) in _BUFFERS.items():
     console.print(f"{key}: {what}")
