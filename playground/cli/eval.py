@@ -63,9 +63,11 @@ def evaluate_run(
     median = f"median {row['median']}, " if row["median"] else ""
     console.print(f"hardware, {row['metric']}: {row['what']}; {median}{row['trials']} trials (paper, {row['where']})")
     console.print(f"simulation, {row['metric']}: by default {row['simulation']}")
-  report = {"checkpoint": str(checkpoint.path), "episodes": count, "seed": seed, "scores": scores} | hardware.facts
+  report = {"checkpoint": str(checkpoint.path), "episodes": count, "seed": seed, "deterministic": deterministic}
+  report |= {"scores": scores} | hardware.facts
   report |= {"hardware_in_paper": real} if real else {}
-  out = trained.run_dir.path / "eval" / f"step_{checkpoint.step:012d}_seed_{seed}.json"
+  name = f"step_{checkpoint.step:012d}_seed_{seed}{'_deterministic' * deterministic}.json"
+  out = trained.run_dir.path / "eval" / name
   out.parent.mkdir(exist_ok=True)
   write_json(out, report)
   console.print(f"written to {out}", soft_wrap=True)

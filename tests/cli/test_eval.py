@@ -44,8 +44,8 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
   return lambda *args: call("eval", *args)
 
 
-def report(run: Path, step: int, seed: int = 0) -> dict[str, Any]:
-  return json.loads((run / "eval" / f"step_{step:012d}_seed_{seed}.json").read_text())
+def report(run: Path, step: int, seed: int = 0, mode: str = "") -> dict[str, Any]:
+  return json.loads((run / "eval" / f"step_{step:012d}_seed_{seed}{mode}.json").read_text())
 
 
 def test_a_run_is_evaluated_at_its_newest_checkpoint(
@@ -100,8 +100,11 @@ def test_the_mode_of_the_policy_is_another_score(command: Command, trained: Path
   scores = []
   for flags in ([], ["--deterministic"], ["--deterministic"]):
     assert command(str(trained), "--seed", "5", *flags) == 0
-    scores.append(report(trained, 4000, seed=5)["scores"]["episode_reward"])
+    written = report(trained, 4000, 5, "_deterministic" if flags else "")
+    assert written["deterministic"] == bool(flags)
+    scores.append(written["scores"]["episode_reward"])
   assert scores[0] != scores[1] == scores[2]
+  assert report(trained, 4000, seed=5)["scores"]["episode_reward"] == scores[0], "the sampled one is kept"
 
 
 @pytest.mark.parametrize("missing", ["gone", "empty", "run/checkpoints/000000000001"])
