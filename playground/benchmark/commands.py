@@ -227,7 +227,11 @@ class Pixels(OfTasks):
           seen = [f"env.vision.width={size}", f"env.vision.height={size}"]
           setting = [*conditions, *seen, *self.with_envs(task, count)]
           last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, *setting, "part=update"))}
-          jobs.append(dataclasses.replace(self.on_one_device(self.job("breakdown", task, setting)), last=last))
+          jobs.append(
+            dataclasses.replace(
+              self.on_one_device(self.job("breakdown", task, setting, watch_memory=self.workers == 1)), last=last
+            )
+          )
     return jobs
 
 

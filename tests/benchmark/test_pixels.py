@@ -53,6 +53,7 @@ def test_what_cannot_be_measured(options: dict[str, Any], message: str) -> None:
 
 def test_the_report_has_ours_beside_the_papers(tmp_path: Path) -> None:
   table = Table(tmp_path / "pixels.csv")
+  row = {"benchmark": "pixels", "task": "CartpoleBalanceVision", "agent": "ppo", "who": "ours", "device": "GPU"}
   sizes = "env.vision.width=64 env.vision.height=64 agent.num_envs=1024"
   for conditions in ("a=1", COMPARED_CONDITIONS[0]):
     for part, seconds in (
@@ -62,13 +63,13 @@ def test_the_report_has_ours_beside_the_papers(tmp_path: Path) -> None:
       ("storing", 6e-6),
       ("update", 2e-5),
     ):
-      row = {"benchmark": "pixels", "task": "CartpoleBalanceVision", "agent": "ppo", "who": "ours", "device": "GPU"}
       setting = f"{conditions} {sizes} part={part}"
       table.add({**row, "setting": setting, "quantity": "seconds_per_step", "value": seconds, "unit": "s"})
+  table.add({**row, "setting": f"a=1 {sizes}", "quantity": "used_memory_gib", "value": 1.25, "unit": "GiB"})
   blocks = pixels(Evidence([tmp_path]), sections.Notes())
   speeds, shares, bars = ([list(row) for row in block.rows] for block in blocks if isinstance(block, Shown))
   of_ours = ["CartpoleBalanceVision", "ours", "64", "1024"]
-  assert speeds[0][:10] == [*of_ours, "1,000,000", "250,000", "200,000", "50,000", "GPU", "a=1"]
+  assert speeds[0][:11] == [*of_ours, "1,000,000", "250,000", "200,000", "50,000", "1.25", "GPU", "a=1"]
   paper = ["CartpoleBalance", "paper, Madrona", "64", "1024"]
   assert speeds[2][:8] == [*paper, "1,370,000", "403,000", "341,000", "31,300"]
   assert shares[0][:8] == [*of_ours, "1 (5%)", "3 (15%)", "1 (5%)", "15 (75%)"]

@@ -1,12 +1,14 @@
 """Where the time of training goes: the loop timed with its parts added one by one, as in the paper's pixel tables."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from playground.benchmark.measures.subject import Subject, alone, num_updates, rate, told
+from playground.benchmark.measures.machine import used_memory
+from playground.benchmark.measures.subject import Subject, alone, emit_peak, num_updates, rate, told
 from playground.benchmark.worker import Facts
 from playground.envs.base import PIXELS
 from playground.envs.physics import WORLDS
@@ -31,25 +33,36 @@ LENGTH = 20  # control steps of one call, where the algorithm has no unrolls
 Run = Callable[[Any, Any, jax.Array], tuple[Any, Any]]
 
 
-def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float, lock: str | None) -> None:
+def measure(
+  facts: Facts,
+  task: str,
+  agent: str,
+  overrides: list[str],
+  seconds: float,
+  lock: str | None,
+  watch_memory: bool = False,
+) -> None:
   """A row for each of `PARTS`: seconds a control step of one environment takes with it and all parts before it.
 
-  The parts take turns, and the best of each one's turns counts: their differences are what is looked at.
+  The parts take turns, and the best of each one's turns counts: their differences are what is looked at. The memory is
+  what all parts took together: JAX's, and with `watch_memory` what the GPU's driver says.
   """
-  subject = Subject.build(facts, task, agent, overrides)
-  learner, state = subject.learner, subject.learner.init(subject.key(0), subject.model)
-  length = getattr(learner.config, "unroll_length", LENGTH)
-  calls: dict[str, tuple[Callable[[int], Any], int]] = {}
-  for part, (run, carry, repeat) in _rolls(subject, state, length).items():
-    calls[part] = (_repeat(subject, run, carry), learner.config.num_envs * length * repeat)
-  calls["update"] = (_train(subject, state), learner.steps_per_update)
-  for call, _ in calls.values():
-    jax.block_until_ready(call(1))
-  best = dict.fromkeys(calls, 0.0)
-  with alone(lock):
-    for _ in range(TURNS):
-      for part, (call, steps) in calls.items():
-        best[part] = max(best[part], rate(call, steps, seconds / TURNS)[0])
+  with used_memory(facts) if watch_memory else nullcontext():
+    subject = Subject.build(facts, task, agent, overrides)
+    learner, state = subject.learner, subject.learner.init(subject.key(0), subject.model)
+    length = getattr(learner.config, "unroll_length", LENGTH)
+    calls: dict[str, tuple[Callable[[int], Any], int]] = {}
+    for part, (run, carry, repeat) in _rolls(subject, state, length).items():
+      calls[part] = (_repeat(subject, run, carry), learner.config.num_envs * length * repeat)
+    calls["update"] = (_train(subject, state), learner.steps_per_update)
+    for call, _ in calls.values():
+      jax.block_until_ready(call(1))
+    best = dict.fromkeys(calls, 0.0)
+    with alone(lock):
+      for _ in range(TURNS):
+        for part, (call, steps) in calls.items():
+          best[part] = max(best[part], rate(call, steps, seconds / TURNS)[0])
+  emit_peak(facts)
   facts["conditions"] += f"; parts added one by one, best of {TURNS} turns of {seconds / TURNS:.1f} s"
   for part, speed in best.items():
     facts.emit("seconds_per_step", 1 / speed, "s", setting=" ".join((*told(overrides), f"part={part}")))

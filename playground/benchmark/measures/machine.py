@@ -43,7 +43,7 @@ def versions() -> str:
 
 
 @contextlib.contextmanager
-def used_memory(facts: Facts, seed: int) -> Iterator[None]:
+def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
   """A row for the most memory in use on the GPU during the block beyond what was before it; none without a GPU.
 
   Asked of the driver twice a second, so that what is not JAX's (Warp's arrays, compiled code) counts.

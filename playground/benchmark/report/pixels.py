@@ -10,6 +10,7 @@ from playground.benchmark.suites import paper_table
 
 SEEN = {"episodes": "state", "pixels": "+ pictures", "inference": "+ inference", "update": "+ training"}
 PARTS = ("physics", "rendering", "inference", "policy update")  # what each of them adds, as the paper calls it
+MEMORY = "used_memory_gib"
 PAPER = ("paper, Madrona", "64", "1024")  # who, side of the pictures, environments
 _SIZES = ("env.vision.width", "env.vision.height", "agent.num_envs")
 
@@ -29,7 +30,8 @@ def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     task, who, side, count, device = group
     seconds = {part: figure.mean for part, figure in parts.items()}
     cells = [f"{1 / seconds[part]:,.0f}" if part in seconds else "" for part in SEEN]
-    speeds.append([task, who, side, count, *cells, device, setting, notes.number(next(iter(parts.values())))])
+    memory = f"{parts[MEMORY].mean:.2f}" if MEMORY in parts else ""
+    speeds.append([task, who, side, count, *cells, memory, device, setting, notes.number(next(iter(parts.values())))])
     if SEEN.keys() <= seconds.keys():
       shares.append([task, who, side, count, *_shares([seconds[part] for part in SEEN]), device, setting])
     if count == "1024" and "pixels" in seconds:
@@ -39,10 +41,10 @@ def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     yield nothing("pixels")
   for task, measured in _paper().items():
     cells = [f"{speed:,.0f}" for speed in measured.values()]
-    speeds.append([task, *PAPER, *cells, "1x RTX 4090", "", ""])
+    speeds.append([task, *PAPER, *cells, "", "1x RTX 4090", "", ""])
     shares.append([task, *PAPER, *_shares([1 / speed for speed in measured.values()]), "1x RTX 4090", ""])
   sizes = ["task", "who", "side", "environments"]
-  yield Table([*sizes, *SEEN.values(), "device", "setting", "note"], speeds)
+  yield Table([*sizes, *SEEN.values(), "GPU memory (GiB)", "device", "setting", "note"], speeds)
   yield Text("Where the time of a step of one environment goes: microseconds, and the share of a step that trains.")
   yield Table([*sizes, *PARTS, "device", "setting"], shares)
   yield Text(
@@ -58,10 +60,12 @@ def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def _ours(evidence: Evidence) -> dict[tuple[Group, str], dict[str, Figure]]:
-  """What was measured, by part, for each group and what else its setting says."""
+  """What was measured, by part (or `MEMORY`), for each group and what else its setting says."""
   groups: dict[tuple[Group, str], dict[str, Figure]] = {}
-  for figure in reversed(evidence.find(benchmark="pixels", quantity="seconds_per_step")):
-    setting, _, part = figure["setting"].rpartition("part=")
+  memory = evidence.find(benchmark="pixels", quantity=MEMORY)
+  for figure in reversed(evidence.find(benchmark="pixels", quantity="seconds_per_step") + memory):
+    setting, _, part = figure["setting"].partition(" part=")
+    part = part or MEMORY
     values = {key: value for key, _, value in (text.partition("=") for text in setting.split())}
     width, height, count = (values.get(key, "") for key in _SIZES)
     side = width if width == height else f"{width} x {height}"
