@@ -10,7 +10,7 @@ from rich.table import Table
 from playground.benchmark.suites import paper_table
 from playground.errors import ConfigError
 from playground.learning.evaluation import make_evaluator
-from playground.rendering.video import render_video
+from playground.rendering.video import need_place, render_video
 from playground.rendering.visuals import drawn_model
 from playground.runs.files import write_json
 from playground.runs.job import episodes_of
@@ -44,6 +44,8 @@ def evaluate_run(
     PlaygroundError: no such run or checkpoint, or one that does not fit.
   """
   console = console or Console()
+  if video:
+    need_place(video)
   trained = load_trained(path)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
   count = run.agent.num_eval_envs if episodes is None else episodes

@@ -25,6 +25,8 @@ def main() -> None:
   except PlaygroundError as error:
     print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
     code = 2
+  except KeyboardInterrupt:
+    code = 130  # as a shell counts it
   except BrokenPipeError:  # `playground list | head`
     sys.stderr.close()
     code = 0
@@ -72,8 +74,8 @@ def _parser() -> argparse.ArgumentParser:
   play.add_argument("policy", help="run directory, checkpoint, or a policy.onnx beside its policy.yaml")
   play.add_argument("--episodes", type=int, default=10)
   play.add_argument("--seed", type=int, default=0)
-  play.add_argument("--video", metavar="FILE", help="also render an episode")
   shown = play.add_mutually_exclusive_group()
+  shown.add_argument("--video", metavar="FILE", help="also render an episode")
   shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
   shown.add_argument("--web", action="store_true", help="show it in the browser instead")
   play.add_argument("--host", default="127.0.0.1", help="of --web: the address to listen on; by default this machine's")

@@ -12,7 +12,7 @@ from playground.deploy.policy import ExportedPolicy
 from playground.deploy.trained import export_policy, load_exact, record
 from playground.errors import PlaygroundError
 from playground.extras import need
-from playground.runs.files import replacing, write_text
+from playground.runs.files import need_folder, replacing, write_text
 
 TOLERANCE = 1e-5  # of an action, against the trained policy's
 _ENVS, _DECISIONS = 8, 125  # 1000 observations
@@ -37,10 +37,12 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
 
   Raises:
     ParityError: the exported policy acts otherwise; nothing is written.
-    PlaygroundError: no such run or checkpoint, or one that cannot be exported.
+    PlaygroundError: no such run or checkpoint, or one that cannot be exported, or no folder that can be written to.
   """
   console = console or Console()
   need("deploy", "onnx", "onnxruntime")
+  if out:
+    need_folder(Path(out).expanduser(), f"--out={out}")
   trained = load_exact(path)
   obs, actions, state = record(trained, _ENVS, _DECISIONS)
   exported = export_policy(trained, state)

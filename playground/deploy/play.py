@@ -20,8 +20,8 @@ from playground.extras import need
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
-from playground.rendering.video import render_video
-from playground.runs.files import write_json
+from playground.rendering.video import need_place, render_video
+from playground.runs.files import need_folder, write_json
 from playground.runs.job import episodes_of
 from playground.runs.trained import Trained
 
@@ -57,11 +57,16 @@ def play(
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run or policy, no display for the viewer, or no port for the browser.
+    PlaygroundError: no such run or policy, no display for the viewer, no port for the browser, or no folder that can be
+      written to.
   """
   console = console or Console()
   if episodes < 1:
     raise ConfigError(f"--episodes={episodes} must be above 0.")
+  if seed < 0:
+    raise ConfigError(f"--seed={seed} must not be negative.")
+  if video:
+    need_place(video)
   if viewer:
     from playground.deploy.viewer import need_display
 
@@ -86,6 +91,7 @@ def play(
     following = None if given.parent.name == "checkpoints" else LATEST
     watch(Session(env, exported, seed, menu, following), host, port, console)
     return 0
+  need_folder(opened.folder, str(opened.folder))
   evaluate = make_evaluator(env, exported.act, episodes, make_mesh(1), 1 if video else 0)
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}

@@ -14,18 +14,32 @@ from playground.envs.base import Observation
 from playground.errors import CheckpointError
 from playground.extras import need
 
+_READ = {"task", "origin", "policy", "env"}  # keys of the contract that are read here and by `playground play`
+
 
 class ExportedPolicy:
   """Maps an observation to an action, as the contract says."""
 
   def __init__(self, model: bytes, contract: Mapping[str, Any]):
-    """Takes the ONNX model and what `playground.deploy.contract` says of it."""
+    """Takes the ONNX model and what `playground.deploy.contract` says of it.
+
+    Raises:
+      CheckpointError: the model is damaged, or takes or gives something else.
+    """
     need("deploy", "onnxruntime")
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    try:
+      self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's have no base of their own
+      raise CheckpointError(f"The policy is no model that ONNX Runtime can read: {error}") from None
+    facts = contract["policy"]
+    told = {row["name"]: row["shape"] for row in facts["inputs"]} | {facts["output"]: [1, facts["action_size"]]}
+    found = {end.name: end.shape for end in (*self._session.get_inputs(), *self._session.get_outputs())}
+    if found != told:
+      raise CheckpointError(f"The policy is not the one that its contract tells of: {found}, and not {told}.")
     self.model = model
     self.contract = contract
 
@@ -44,9 +58,12 @@ class ExportedPolicy:
       contract = yaml.safe_load(path.with_suffix(".yaml").read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError):
       contract = None
-    if not isinstance(contract, dict) or contract.get("format") != FORMAT:
+    if not isinstance(contract, dict) or contract.get("format") != FORMAT or not set(contract) >= _READ:
       raise CheckpointError(f"{path.with_suffix('.yaml')} is not a policy's contract ({FORMAT}): export the run again.")
-    return cls(path.read_bytes(), contract)
+    try:
+      return cls(path.read_bytes(), contract)
+    except CheckpointError as error:
+      raise CheckpointError(f"{path}: {error}") from None
 
   def actions(self, obs: Any) -> np.ndarray:
     """Actions in [-1, 1], [..., action_size], for a task's observations with any leading axes: one inference each."""

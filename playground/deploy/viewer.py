@@ -2,7 +2,9 @@
 
 import os
 import sys
+import threading
 import time
+import warnings
 
 import numpy as np
 from rich.console import Console
@@ -12,10 +14,12 @@ from playground.deploy.policy import ExportedPolicy
 from playground.envs.base import Env
 from playground.errors import HardwareError
 from playground.rendering.video import follow
+from playground.runs.interrupts import noted_signals
 
 # GLFW's codes of the keys -> component of the command, direction.
 _STEERING = {265: (0, 1), 264: (0, -1), 263: (2, 1), 262: (2, -1), ord(","): (1, 1), ord("."): (1, -1)}
 _AS_THE_TASK_DRAWS, _RESET = 259, 257  # backspace, enter
+_CLOSING = 5.0  # s for a window to go
 _HELP = (
   "Keys: up and down go, left and right turn, comma and period go sideways, backspace leaves commands to the task, "
   "enter begins anew. Double-click a body, then hold ctrl and drag with the right button to push it."
@@ -24,12 +28,30 @@ _HELP = (
 
 def need_display() -> None:
   """Raises HardwareError where there is no screen for a window."""
-  if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-    raise HardwareError("--viewer needs a display, and there is none here: use --video FILE.")
+  if not sys.platform.startswith("linux"):
+    return
+  display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+  if not display:
+    raise HardwareError("--viewer needs a display, and there is none here: use --video FILE or --web.")
+  if not _opens_a_window():  # MuJoCo's would wait for ever
+    raise HardwareError(f"--viewer cannot open a window on the display {display}: use --video FILE or --web.")
+
+
+def _opens_a_window() -> bool:
+  import glfw
+
+  with warnings.catch_warnings(action="ignore"):
+    try:
+      if not glfw.init():
+        return False
+      glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
+      return bool(glfw.create_window(16, 16, "", None, None))
+    finally:
+      glfw.terminate()
 
 
 def view(env: Env, exported: ExportedPolicy, seed: int, console: Console) -> None:
-  """Shows a policy in real time until its window is closed."""
+  """Shows a policy in real time until its window is closed, or ctrl+c."""
   import mujoco.viewer
 
   player = Player(env, exported, seed)
@@ -47,10 +69,11 @@ def view(env: Env, exported: ExportedPolicy, seed: int, console: Console) -> Non
       console.print(f"command {np.round(player.command, 1).tolist()}")
 
   console.print(_HELP, soft_wrap=True)
-  with mujoco.viewer.launch_passive(env.mj_model, data, key_callback=on_key) as window:
+  others = set(threading.enumerate())
+  with noted_signals() as told, mujoco.viewer.launch_passive(env.mj_model, data, key_callback=on_key) as window:
     with window.lock():
       follow(window.cam, env.mj_model)
-    while window.is_running():
+    while window.is_running() and not told.is_set():
       began = time.perf_counter()
       state = player.decide()
       with window.lock():
@@ -62,3 +85,5 @@ def view(env: Env, exported: ExportedPolicy, seed: int, console: Console) -> Non
         player.force = data.xfrc_applied.astype(np.float32)
       window.sync()
       player.pause_until_due(began)
+  for drawing in set(threading.enumerate()) - others:  # a process that ends before the window's thread may hang
+    drawing.join(_CLOSING)

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from playground.errors import PlaygroundError, nearest
+from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
-from playground.runs.files import replacing
+from playground.runs.files import need_folder, replacing
 
 MAX_FPS = 50.0
 _CAMERAS = ("track", "tracking", "fixed", "side", "front", "back", "cam0")
@@ -126,6 +126,13 @@ def render_video(
       return out_path
   notify(f"No video at {out_path.name}: {reason}; `playground doctor` shows what rendering needs.")
   return None
+
+
+def need_place(out_path: str) -> None:
+  """Raises ConfigError if `--video` names what cannot be written, before there is anything to render."""
+  if Path(out_path).suffix != ".mp4" or Path(out_path).is_dir():
+    raise ConfigError(f"--video={out_path} must be a file that ends in .mp4.")
+  need_folder(Path(out_path).parent, f"--video={out_path}")
 
 
 def frame_stride(dt: float) -> int:

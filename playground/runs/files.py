@@ -9,6 +9,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from playground.errors import ConfigError
+
+
+def need_folder(folder: Path, option: str) -> None:
+  """Raises ConfigError, which names the option that it is of, where no folder can be or be written to; makes none."""
+  folder = folder.absolute()
+  there = next(path for path in (folder, *folder.parents) if os.path.exists(path))
+  if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+    raise ConfigError(f"{option} cannot be written: {there} is not a folder that you may write to.")
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:

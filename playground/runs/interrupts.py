@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Self
@@ -24,6 +25,14 @@ def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[No
   finally:
     for signum, handler in before.items():
       signal.signal(signum, handler)
+
+
+@contextlib.contextmanager
+def noted_signals() -> Iterator[threading.Event]:
+  """An event that SIGINT and SIGTERM set: for loops mostly in callbacks of C code, where exceptions get lost."""
+  told = threading.Event()
+  with on_signals(lambda *_: told.set()):
+    yield told
 
 
 class Interrupts:

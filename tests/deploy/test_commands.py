@@ -2,6 +2,7 @@
 
 import json
 import re
+import signal
 import socket
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 import yaml
 
 from playground.cli.main import main
+from playground.deploy import play
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.web.server import Watch
 from tests.command import Command, caller
@@ -91,6 +93,51 @@ def test_a_policy_that_acts_otherwise_is_not_written(
   assert not (tmp_path / "out").exists()
 
 
+def test_a_damaged_policy_and_one_of_another_task(
+  command: Command, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+  assert command("export", str(run), "--out", str(tmp_path)) == 0
+  model, contract = (tmp_path / "policy.onnx").read_bytes(), (tmp_path / "policy.yaml").read_text()
+  capsys.readouterr()
+  for content, told, said in [
+    (b"", contract, "is no model that ONNX Runtime can read"),
+    (model[:-9], contract, "is no model that ONNX Runtime can read"),
+    (model, contract.replace("shape: [1, 5]", "shape: [1, 6]"), "{'obs': [1, 5], 'continuous_actions': [1, 1]}, and"),
+    (model, contract.replace("action_size: 1", "action_size: 2"), "is not the one that its contract tells of"),
+  ]:
+    (tmp_path / "policy.onnx").write_bytes(content)
+    (tmp_path / "policy.yaml").write_text(told)
+    assert command("play", str(tmp_path / "policy.onnx")) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {tmp_path / 'policy.onnx'}: The policy ") and said in line
+
+
+def test_a_display_that_is_not_there(
+  command: Command, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+  monkeypatch.setenv("DISPLAY", ":4242")
+  assert command("play", str(run), "--viewer") == 2
+  assert "--viewer cannot open a window on the display :4242" in capsys.readouterr().err
+
+
+def test_a_video_or_a_window(command: Command, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  for shown in ("--web", "--viewer"):
+    assert command("play", str(run), "--video", "a.mp4", shown) == 2
+    assert f"{shown}: not allowed with argument --video" in capsys.readouterr().err
+
+
+def test_ctrl_c_is_no_traceback(
+  command: Command, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  def interrupted(path: str) -> None:
+    signal.raise_signal(signal.SIGINT)
+
+  monkeypatch.setattr(play, "open_policy", interrupted)
+  assert command("play", str(run)) == 130
+  assert capsys.readouterr().err == ""
+
+
 def test_play_in_the_browser(
   command: Command, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -101,7 +148,7 @@ def test_play_in_the_browser(
     truly(watch)
     watched.append(watch)
     if len(watched) == 20:
-      raise KeyboardInterrupt
+      signal.raise_signal(signal.SIGINT)
 
   monkeypatch.setattr(Watch, "frame", frame)
   port = free_port()
@@ -123,16 +170,23 @@ def test_one_sentence_each(
 ) -> None:
   for name in ("DISPLAY", "WAYLAND_DISPLAY"):
     monkeypatch.delenv(name, raising=False)
-  (tmp_path / "policy.onnx").touch()
-  (tmp_path / "other.onnx").touch()
+  for name in ("policy", "other", "cut"):
+    (tmp_path / f"{name}.onnx").touch()
   (tmp_path / "other.yaml").write_text("format: something else")
+  (tmp_path / "cut.yaml").write_text("format: playground-policy/2\ntask: CartpoleBalance\n")
   for args, said in [
     (["play", str(tmp_path / "policy.onnx")], "policy.yaml does not exist"),
     (["play", str(tmp_path / "other.onnx")], "other.yaml is not a policy's contract"),
+    (["play", str(tmp_path / "cut.onnx")], "cut.yaml is not a policy's contract"),
     (["play", str(tmp_path / "none")], "does not exist: give a run directory"),
     (["play", str(tmp_path), "--episodes", "0"], "--episodes=0 must be above 0"),
+    (["play", str(tmp_path), "--seed", "-1", "--web"], "--seed=-1 must not be negative"),
+    (["play", str(tmp_path), "--video", "a.gif"], "--video=a.gif must be a file that ends in .mp4"),
+    (["play", str(tmp_path), "--video", str(tmp_path / "cut.yaml" / "a.mp4")], "cut.yaml is not a folder"),
     (["play", str(tmp_path), "--viewer"], "--viewer needs a display"),
     (["export", str(tmp_path)], "holds no checkpoint"),
+    (["export", str(tmp_path), "--out", str(tmp_path / "cut.yaml")], "cut.yaml is not a folder"),
+    (["eval", str(tmp_path), "--video", "a"], "--video=a must be a file that ends in .mp4"),
   ]:
     assert command(*args) == 2
     (line,) = capsys.readouterr().err.splitlines()

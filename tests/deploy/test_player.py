@@ -1,6 +1,9 @@
 """Watching a policy: commands and pushes of the watcher, and episodes that begin anew."""
 
 import contextlib
+import signal
+import threading
+import time
 from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -65,28 +68,43 @@ def test_an_episode_that_breaks_begins_anew() -> None:
   assert np.isfinite(player.decide().data.qpos).all() and player.state.info["age"] == 1
 
 
-@pytest.mark.parametrize("task, followed", [("CartpoleBalance", False), ("Go1JoystickFlatTerrain", True)])
-def test_the_viewer_shows_the_policy(task: str, followed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+  "task, followed, open_until", [("CartpoleBalance", False, None), ("Go1JoystickFlatTerrain", True, 3)]
+)
+def test_the_viewer_shows_the_policy(
+  task: str, followed: bool, open_until: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  """Until its window is closed, or ctrl+c."""
   env = on_c_physics(load(task))
   shown: list[np.ndarray] = []
   keys: list[Any] = []
+  data_of_window: list[mujoco.MjData] = []
   camera = mujoco.MjvCamera()
+  drawing = threading.Thread(target=time.sleep, args=(0.5,))  # as MuJoCo's does, for a while after its window is closed
+
+  def sync() -> None:
+    shown.append(data_of_window[0].qpos.copy())
+    if open_until is None and len(shown) == 3:
+      signal.raise_signal(signal.SIGINT)
 
   @contextlib.contextmanager
   def window(model: mujoco.MjModel, data: mujoco.MjData, key_callback: Any) -> Iterator[Any]:
     assert model is env.mj_model
     keys.append(key_callback)
+    data_of_window.append(data)
     yield SimpleNamespace(
-      is_running=lambda: len(shown) < 3,
+      is_running=lambda: open_until is None or len(shown) < open_until,
       lock=contextlib.nullcontext,
       cam=camera,
       perturb=mujoco.MjvPerturb(),
-      sync=lambda: shown.append(data.qpos.copy()),
+      sync=sync,
     )
+    drawing.start()
 
   monkeypatch.setattr(mujoco.viewer, "launch_passive", window)
   full: Any = SimpleNamespace(actions=lambda obs: np.ones(env.action_size))
   view(env, full, 0, Console(quiet=True))
+  assert not drawing.is_alive()
   assert len(shown) == 3 and not np.array_equal(shown[0], shown[2])
   assert followed or shown[0][0] < shown[1][0] < shown[2][0]  # the cart drives off
   assert (camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING) == followed

@@ -10,6 +10,7 @@ from playground.deploy.session import Session
 from playground.deploy.web.panel import Panel
 from playground.deploy.web.view import View
 from playground.errors import ConfigError, PlaygroundError
+from playground.runs.interrupts import noted_signals
 
 _FRAME = 1 / 30  # s between two pictures: more than a browser without a GPU can draw
 _DRAW = 0.25  # s between two looks at what changes slowly: text, plots, the run's checkpoints
@@ -71,9 +72,8 @@ def watch(session: Session, host: str, port: int, console: Console) -> None:
   watching = Watch(session, host, port)
   console.print("Watch it there; ctrl+c here ends it.")
   try:
-    while True:
-      watching.frame()
-  except KeyboardInterrupt:
-    pass
+    with noted_signals() as told:
+      while not told.is_set():
+        watching.frame()
   finally:
     watching.close()
