@@ -8,6 +8,7 @@ import numpy as np
 from dm_env import specs
 
 from playground.adapters.episodes import Episodes, Moment
+from playground.envs.base import PIXELS
 
 
 class DmEnv(dm_env.Environment):
@@ -34,13 +35,20 @@ class DmEnv(dm_env.Environment):
     sizes = self._episodes.env.observation_size
     if not isinstance(sizes, Mapping):
       return specs.Array((sizes,), np.float32, "observation")
-    return {name: specs.Array(shape, np.float32, name) for name, shape in sizes.items()}
+    return {name: _spec(name, shape) for name, shape in sizes.items()}
 
   def action_spec(self) -> specs.BoundedArray:
     return specs.BoundedArray((self._episodes.env.action_size,), np.float32, -1.0, 1.0, "action")
 
   def reward_spec(self) -> specs.Array:
     return specs.Array((), float, "reward")
+
+
+def _spec(name: str, shape: tuple[int, ...]) -> specs.Array:
+  """Of one entry: pictures are bytes."""
+  if name.startswith(PIXELS):
+    return specs.BoundedArray(shape, np.uint8, 0, 255, name)
+  return specs.Array(shape, np.float32, name)
 
 
 def _time_step(moment: Moment) -> dm_env.TimeStep:
