@@ -13,6 +13,7 @@ from playground.config import compose
 from playground.envs.base import State
 from playground.errors import ConfigError
 from playground.hardware.mesh import make_mesh
+from playground.learning import ppo
 from playground.learning.cnn import CNN, CNNConfig, random_shift
 from playground.learning.networks import ACTIVATIONS, ActorCritic, NetworkConfig, SoftActorCritic, SoftNetworkConfig
 from playground.learning.ppo import PPO, PPOConfig
@@ -68,6 +69,8 @@ def test_normalised_channels_know_no_brightness_nor_contrast() -> None:
   normalising = dataclasses.replace(TINY, normalize_channels=True)
   np.testing.assert_allclose(features(normalising, pixels), features(normalising, brighter), atol=1e-3)
   assert jnp.abs(features(TINY, pixels) - features(TINY, brighter)).max() > 0.1
+  beside_a_bright_one = jnp.concatenate([pixels[:1], pixels[1:] + 150])  # each picture is normalised by itself
+  np.testing.assert_allclose(features(normalising, beside_a_bright_one), features(normalising, pixels), atol=1e-3)
 
 
 def test_spatial_softmax_finds_a_bright_spot() -> None:
@@ -146,7 +149,12 @@ class Seen(PointTask):
     return super().reset(rng)
 
 
-def test_a_training_step_keeps_pictures_as_bytes() -> None:
+def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+  shifted: list[Any] = []
+  note = lambda obs, shifts, pad: (
+    shifted.append((obs["pixels/eye"].shape, shifts, pad)) or random_shift(obs, shifts, pad)
+  )
+  monkeypatch.setattr(ppo, "random_shift", note)
   network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", cnn=TINY)
   config = dataclasses.replace(SMALL_PPO, network=network, augment_pixels=1)
   learner = PPO(Seen(), config, make_mesh(1), {})
@@ -156,6 +164,8 @@ def test_a_training_step_keeps_pictures_as_bytes() -> None:
   traced = learner.train.trace(state, {}, jnp.int32(1))
   floats = [v.aval for v in _variables(traced.jaxpr.jaxpr) if v.aval.shape == (5, 32, 6, 6, 2)]
   assert floats and {aval.dtype.name for aval in floats} == {"uint8"}  # all that is collected: [T, B, H, W, C]
+  (collected, shifts, pad), (last, same, _) = shifted[:2]  # of a minibatch, [T, B, ...], and of what came after it
+  assert pad == 1 and shifts is same and collected[1:] == last and shifts.shape == (last[0], 2)
   state, metrics = learner.train(state, {}, jnp.int32(1))
   assert metrics["nonfinite_updates"] == 0 and "obs_farthest" not in metrics
   assert all((a != b).any() for a, b in zip(before, numbers(state.params), strict=True) if a.any())
