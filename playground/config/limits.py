@@ -11,7 +11,7 @@ _PRECISIONS = ("default", "high", "highest", "bfloat16", "tensorfloat32", "float
 _CHOICES = {
   "agent.schedule": ("fixed", "adaptive"),
   "env.impl": ("auto", "jax", "warp"),
-  "env.vision.image": ("rgb", "gray", "depth"),
+  "env.vision.image": ("rgb", "gray", "depth", "segmentation"),
   "hardware.platform": ("auto", "cpu", "gpu"),
   "hardware.matmul_precision": _PRECISIONS,
   "hardware.network_precision": _PRECISIONS,

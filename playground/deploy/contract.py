@@ -1,6 +1,6 @@
 """What a controller must know to run a policy: `policy.yaml`."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -8,23 +8,17 @@ import mujoco
 import numpy as np
 
 from playground.deploy.graph import OUTPUT, input_names
+from playground.deploy.parts import describe_part
 from playground.envs.base import PIXELS, Env, State
-from playground.envs.locomotion.legged import LeggedTask
-from playground.envs.manipulation.in_hand import InHand
-from playground.mdp.hand_observations import HAND_OBSERVATIONS
-from playground.mdp.observations import OBSERVATIONS
 from playground.runs.files import plain
 
 FORMAT = "playground-policy/2"
 
-_FUNCTIONS: tuple[tuple[type[Env], Mapping[str, Callable[..., Any]]], ...] = (
-  (LeggedTask, OBSERVATIONS),
-  (InHand, HAND_OBSERVATIONS),
-)
 _VALUES = {
   "rgb": "red, green and blue, 0 to 255",
   "gray": "the mean of red, green and blue, 0 to 255",
   "depth": "255 * min(1, distance / {farthest} m) along the optical axis, 0 where nothing is",
+  "segmentation": "the number of the geom that is seen, counted from 1 in the order of the model, 0 where nothing is",
 }
 _HISTORY = "_history"
 _CONSTANT_BASES = ("default_pose", "home", "zero")
@@ -90,7 +84,6 @@ def describe_policy(
 
 def _observation(env: Env, config: Mapping[str, Any], entry: str) -> list[dict[str, Any]]:
   """Each part in its order: where it begins, its length, the factor and the noise on it, what it is, in which frame."""
-  functions = next((functions for kind, functions in _FUNCTIONS if isinstance(env.unwrapped, kind)), {})
   slips = config.get("parity_obs", {}) if config["parity"] else {}
   noise, scales = config.get("noise", {}), config.get("obs_scales", {})
   parts, start = [], 0
@@ -99,8 +92,8 @@ def _observation(env: Env, config: Mapping[str, Any], entry: str) -> list[dict[s
     part: dict[str, Any] = {"part": name, "start": start, "size": size, "scale": scales.get(base, 1.0)}
     if base in noise.get("scales", {}):
       part["noise"] = (noise["level"] * np.asarray(noise["scales"][base])).tolist()
-    if function := functions.get(slips.get(base, base)):
-      part["what"] = (function.__doc__ or "").strip().splitlines()[0]
+    if said := describe_part(env, slips.get(base, base)):
+      part["what"] = said
     parts.append(part)
     start += size
   return parts

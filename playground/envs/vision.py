@@ -12,7 +12,8 @@ from playground.envs.wrappers import Wrapper
 from playground.errors import ConfigError, nearest
 from playground.rendering.batch import BatchRenderer, View, camera_names
 
-_CHANNELS = {"rgb": 3, "gray": 1, "depth": 1}
+_CHANNELS = {"rgb": 3, "gray": 1, "depth": 1, "segmentation": 1}
+_MAX_GEOMS = 255  # that a byte tells apart, beside nothing
 
 
 class Vision(Wrapper):
@@ -45,12 +46,17 @@ class Vision(Wrapper):
     brightness = tuple(config.brightness)
     if len(brightness) != 2 or not 0 <= brightness[0] <= brightness[1]:
       raise ConfigError(f"env.vision.brightness={list(brightness)} must be two factors, 0 or more, the lower first.")
+    if config.image == "segmentation" and env.mj_model.ngeom > _MAX_GEOMS:
+      many = f"the model has {env.mj_model.ngeom} geoms, more than the {_MAX_GEOMS} that a byte tells apart"
+      raise ConfigError(f"env.vision.image=segmentation: {many}.")
+    if config.image == "segmentation" and brightness != (1, 1):
+      raise ConfigError(f"env.vision.brightness={list(brightness)}: geoms have no brightness, leave it [1.0, 1.0].")
     self._image, self._camera, self._farthest = config.image, config.camera, config.farthest
     self._frames, self._brightness = config.frames, brightness
     self._leaks: bool = env.parity and self._frames > 1
     self._warp_model = env.mjx_model  # to be rendered, wherever the task is simulated later (`c_physics.py`)
     size = {"width": config.width, "height": config.height}
-    kind = "depth" if self._image == "depth" else "rgb"
+    kind = "rgb" if self._image in ("rgb", "gray") else self._image
     looks = {"shadows": config.shadows, "textures": config.textures}
     self._renderer = BatchRenderer(env.physics, View((config.camera,), kinds=(kind,), **size, **looks))
 
@@ -96,6 +102,8 @@ class Vision(Wrapper):
     seen = pictures[self._camera]
     if self._image == "depth":
       frame = 255 * jnp.minimum(seen["depth"][..., None] / self._farthest, 1.0)
+    elif self._image == "segmentation":
+      frame = (seen["segmentation"][..., None] + 1).astype(jnp.uint8)
     elif self._image == "gray":
       frame = seen["rgb"].astype(jnp.float32).mean(axis=-1, keepdims=True)
     else:

@@ -1,6 +1,7 @@
 """What a camera's pictures become on their way into the observation, with a renderer that shows the position."""
 
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -31,7 +32,8 @@ class Shown:
     size = (self.view.height, self.view.width)
     red, green, blue = (jnp.full(size, 100 * data.time + i) for i in (-1, 0, 1))
     rgb = jnp.stack([red, green, blue], axis=-1).astype(jnp.uint8)
-    return {"eye": {"rgb": rgb, "depth": jnp.full(size, data.time)}}, data
+    geom = jnp.round(10 * data.time).astype(jnp.int32) - 1  # at first there is none
+    return {"eye": {"rgb": rgb, "depth": jnp.full(size, data.time), "segmentation": jnp.full(size, geom)}}, data
 
 
 class Aging(Point):
@@ -54,6 +56,7 @@ def seeing(monkeypatch: pytest.MonkeyPatch) -> Any:
   def make(parity: bool = False, **settings: Any) -> vision.Vision:
     env: Any = Aging(episode_length=LENGTH)
     env.parity = parity
+    env.mj_model = SimpleNamespace(ngeom=settings.pop("ngeom", 4))
     config = compose(["env=CartpoleBalance", "tuned=null"]).resolved["env"]["vision"]
     env.config = ConfigDict({"vision": config | {"camera": "eye", "width": 2, "height": 3} | settings})
     return vision.Vision(env)
@@ -113,9 +116,16 @@ def test_depth_is_white_from_the_farthest_on(seeing: Any) -> None:
   assert seen == [0, 128, 255, 255]
 
 
+def test_geoms_are_counted_from_1(seeing: Any) -> None:
+  seen = [values(state)[0] for state in roll(seeing(image="segmentation"), 3, wrap_for_evaluation)]
+  assert seen == [0, 1, 2, 3]
+
+
 @pytest.mark.parametrize(
   ("settings", "message"),
   [
+    ({"image": "segmentation", "ngeom": 256}, "the model has 256 geoms, more than the 255 that a byte tells apart"),
+    ({"image": "segmentation", "brightness": [0.5, 1.0]}, r"brightness=\[0.5, 1.0\]: geoms have no brightness"),
     ({"camera": "eyes"}, r"env.vision.camera=eyes is no camera .* the task has eye, side.*Did you mean 'eye'"),
     ({"camera": None}, r"env.vision.camera=None is no camera of the model; the task has eye, side"),
     ({"brightness": [1.0, 0.5]}, r"env.vision.brightness=\[1.0, 0.5\] must be two factors"),
