@@ -167,7 +167,7 @@ def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
     renders: whether the task sees through a camera, which only Warp renders.
 
   Raises:
-    ConfigError: unknown name, Warp asked for where it is not installed, or another asked to render.
+    ConfigError: unknown name, Warp asked for where it is not installed or cannot run, or another asked to render.
   """
   if impl == "auto":
     impl = "warp" if renders else cuda_impl if jax.default_backend() == "gpu" else "jax"
@@ -176,10 +176,17 @@ def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
   if renders and impl != "warp":
     raise ConfigError(f"env.impl={impl} renders no pictures, which env.vision.enable=true asks for: leave it auto.")
   if impl == "warp":
+    instead = "leave env.vision.enable=false" if renders else "set env.impl=jax"
     try:
-      import warp  # noqa: F401  # pyright: ignore[reportMissingImports]
+      import warp  # pyright: ignore[reportMissingImports]
     except ImportError:
-      instead = "leave env.vision.enable=false" if renders else "set env.impl=jax"
       remedy = f"pip install 'mujoco-mjx[warp]', or {instead}"
       raise ConfigError(f"env.impl=warp needs MuJoCo-Warp, which is not installed: {remedy}.") from None
+    backend = jax.default_backend()
+    if backend != "cpu":
+      warp.config.log_level = warp.LOG_WARNING  # asking starts it, which it would tell
+      if backend != "gpu" or not warp.is_cuda_available():
+        raise ConfigError(
+          f"env.impl=warp runs on CPUs and NVIDIA GPUs and finds none beside JAX's {backend}: {instead}."
+        )
   return impl

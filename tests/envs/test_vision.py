@@ -149,6 +149,13 @@ def test_a_machine_without_warp_says_how_to_get_it(monkeypatch: pytest.MonkeyPat
     choose_impl("auto", "jax", renders=True)
 
 
+def test_a_machine_that_warp_does_not_run_on_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+  for backend in ("tpu", "gpu"):  # a GPU that JAX sees and CUDA does not: another maker's, or a driver too old
+    monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+    with pytest.raises(ConfigError, match=rf"finds none beside JAX's {backend}: leave env.vision.enable=false"):
+      choose_impl("auto", "jax", renders=True)
+
+
 def test_the_settings_are_there_for_every_task() -> None:
   given = ["env.vision.enable=true", "env.vision.camera=track", "env.vision.frames=2"]
   assert compose(["env=Go1JoystickFlatTerrain", *given]).env.vision.frames == 2
