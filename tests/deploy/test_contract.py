@@ -9,6 +9,7 @@ import yaml
 
 from playground import registry
 from playground.deploy.contract import describe_policy
+from playground.deploy.parts import describe_part
 from playground.envs.base import State
 from playground.runs.files import plain
 
@@ -51,6 +52,16 @@ def test_a_joystick_policy() -> None:
   assert (first["default"], first["default_of"]) == (0.1, "keyframe home")
   assert [row["joint"] for row in said["actuators"]] == said["joints"][1:]
   assert said["command"]["max"] == [1.5, 0.8, 1.2]
+
+
+@pytest.mark.parametrize(
+  "task",
+  ["Op3Joystick", "PandaPickCubeCartesian", "PandaRobotiqPushCube", "AlohaHandOver", "AlohaSinglePegInsertion"],
+)
+def test_each_part_of_a_robots_observation_is_explained(task: str) -> None:
+  env = registry.load(task)
+  actor = env.observation_parts["state"]
+  assert actor and [name for name in actor if not describe_part(env, name.removesuffix("_history"))] == []
 
 
 def test_targets_that_actions_move() -> None:
