@@ -43,6 +43,8 @@ class Wrapper:
   def __getattr__(self, name: str) -> Any:
     if name.startswith("__"):
       raise AttributeError(name)
+    if hasattr(type(self), name):  # a property of ours that failed: its own error, not the task's value in its place
+      return object.__getattribute__(self, name)
     return getattr(self.env, name)
 
 

@@ -118,3 +118,14 @@ def test_an_absurd_velocity_counts_as_not_finite() -> None:
   np.testing.assert_array_equal(states[2].done, 1)
   np.testing.assert_array_equal(states[2].reward, 0)
   np.testing.assert_array_equal(jnp.abs(states[2].data.qvel) < wrappers.MAX_VELOCITY, True)
+
+
+def test_a_property_that_fails_is_not_answered_by_the_task() -> None:
+  class Broken(wrappers.Wrapper):
+    @property
+    def observation_size(self) -> int:
+      raise AttributeError("no renderer")
+
+  with pytest.raises(AttributeError, match="no renderer"):
+    _ = Broken(PointTask()).observation_size
+  assert Broken(PointTask()).action_size == PointTask().action_size
