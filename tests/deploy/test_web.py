@@ -15,6 +15,7 @@ import pytest
 from playground.cli.main import main
 from playground.deploy.menu import Menu
 from playground.deploy.play import open_policy
+from playground.deploy.player import Player
 from playground.deploy.session import Session
 from playground.deploy.web.server import Watch
 from tests.command import caller
@@ -187,7 +188,7 @@ def test_one_sentence_each(
 
 
 @pytest.mark.slow  # without a GPU the browser draws so slowly that beside other tests keys get lost
-def test_page(watch: Watch) -> None:
+def test_page(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
   with browser() as chromium, running(watch):
     page = chromium.new_page(viewport={"width": 640, "height": 480})
     complaints: list[str] = []
@@ -222,6 +223,15 @@ def test_page(watch: Watch) -> None:
     eventually(page, lambda: session.paused)
     page.locator("body").press("Space")
     eventually(page, lambda: not session.paused)
+
+    speed = page.get_by_role("slider").nth(3)
+    speed.press("Home")
+    eventually(page, lambda: session.speed == 0.05)
+    speed.press("End")
+    pushes: list[float] = []
+    monkeypatch.setattr(Player, "push", lambda player, by: pushes.append(by))
+    page.get_by_role("button", name="Push (P)").click(timeout=_WAIT)
+    eventually(page, lambda: pushes == [0.5])
     assert complaints == []
 
 
