@@ -129,7 +129,15 @@ class SlurmLauncher:
       self._executor.update_parameters(**slurm_parameters(self._config, job))
     folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
     task = SlurmJob(folder.path.absolute(), self._command, self._config.timeout, self._config.grace)
-    submitted = self._executor.submit(task)
+    try:
+      submitted = self._executor.submit(task)
+    except submitit.core.utils.FailedJobError as error:
+      folder.write(status="queued", attempt=folder.record.get("attempt", 0))
+      why = str(error).strip().splitlines()[-1].removeprefix("sbatch: ")
+      raise HardwareError(
+        f"launcher=slurm: sbatch refused job {job.name} ({why}); what was submitted before goes on, and so does the "
+        "same command once that is mended."
+      ) from None
     (folder.path / "slurm_id").write_text(submitted.job_id)
     self.submitted[job.name] = submitted
     self._queue.forget()

@@ -93,3 +93,16 @@ def test_without_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(sweep, "launcher=slurm", "launcher.wait=false", "launcher.max_parallel=3")
   with pytest.raises(ConfigError, match=r"launcher\.minutes=1 leaves no time to train: .* save 90 s"):
     run(sweep, "launcher=slurm", "launcher.minutes=1")
+
+
+def test_what_sbatch_refuses_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  for name in ("sbatch", "srun"):
+    (tmp_path / name).write_text(
+      "#!/bin/sh\necho sbatch: error: a word >&2\necho sbatch: error: No such partition >&2\nexit 1\n"
+    )
+    (tmp_path / name).chmod(0o755)
+  monkeypatch.setenv("PATH", str(tmp_path))
+  sweep = make_sweep(tmp_path / "sweep", 0, needs=0)
+  with pytest.raises(HardwareError, match=r"sbatch refused job 000_seed=0 \(error: No such partition\)"):
+    run(sweep, "launcher=slurm")
+  assert statuses(sweep) == {0: "queued"}

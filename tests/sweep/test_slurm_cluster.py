@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from playground.errors import HardwareError
 from playground.sweep.folder import SweepDirectory
 from tests.sweep.helpers import controller, make_sweep, output, run, starts, statuses, wait_for
 from tests.sweep.slurm_cluster import CPUS, SlurmCluster, slurm_cluster
@@ -155,3 +156,10 @@ def test_training_goes_on_where_it_was_displaced(tmp_path: Path, cluster: SlurmC
   assert list(table[["status", "steps", "attempts"]].iloc[0]) == ["finished", STEPS, 2]
   assert restarts(cluster, ids(sweep)[0]) == 1
   assert "Resuming the whole training state" in sweep.folder(sweep.jobs[0]).log.read_text()
+
+
+def test_what_slurm_refuses(tmp_path: Path, cluster: SlurmCluster) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  with pytest.raises(HardwareError, match=r"sbatch refused job 000_seed=0 \(.*Invalid partition name specified"):
+    run(sweep, *SHARED, "launcher.partition=none")
+  assert statuses(sweep) == {0: "queued"}
