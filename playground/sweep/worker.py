@@ -131,7 +131,7 @@ class Worker:
       return "timeout", f"took longer than launcher.timeout={self._timeout:g} s"
     if why == "stopped" or run.get("status") == "preempted":
       killed = code == -signal.SIGKILL
-      return "preempted", "killed before it could save" if killed else "stopped; resumes from its checkpoint"
+      return "preempted", "killed before it could save" if killed else "stopped; goes on when it is started again"
     if code < 0:
       name = signal.Signals(-code).name
       return "killed", f"killed by {name}{', perhaps for want of memory' if code == -signal.SIGKILL else ''}"

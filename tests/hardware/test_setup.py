@@ -24,6 +24,10 @@ for config in (SMALL_PPO, SMALL_SAC):
   learner = point_learner(config, num_devices=2)
   state = learner.init(jax.random.PRNGKey(0), {})
   state, metrics = learner.train(state, {}, np.int32(30))
+  alone = point_learner(config)
+  _, its = alone.train(alone.init(jax.random.PRNGKey(0), {}), {}, np.int32(30))
+  ratio = float(metrics["grad_norm"]) / float(its["grad_norm"])
+  assert 0.7 < ratio < 1.4, f"gradients are averaged, not added: {ratio}"
   for leaf in jax.tree.leaves((state.params, state.opt_state, state.normalizer)):
     ours, theirs = (np.asarray(shard.data) for shard in leaf.addressable_shards)
     np.testing.assert_array_equal(ours, theirs)

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -86,7 +87,7 @@ def test_checkpoints_go_on_on_another_topology(tmp_path: Path) -> None:
 
 
 def test_two_processes_are_one_training(tmp_path: Path) -> None:
-  """On the loopback, one device each: the same parameters everywhere, one run directory, and it resumes."""
+  """On the loopback, one device each: the same parameters everywhere, one run directory, one process's return curve."""
   with socket.socket() as free:
     free.bind(("localhost", 0))
     port = free.getsockname()[1]
@@ -104,6 +105,14 @@ def test_two_processes_are_one_training(tmp_path: Path) -> None:
   assert (summary["status"], summary["steps"], summary["params_sha256"]) == ("finished", 1600, ours)
   assert [path.name for path in tmp_path.iterdir()] == ["run"]
   assert "finished" not in second and "metrics" not in second, "only process 0 reports"
+
+  alone = start(script, tmp_path, "hardware=cpu", "hardware.devices=2", "run_dir=alone", devices=2)
+  out, _ = alone.communicate(timeout=800)
+  assert alone.returncode == 0, out[-3000:]
+  tables = [pd.read_csv(tmp_path / run / "metrics.csv") for run in ("run", "alone")]
+  curve, its = (table["eval/episode_reward"].dropna().to_numpy() for table in tables)
+  assert its[-1] > its[0] + 1, "it learns"
+  np.testing.assert_allclose(curve, its, atol=0.01)
 
 
 # What cannot be
