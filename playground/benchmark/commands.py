@@ -314,7 +314,7 @@ class BesidePeer(OfTasks):
     super().check()
     if self.agent not in self.agents:
       raise ConfigError(f"agent={self.agent}: {self.name} is of {' or '.join(self.agents)}.")
-    check_peer(self.peer, self.peer_python, self.peer_path)
+    check_peer(self.peer, self.peer_python, self.peer_path, self.peer_menagerie)
 
   def peer_job(self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: Any) -> Job:
     """A job of the peer; overrides are of our run and do not reach it."""

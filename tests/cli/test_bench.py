@@ -39,6 +39,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     (["compare", "tasks=CheetahRun", "peer_python=no_such_python"], "cannot be run"),
     (["compare", "tasks=CheetahRun", f"peer_python={sys.executable}"], "playground 0.2.0 is not installed"),
     (["compare", "tasks=CheetahRun", "agent=sac"], "compare is of ppo"),
+    (["learning", "tasks=CheetahRun", "peer_menagerie=no_such_folder"], "holds no robot models"),
     (["report", "rows=no_such_folder"], "no measured row"),
   ],
 )

@@ -23,15 +23,23 @@ class Peer(NamedTuple):
 PEERS = {"playground020": Peer(Path(__file__).parent / "playground020.py", "playground", "0.2.0")}
 
 
-def check_peer(peer: str, python: str, path: str) -> None:
-  """Asks the peer's interpreter for the package.
+def check_peer(peer: str, python: str, path: str, menagerie: str) -> None:
+  """Asks the peer's interpreter for the package, and looks for its robots.
+
+  Args:
+    peer: one of `PEERS`.
+    python: interpreter of the environment that it is installed in.
+    path: PYTHONPATH of that interpreter.
+    menagerie: folder of robot models, one folder each; none where it fetches them itself.
 
   Raises:
     UnknownNameError: there is no such peer.
-    ConfigError: the interpreter is not there, or the package not installed for it.
+    ConfigError: the interpreter is not there, the package not installed for it, or the folder holds no robot.
   """
   if peer not in PEERS:
     raise UnknownNameError(f"peer={peer} does not exist: choose from {', '.join(PEERS)}.{nearest(peer, PEERS)}")
+  if menagerie and not any(Path(menagerie).glob("*/*.xml")):
+    raise ConfigError(f"peer_menagerie={menagerie} holds no robot models: name the folder of unitree_go1 and others.")
   _, distribution, version = PEERS[peer]
   ask = f"import importlib.metadata as m; print(m.version({distribution!r}))"
   env = {**os.environ, "PYTHONPATH": path}
