@@ -70,6 +70,8 @@ def join(config: Any) -> None:
       "hardware.distributed.coordinator=<host:port>, num_processes and process_id."
     )
   timeout = config.distributed.timeout
+  if explicit:
+    _check(**given)
   if explicit and given["process_id"] > 0:
     _reach(given["coordinator"], timeout)
   # Its handler of SIGTERM would replace ours, which saves.
@@ -81,9 +83,9 @@ def join(config: Any) -> None:
   arguments = {"coordinator_address": given["coordinator"]} | {key: given[key] for key in keys[1:]}
   _within(
     lambda: jax.distributed.initialize(
-      **arguments, local_device_ids=_local_device_ids(), initialization_timeout=round(timeout)
+      **arguments, local_device_ids=_local_device_ids(), initialization_timeout=round(timeout) + 60
     ),
-    timeout + 10,
+    timeout,  # JAX's own is later: it aborts the process
     f"not all of {where} came within hardware.distributed.timeout={timeout:g} s",
   )
 
@@ -126,7 +128,8 @@ def leaving_at_once() -> Iterator[None]:
   try:
     yield
   except BaseException as error:
-    if not (jax.distributed.is_initialized() and several()):
+    waiting = any(thread.name == PREFLIGHT for thread in threading.enumerate())  # the command leaves at once by itself
+    if waiting or not (jax.distributed.is_initialized() and several()):  # asking JAX while it connects aborts
       raise
     ours = isinstance(error, PlaygroundError)
     print(f"error: {error}" if ours else traceback.format_exc(), file=sys.stderr, flush=True)
@@ -157,11 +160,19 @@ def _within(call: Callable[[], Any], seconds: float, otherwise: str) -> Any:
   raise HardwareError(f"hardware=multi_node: {otherwise if late else said}.") from result
 
 
+def _check(coordinator: str, num_processes: int, process_id: int) -> None:
+  host, _, port = str(coordinator).rpartition(":")
+  if not host or not port.isdigit():
+    raise ConfigError(f"hardware.distributed.coordinator={coordinator} must be <host>:<port>.")
+  if not 0 <= process_id < num_processes:
+    raise ConfigError(
+      f"hardware.distributed.process_id={process_id} must be from 0 to {num_processes - 1} (num_processes - 1)."
+    )
+
+
 def _reach(address: str, timeout: float) -> None:
   """Waits until process 0 listens."""
   host, _, port = address.rpartition(":")
-  if not host or not port.isdigit():
-    raise ConfigError(f"hardware.distributed.coordinator={address} must be <host>:<port>.")
   until, why = time.monotonic() + timeout, ""
   while time.monotonic() < until:
     try:

@@ -122,12 +122,18 @@ def hardware(*overrides: str) -> Any:
   return compose(["env=CartpoleBalance", *overrides]).hardware
 
 
+THREE_KEYS = ("hardware=multi_node", "hardware.distributed.coordinator=localhost:1")
+THREE_KEYS += ("hardware.distributed.num_processes=2", "hardware.distributed.process_id=0")
+
+
 @pytest.mark.parametrize(
   ("overrides", "words"),
   {
     ("hardware=multi_node",): ["finds no cluster here", "hardware.distributed.coordinator=<host:port>"],
     ("hardware=multi_node", "hardware.distributed.process_id=1"): ["hardware.distributed.coordinator is missing"],
     ("hardware.distributed.process_id=1",): ["hardware.distributed.process_id needs hardware=multi_node."],
+    (*THREE_KEYS, "hardware.distributed.coordinator=here"): ["coordinator=here must be <host>:<port>."],
+    (*THREE_KEYS, "hardware.distributed.process_id=2"): ["process_id=2 must be from 0 to 1"],
   }.items(),
 )
 def test_too_little_is_said_of_the_others(
@@ -149,6 +155,26 @@ def test_a_coordinator_that_is_not_there() -> None:
       distributed.join(hardware("hardware=multi_node", *(f"hardware.distributed.{k}={v}" for k, v in keys.items())))
   assert f"coordinator={address} could not be reached" in str(caught.value)
   assert "Connection refused" in str(caught.value)
+
+
+def test_others_that_do_not_come(tmp_path: Path) -> None:
+  """To process 0, which alone waits for them in JAX: that would abort it."""
+  with socket.socket() as free:
+    free.bind(("localhost", 0))
+    keys = {"coordinator": f"localhost:{free.getsockname()[1]}", "num_processes": 2, "process_id": 0, "timeout": 2}
+  line = [
+    *LINE,
+    "hardware=multi_node",
+    "hardware.platform=cpu",
+    *(f"hardware.distributed.{k}={v}" for k, v in keys.items()),
+  ]
+  script = "from playground.cli.run import main; main()"
+  process = start(script, tmp_path, line=line)
+  out, _ = process.communicate(timeout=200)
+  assert process.returncode == 2, out[-2000:]
+  said = out.strip().splitlines()[-1]
+  assert said.startswith("error: hardware=multi_node: not all of 2 processes at localhost:")
+  assert said.endswith("came within hardware.distributed.timeout=2 s.")
 
 
 def test_an_exchange_that_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
