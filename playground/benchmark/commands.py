@@ -227,11 +227,8 @@ class Pixels(OfTasks):
           seen = [f"env.vision.width={size}", f"env.vision.height={size}"]
           setting = [*conditions, *seen, *self.with_envs(task, count)]
           last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, *setting, "part=update"))}
-          jobs.append(
-            dataclasses.replace(
-              self.on_one_device(self.job("breakdown", task, setting, watch_memory=self.workers == 1)), last=last
-            )
-          )
+          job = self.job("breakdown", task, setting, watch_memory=self.workers == 1)
+          jobs.append(dataclasses.replace(self.on_one_device(job), last=last))
     return jobs
 
 

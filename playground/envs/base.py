@@ -11,6 +11,7 @@ import mujoco
 from flax import struct
 
 from playground.envs.physics import DERIVED_FIELDS, Physics, PhysicsData, mjx
+from playground.envs.warp_kernels import quiet_warp
 from playground.errors import ConfigError
 
 Observation = jax.Array | dict[str, jax.Array]
@@ -178,15 +179,11 @@ def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
   if impl == "warp":
     instead = "leave env.vision.enable=false" if renders else "set env.impl=jax"
     try:
-      import warp  # pyright: ignore[reportMissingImports]
+      warp = quiet_warp()
     except ImportError:
       remedy = f"pip install 'mujoco-mjx[warp]', or {instead}"
       raise ConfigError(f"env.impl=warp needs MuJoCo-Warp, which is not installed: {remedy}.") from None
     backend = jax.default_backend()
-    if backend != "cpu":
-      warp.config.log_level = warp.LOG_WARNING  # asking starts it, which it would tell
-      if backend != "gpu" or not warp.is_cuda_available():
-        raise ConfigError(
-          f"env.impl=warp runs on CPUs and NVIDIA GPUs and finds none beside JAX's {backend}: {instead}."
-        )
+    if backend != "cpu" and not (backend == "gpu" and warp.is_cuda_available()):
+      raise ConfigError(f"env.impl=warp runs on CPUs and NVIDIA GPUs and finds none beside JAX's {backend}: {instead}.")
   return impl

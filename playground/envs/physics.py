@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from playground.envs.warp_kernels import Building
+from playground.envs.warp_kernels import Building, quiet_warp
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
@@ -217,9 +217,7 @@ def _put_on_warp(mj_model: mujoco.MjModel) -> mjx.Model:
   Few solver iterations are what these tasks ask for, and one line for each solve is slower than the solve. Buffers that
   are too small are in `PhysicsData.buffers`, which the trainers count.
   """
-  import warp
-
-  warp.config.log_level = warp.LOG_WARNING
+  quiet_warp()
   model = mjx.put_model(mj_model, impl="warp")
   return model.tree_replace({"opt._impl.warn_overflow": 0})  # pyright: ignore[reportReturnType]
 

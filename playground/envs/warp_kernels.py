@@ -69,6 +69,14 @@ class Building:
     self._folder.cleanup()
 
 
+def quiet_warp() -> Any:
+  """The module `warp`, without its messages on starting and on loading kernels; ImportError where there is none."""
+  import warp
+
+  warp.config.log_level = warp.LOG_WARNING
+  return warp
+
+
 def compile_all(mj_model: mujoco.MjModel, njmax: int | None, workers: int) -> None:
   """Compiles the kernels of a physics step for this process's device; it cannot launch any afterwards."""
   import warp
@@ -82,10 +90,9 @@ def compile_all(mj_model: mujoco.MjModel, njmax: int | None, workers: int) -> No
 def _launched(mj_model: mujoco.MjModel, njmax: int | None) -> list[tuple[Any, int | None]]:
   """The modules whose kernels a step launches, with the threads of a block that they are launched with."""
   import mujoco.mjx.warp.ffi  # MJX's own module
-  import warp
   from mujoco.mjx.third_party import mujoco_warp
 
-  warp.config.log_level = warp.LOG_WARNING
+  warp = quiet_warp()
   with warp.ScopedDevice("cpu"):  # as MJX does
     model = mujoco_warp.put_model(mj_model)
   model.opt.warn_overflow = 0  # as `physics` does
