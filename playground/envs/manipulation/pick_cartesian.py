@@ -33,7 +33,8 @@ class PickCubeCartesian(Pick):
   - Where the arm cannot reach, or only beyond its joints' limits, the hand's place stays as it is (0.2.0 moves it on,
     away from the hand, and knows no limits).
   - The hand that starts with the cube stays where it is (0.2.0 calls it back in the same step).
-  - The gripper's delayed actions are those of the episode (0.2.0: of the one before, too).
+  - The gripper's delayed actions are those of the episode, and before it the closing of fingers that hold the cube at
+    the start, the opening of others (0.2.0: those of the episode before).
   """
 
   def __init__(self, config: Any, scene: str = "panda_single_cube_camera"):
@@ -80,8 +81,8 @@ class PickCubeCartesian(Pick):
     guided = first & jax.random.bernoulli(guide_key, self.config.guide_probability)
     start = {"reached_box": 0.0, "best_reward": 0.0, "last_act": jnp.zeros(3)}
     start["current_pos"] = jnp.where(guided, self._guide_tip, self._tip)
-    if not self.parity:
-      start["action_history"] = jnp.zeros_like(state.info["action_history"])
+    if not self.parity:  # the fingers were told before what they are seen to do: a late one must not let the cube fall
+      start["action_history"] = jnp.full_like(state.info["action_history"], jnp.where(guided, -1.0, 0.0))
     state = begin_anew(state, **start)
     delay = delays.draw_delay(delay_key, (0, self.config.gripper_delay))
     qpos = jnp.where(guided, self._guide_qpos, state.data.qpos)

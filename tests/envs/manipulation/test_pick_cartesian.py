@@ -154,3 +154,12 @@ def test_some_episodes_begin_with_the_cube_in_the_hand(mode: dict[str, Any], sta
   there, start = forward_kinematics(jnp.array(picked.ctrl[:7]))[0], (0.66105318, -0.00051778, 0.17906836)
   next_tip = forward_kinematics(env.control(fresh, jnp.array([0.0, 0, -1]))[:7])[0]
   np.testing.assert_allclose(next_tip, start if mode else there, atol=1e-5)  # 0.2.0 calls the hand back
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_late_fingers_hold_the_cube_that_they_begin_with(delay: int, state: State) -> None:
+  env = prepared(gripper_delay=2, guide_probability=1.0)
+  info = state.info | {"action_history": jnp.ones(3), "action_delay": jnp.array(0)}
+  fresh = env.disturb(state.replace(data=state.data.replace(time=jnp.array(0.0)), info=info))
+  late = fresh.replace(info=fresh.info | {"action_delay": jnp.array(delay)})
+  assert env.control(late, jnp.array([0.0, 0, -1]))[7] == 0
