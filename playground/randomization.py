@@ -85,6 +85,7 @@ class Term:
     distribution: `uniform`, `log_uniform` or `normal`; of a switch `bernoulli`.
     column: column, or columns, of a two-dimensional field; None is all.
     shared: one draw for all entries, instead of one for each.
+    axis: of `rotate`, ranges of the axis's x, y and z before it has length 1; None is any direction alike.
   """
 
   field: str
@@ -96,6 +97,7 @@ class Term:
   distribution: str = "uniform"
   column: int | Sequence[int] | None = None
   shared: bool = False
+  axis: Sequence[Sequence[float]] | None = None
 
   @property
   def parameters(self) -> tuple[float, float]:
@@ -148,7 +150,20 @@ class Term:
       raise ConfigError(f"{key}.range={list(values)} has its low end above its high end.")
     if parsed.distribution == "log_uniform" and values[0] <= 0:
       raise ConfigError(f"{key}.range={list(values)} must be above 0 for log_uniform.")
+    parsed._check_axis(key)
     return parsed
+
+  def _check_axis(self, key: str) -> None:
+    if self.axis is None:
+      return
+    if self.operation != "rotate":
+      raise ConfigError(f"{key}: operation {self.operation!r} has no key 'axis'.")
+    pairs = isinstance(self.axis, list | tuple) and len(self.axis) == 3
+    pairs = pairs and all(
+      _is_list_of(pair, int | float) and len(pair) == 2 and pair[0] <= pair[1] for pair in self.axis
+    )
+    if not pairs or not any(any(pair) for pair in self.axis):
+      raise ConfigError(f"{key}.axis={self.axis!r} is not three pairs [low, high], of x, y and z, not all 0.")
 
 
 class _Slot(NamedTuple):
@@ -174,7 +189,12 @@ class _Draw(NamedTuple):
     # One flat draw, a scalar if single: the order and shapes of Playground 0.2.0, so that the numbers are the same.
     if self.term.operation == "rotate":
       key, axis_key = jax.random.split(key)
-      axes = jax.random.normal(axis_key, (*(() if self.term.shared else self.shape), 3))
+      shape = (*(() if self.term.shared else self.shape), 3)
+      if self.term.axis is None:
+        axes = jax.random.normal(axis_key, shape)
+      else:
+        low, high = jnp.array(self.term.axis, jnp.float32).T
+        axes = jax.random.uniform(axis_key, shape, minval=low, maxval=high)
     scalar = self.count == 1
     draw = _DISTRIBUTIONS[self.term.distribution](key, () if scalar else (self.count,), *self.term.parameters)
     draw = draw if scalar else draw.reshape(self.shape)

@@ -49,6 +49,29 @@ def test_turns_keep_lengths_and_stay_within_their_angle(model: mujoco.MjModel, b
     assert (np.std(turned - nominal, axis=0) > 0.005).all()  # about axes of all directions
 
 
+def test_the_start_of_the_hand_stays_in_sight(model: mujoco.MjModel, batch: dict[str, np.ndarray]) -> None:
+  half = np.tan(np.deg2rad(model.cam_fovy[0] / 2))
+  for quat, position in zip(batch["cam_quat"][:, 0], batch["cam_pos"][:, 0], strict=True):
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, quat)
+    right, up, back = frame.reshape(3, 3).T @ (np.array([0.661, 0, 0.179]) - position)  # of its tip
+    assert abs(right) < -back * half and abs(up) < -back * half
+
+
+def test_an_axis_may_be_narrowed(model: mujoco.MjModel) -> None:
+  term = {
+    "field": "light_dir",
+    "target": "top",
+    "operation": "rotate",
+    "range": [0.3, 0.3],
+    "axis": [[0, 0], [1, 2], [0, 0]],
+  }
+  turned = Randomizer(model, [term]).sample(jax.random.PRNGKey(0))["light_dir"][0]
+  x, y, z = model.light_dir[0]
+  c, s = np.cos(0.3), np.sin(0.3)
+  np.testing.assert_allclose(turned, [c * x + s * z, y, c * z - s * x], atol=1e-6)
+
+
 def test_shadows_are_switched(batch: dict[str, np.ndarray]) -> None:
   shadows = batch["light_castshadow"]
   assert shadows.dtype == bool and 0.5 < shadows.mean() < 0.95
@@ -61,6 +84,11 @@ def test_shadows_are_switched(batch: dict[str, np.ndarray]) -> None:
     ({"field": "light_diffuse", "distribution": "bernoulli", "mean": 0.5}, "'light_diffuse' is no switch"),
     ({"field": "light_castshadow", "distribution": "bernoulli", "mean": 1.5}, "mean=1.5 is no probability"),
     ({"field": "cam_fovy", "target": "front", "operation": "rotate", "range": [0, 1]}, "directions or quaternions"),
+    ({"field": "light_dir", "range": [0, 1], "axis": [[0, 1]] * 3}, "operation 'set' has no key 'axis'"),
+    *(
+      ({"field": "light_dir", "operation": "rotate", "range": [0, 1], "axis": axis}, "not three pairs")
+      for axis in ([[0, 1]] * 2, [[0, 1], [1, 0], [0, 1]], [[0, 0]] * 3, 1, [0, 1, 0])
+    ),
   ],
 )
 def test_what_does_not_go_together(model: mujoco.MjModel, term: dict[str, Any], message: str) -> None:
