@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
+from playground import registry
 from playground.config import compose
 from playground.errors import UnknownNameError
 from playground.randomization import Randomizer
@@ -177,3 +178,10 @@ def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   assert "full float32, TF32 ruins some contact-rich tasks" in page  # beside a key, in configs/hardware/auto.yaml
   page = (tmp_path / "site/reference/api/parts-of-tasks.html").read_text(encoding="utf-8")
   assert 'id="playground.mdp.tolerance.tolerance"' in page
+
+
+def test_the_gallery_shows_every_task() -> None:
+  text = (DOCS / "gallery.md").read_text()
+  for task in registry.ALL_ENVS:
+    assert text.count(f"](gallery/{task}.webp)") == 1 and f"**{task}**" in text, task
+    assert (DOCS / "gallery" / f"{task}.webp").is_file()

@@ -30,7 +30,7 @@ OURS: dict[str, dict[str, Any]] = {
   "ppo": {"num_resets_per_eval": 10},  # the default of the script that the paper was run with
 }
 # Sets that are no task's own.
-FOR_ANY_TASK = ("sparse_reward",)
+FOR_ANY_TASK = ("sparse_reward", "bounded_gradients")
 # What a source lists and nobody can have used: Brax's SAC has no such argument and refuses it.
 UNUSABLE = {"sac": ("num_resets_per_eval",), "sac_v020": ("num_resets_per_eval",)}
 
@@ -159,3 +159,9 @@ def test_a_tuned_set_belongs_to_an_agent_and_a_task(option: str):
   assert agent in options("agent")
   listed = {name for source in SOURCES for name in rows(source)}  # some are yet to come
   assert task in {*registry.names(), *listed, *FOR_ANY_TASK}
+
+
+def test_the_cheetahs_experiment_limits_gradients_and_the_task_alone_has_the_papers_set():
+  limits = [compose([choice]).agent.max_grad_norm for choice in ("experiment=cheetah_run", "env=CheetahRun")]
+  assert limits == [1.0, None]
+  assert compose(["experiment=cheetah_run", "agent=sac"]).choices["tuned"] == "sac/CheetahRun"
