@@ -92,8 +92,8 @@ _POOLS: dict[str, Callable[[Chain, list[int]], None]] = {
 def _normalize_channels(graph: Chain) -> None:
   """Each channel to mean 0 and deviation 1.
 
-  Step by step, and its means of the means of rows: ONNX Runtime's InstanceNormalization subtracts the mean last, and sums of
-  a whole picture lose digits, both too many for a policy of steep actions.
+  Step by step, and by the means of rows' means: ONNX Runtime's InstanceNormalization subtracts the mean last, and sums
+  of a whole picture lose digits, both too many for a policy of steep actions.
   """
   x = graph.value
   _mean_of_picture(graph)
