@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,7 @@ class Evidence:
       self.rows += rows
       self.curves |= curves
       self.files += [path] * bool(rows or curves)
+    self.rows = _once(self.rows)
 
   def find(self, **wanted: str) -> list[Figure]:
     """Figures of the rows with these columns, a GPU's before a CPU's, then the newest, then the largest."""
@@ -73,6 +75,29 @@ class Evidence:
 
 
 SAME = ("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "devices", "device", "commit")
+
+
+def _once(rows: Sequence[Row]) -> list[Row]:
+  """The rows, without the final return of a run that another file has, too: the schema's stays, else the first.
+
+  Every file has its own words for a run; it is the same one where task, side, steps/s and return agree up to rounding.
+  """
+  of_run = lambda row: tuple(row.get(name) for name in (*SAME, "source", "seed", "apart") if name != "quantity")
+  rates = {of_run(row): row["value"] for row in rows if row["quantity"] == "training_steps_per_s"}
+  told: list[tuple[Row, float]] = []
+  repeated: set[int] = set()
+  for row in sorted((row for row in rows if row["quantity"] == "final_return"), key=lambda row: "apart" in row):
+    rate = rates.get(of_run(row), math.nan)  # which is close to none
+    if any(_alike(row, other) and math.isclose(rate, its, rel_tol=1e-4) for other, its in told):
+      repeated.add(id(row))
+    told.append((row, rate))
+  return [row for row in rows if id(row) not in repeated]
+
+
+def _alike(row: Row, other: Row) -> bool:
+  """Whether two final returns may be one that two files have."""
+  same = row["task"] == other["task"] and (row["who"] == "ours") == (other["who"] == "ours")
+  return same and row["source"] != other["source"] and abs(row["value"] - other["value"]) < 0.06
 
 
 def _before(date: str) -> list[int]:
@@ -114,7 +139,7 @@ def _row(path: Path, line: dict[str, str], quantity: str, value: float) -> Row:
     "devices": "1",
     "conditions": "; ".join(part for part in (note, row["conditions"]) if part),
     "call": call,
-    "apart": call + note,  # what sets runs apart that agree in all else
+    "apart": call or note,  # what sets runs apart that agree in all else
   }
   return row
 
