@@ -10,7 +10,7 @@ from rich.table import Table
 from playground.benchmark.suites import paper_table
 from playground.errors import ConfigError
 from playground.learning.evaluation import make_evaluator
-from playground.rendering.video import need_place, render_video
+from playground.rendering.video import need_camera, need_place, render_video
 from playground.rendering.visuals import drawn_model
 from playground.runs.files import write_json
 from playground.runs.job import episodes_of
@@ -25,6 +25,7 @@ def evaluate_run(
   seed: int = 0,
   deterministic: bool = False,
   video: str | None = None,
+  camera: str | None = None,
   console: Console | None = None,
 ) -> int:
   """Evaluates a run's newest checkpoint, or the one given, prints the scores and writes them beside the run.
@@ -35,23 +36,24 @@ def evaluate_run(
     seed: of the evaluation.
     deterministic: whether the policy acts with its mode instead of sampling (the run's own setting if False).
     video: where to render the first episode to (.mp4).
+    camera: the video's, see `render_video`.
     console: for the output.
 
   Returns:
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run or checkpoint, or one that does not fit.
+    PlaygroundError: no such run or checkpoint, or one that does not fit, or no such camera.
   """
   console = console or Console()
-  if video:
-    need_place(video)
+  need_place(video, camera)
   trained = load_trained(path)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
   count = run.agent.num_eval_envs if episodes is None else episodes
   if count < 1:
     raise ConfigError(f"--episodes={count} must be above 0.")
   drawn = drawn_model(env, run.video.visuals)
+  need_camera(drawn, camera, "--camera")
   _, model = randomized_models(env, run, 1, count)
   act = lambda policy, obs, key: trained.learner.act(policy, obs, key, deterministic or None)
   evaluate = make_evaluator(env, act, count, hardware.mesh, 1 if video else 0)
@@ -74,8 +76,14 @@ def evaluate_run(
   write_json(out, report)
   console.print(f"written to {out}", soft_wrap=True)
   if video:
-    tape = episodes_of(recording, 1)
-    render_video(drawn, out_path=Path(video), dt=env.dt * env.action_repeat, notify=console.print, **tape)
+    render_video(
+      drawn,
+      out_path=Path(video),
+      dt=env.dt * env.action_repeat,
+      camera=camera,
+      notify=console.print,
+      **episodes_of(recording, 1),
+    )
   return 0
 
 

@@ -67,6 +67,7 @@ def _parser() -> argparse.ArgumentParser:
   evaluate.add_argument("--seed", type=int, default=0)
   evaluate.add_argument("--deterministic", action="store_true", help="act on the distribution's mode")
   evaluate.add_argument("--video", metavar="FILE", help="also render an episode")
+  evaluate.add_argument("--camera", metavar="NAME", help="of --video: one of the model's; by default one that looks on")
   export = add("export", _export, "Write a run's policy as ONNX, with the contract that a controller needs.")
   export.add_argument("run", help="run directory or checkpoint")
   export.add_argument("--out", metavar="FOLDER", help="by default export/ in the run's")
@@ -78,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
   shown.add_argument("--video", metavar="FILE", help="also render an episode")
   shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
   shown.add_argument("--web", action="store_true", help="show it in the browser instead")
+  play.add_argument("--camera", metavar="NAME", help="of --video: one of the model's; by default one that looks on")
   play.add_argument("--host", default="127.0.0.1", help="of --web: the address to listen on; by default this machine's")
   play.add_argument("--port", type=int, default=8080, help="of --web")
   sweep = add("sweep", _sweep, "Look at a sweep, gather its result, or do what is missing of it.")
@@ -114,7 +116,12 @@ def _eval(args: argparse.Namespace) -> int:
   from playground.cli.eval import evaluate_run
 
   return evaluate_run(
-    args.run, episodes=args.episodes, seed=args.seed, deterministic=args.deterministic, video=args.video
+    args.run,
+    episodes=args.episodes,
+    seed=args.seed,
+    deterministic=args.deterministic,
+    video=args.video,
+    camera=args.camera,
   )
 
 
@@ -132,6 +139,7 @@ def _play(args: argparse.Namespace) -> int:
     episodes=args.episodes,
     seed=args.seed,
     video=args.video,
+    camera=args.camera,
     viewer=args.viewer,
     web=args.web,
     host=args.host,

@@ -20,7 +20,7 @@ from playground.extras import need
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
-from playground.rendering.video import need_place, render_video
+from playground.rendering.video import need_camera, need_place, render_video
 from playground.runs.files import need_folder, write_json
 from playground.runs.job import episodes_of
 from playground.runs.trained import Trained
@@ -34,6 +34,7 @@ def play(
   episodes: int = 10,
   seed: int = 0,
   video: str | None = None,
+  camera: str | None = None,
   viewer: bool = False,
   web: bool = False,
   host: str = "127.0.0.1",
@@ -47,6 +48,7 @@ def play(
     episodes: how many to measure.
     seed: of the episodes.
     video: where to render the first episode to (.mp4).
+    camera: the video's, see `render_video`.
     viewer: whether to show the policy in MuJoCo's viewer instead of measuring it.
     web: whether to show it in the browser instead.
     host: the address that the browser's page is served at.
@@ -57,16 +59,15 @@ def play(
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run or policy, no display for the viewer, no port for the browser, or no folder that can be
-      written to.
+    PlaygroundError: no such run, policy or camera, no display for the viewer, no port for the browser, or no folder
+      that can be written to.
   """
   console = console or Console()
   if episodes < 1:
     raise ConfigError(f"--episodes={episodes} must be above 0.")
   if seed < 0:
     raise ConfigError(f"--seed={seed} must not be negative.")
-  if video:
-    need_place(video)
+  need_place(video, camera)
   if viewer:
     from playground.deploy.viewer import need_display
 
@@ -78,6 +79,7 @@ def play(
     need_port(host, port)
   opened = open_policy(path)
   exported, env = opened.exported, opened.env
+  need_camera(env.mj_model, camera, "--camera")
   if viewer:
     from playground.deploy.viewer import view
 
@@ -101,8 +103,14 @@ def play(
   write_json(out, {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "scores": scores, "origin": origin})
   console.print(f"written to {out}", soft_wrap=True)
   if video:
-    tape = episodes_of(recording, 1)
-    render_video(env.mj_model, out_path=Path(video), dt=env.dt * env.action_repeat, notify=console.print, **tape)
+    render_video(
+      env.mj_model,
+      out_path=Path(video),
+      dt=env.dt * env.action_repeat,
+      camera=camera,
+      notify=console.print,
+      **episodes_of(recording, 1),
+    )
   return 0
 
 

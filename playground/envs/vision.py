@@ -10,7 +10,8 @@ from playground.envs.base import PIXELS, Env, State
 from playground.envs.physics import PhysicsData, mjx
 from playground.envs.wrappers import Wrapper
 from playground.errors import ConfigError, nearest
-from playground.rendering.batch import BatchRenderer, View, camera_names
+from playground.rendering.batch import BatchRenderer, View
+from playground.rendering.video import camera_names
 
 _CHANNELS = {"rgb": 3, "gray": 1, "depth": 1, "segmentation": 1}
 _MAX_GEOMS = 255  # that a byte tells apart, beside nothing

@@ -12,10 +12,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from playground.envs.physics import Physics, PhysicsData, mjx
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.rendering.video import camera_names
 
 Pictures = dict[str, jax.Array]
 _KINDS = ("rgb", "depth", "segmentation")
@@ -167,11 +167,6 @@ class BatchRenderer:
         enabled_geom_groups=list(view.geom_groups),
       )
     return self._contexts[key]
-
-
-def camera_names(mj_model: mujoco.MjModel) -> list[str]:
-  """Names of the model's cameras."""
-  return [name for i in range(mj_model.ncam) if (name := mj_model.camera(i).name)]
 
 
 def _bytes(packed: jax.Array) -> jax.Array:

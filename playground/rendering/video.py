@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from playground.errors import ConfigError, PlaygroundError, nearest
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
 from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
 from playground.runs.files import need_folder, replacing
 
 MAX_FPS = 50.0
-_CAMERAS = ("track", "tracking", "fixed", "side", "front", "back", "cam0")
+# Names of cameras that look on from where a task is seen best; the swimmer's is tracking1.
+_CAMERAS = ("track", "tracking", "tracking1", "fixed", "side", "front", "back", "cam0")
 
 
 def save_trajectory(
@@ -128,11 +129,27 @@ def render_video(
   return None
 
 
-def need_place(out_path: str) -> None:
-  """Raises ConfigError if `--video` names what cannot be written, before there is anything to render."""
+def need_place(out_path: str | None, camera: str | None = None) -> None:
+  """Raises ConfigError if `--video` names what cannot be written, or only `--camera` is given, before all else."""
+  if out_path is None:
+    if camera is not None:
+      raise ConfigError(f"--camera={camera} is of the video that --video=<file> asks for.")
+    return
   if Path(out_path).suffix != ".mp4" or Path(out_path).is_dir():
     raise ConfigError(f"--video={out_path} must be a file that ends in .mp4.")
   need_folder(Path(out_path).parent, f"--video={out_path}")
+
+
+def need_camera(model: Any, name: str | None, option: str) -> None:
+  """Raises UnknownNameError, which names the option that it is of, for a camera that the model has not; None is any."""
+  if name is not None and name not in (names := camera_names(model)):
+    have = ", ".join(names) or "none"
+    raise UnknownNameError(f"{option}={name} is no camera of the model; it has {have}.{nearest(name, names)}")
+
+
+def camera_names(model: Any) -> list[str]:
+  """Names of the model's cameras."""
+  return [name for i in range(model.ncam) if (name := model.camera(i).name)]
 
 
 def frame_stride(dt: float) -> int:
@@ -196,9 +213,8 @@ def choose_camera(model: Any, name: str | None = None) -> Any:
   """Returns the named camera, or the best one the model offers for looking at it from outside."""
   import mujoco
 
-  names = [model.camera(i).name for i in range(model.ncam)]
-  if name is not None and name not in names:
-    raise PlaygroundError(f"the model has no camera {name!r}, only {', '.join(names) or 'none'}.{nearest(name, names)}")
+  need_camera(model, name, "camera")
+  names = camera_names(model)
   chosen = name or next((known for known in _CAMERAS if known in names), None)
   if chosen:
     return chosen

@@ -12,7 +12,7 @@ from playground.envs.base import PIXELS, Env, newest_picture
 from playground.envs.wrappers import Vectorize
 from playground.errors import ConfigError
 from playground.randomization import Randomizer
-from playground.rendering.batch import camera_names
+from playground.rendering.video import camera_names
 
 _GAP = 2  # pixels between two views
 

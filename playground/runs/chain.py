@@ -20,6 +20,7 @@ from playground.hardware.setup import setup
 from playground.learning.algorithms import make_learner
 from playground.learning.checkpoints import Checkpoint, describe, find_checkpoints
 from playground.randomization import Randomizer
+from playground.rendering.video import need_camera
 from playground.runs.chain_result import write_result
 from playground.runs.interrupts import Interrupts, exit_code
 from playground.runs.provenance import process_age_s
@@ -92,6 +93,7 @@ def _check(config: "RunConfig") -> None:
   for stage, name in zip(config.stages, stage_folders(config.resolved["curriculum"]), strict=True):
     with in_stage(name):
       env = registry.load(stage.choices["env"], config=stage.env)
+      need_camera(env.mj_model, stage.video.camera, "video.camera")
       Randomizer(env.mj_model, stage.randomization.terms)
       learner = make_learner(env, stage.agent, hardware.mesh, hardware.network_precision)
       learner.notices()  # raises for a replay buffer that the device cannot hold

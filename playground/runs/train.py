@@ -20,6 +20,7 @@ from playground.learning.evaluation import make_evaluator
 from playground.learning.learner import Learner
 from playground.learning.loop import Loop, Mark, compile_program, longest_stretch, schedule
 from playground.randomization import Randomizer
+from playground.rendering.video import need_camera
 from playground.rendering.visuals import drawn_model
 from playground.runs.chain import train_chain
 from playground.runs.follower import Follower
@@ -71,6 +72,7 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
   agent.check(hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
+  need_camera(drawn, config.video.camera, "video.camera")
   model, eval_model = divide(randomized_models(env, config, agent.num_envs, agent.num_eval_envs), hardware.mesh)
   learner = algorithm_class(env, agent, hardware.mesh, model, hardware.network_precision)
   start.notices += learner.notices()

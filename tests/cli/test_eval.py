@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -126,6 +127,24 @@ def test_a_run_of_a_larger_machine_is_evaluated_on_this_one(command: Command, tr
   (run / "config.yaml").write_text(yaml.safe_dump(config))
   assert command(str(run)) == 0
   assert report(run, 4000)["num_devices"] == 1
+
+
+def test_a_video_by_the_camera_that_is_named(
+  command: Command, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  cameras = "".join(f'<camera name="{name}"/>' for name in ("side", "front"))
+  model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{cameras}</worldbody></mujoco>")
+  monkeypatch.setattr(Point, "mj_model", model)
+  filmed: list[Any] = []
+  monkeypatch.setattr(eval_command, "render_video", lambda model, **view: filmed.append(view["camera"]))
+  video = ["--video", str(tmp_path / "a.mp4")]
+  assert command(str(trained), *video, "--camera", "front") == 0
+  assert filmed == ["front"]
+  monkeypatch.setattr(eval_command, "make_evaluator", pytest.fail)
+  capsys.readouterr()
+  assert command(str(trained), *video, "--camera", "frnt") == 2
+  sentence = "--camera=frnt is no camera of the model; it has side, front. Did you mean 'front'?"
+  assert capsys.readouterr().err == f"error: {sentence}\n"
 
 
 def test_no_episodes_are_refused(command: Command, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

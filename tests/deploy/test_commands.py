@@ -5,6 +5,7 @@ import re
 import signal
 import socket
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,6 +122,23 @@ def test_a_display_that_is_not_there(
   assert "--viewer cannot open a window on the display :4242" in capsys.readouterr().err
 
 
+def test_a_video_by_the_camera_that_is_named(
+  command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  filmed: list[Any] = []
+  monkeypatch.setattr(play, "render_video", lambda model, **view: filmed.append(view["camera"]))
+  video = ["--episodes", "1", "--video", str(tmp_path / "a.mp4")]
+  assert command("play", str(run), *video, "--camera", "lookatcart") == 0
+  assert command("play", str(run), *video) == 0
+  assert filmed == ["lookatcart", None]
+  monkeypatch.setattr(play, "make_evaluator", pytest.fail)
+  capsys.readouterr()
+  assert command("play", str(run), *video, "--camera", "lookat_cart") == 2
+  assert capsys.readouterr().err == (
+    "error: --camera=lookat_cart is no camera of the model; it has fixed, lookatcart. Did you mean 'lookatcart'?\n"
+  )
+
+
 def test_a_video_or_a_window(command: Command, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
   for shown in ("--web", "--viewer"):
     assert command("play", str(run), "--video", "a.mp4", shown) == 2
@@ -183,6 +201,7 @@ def test_one_sentence_each(
     (["play", str(tmp_path), "--seed", "-1", "--web"], "--seed=-1 must not be negative"),
     (["play", str(tmp_path), "--video", "a.gif"], "--video=a.gif must be a file that ends in .mp4"),
     (["play", str(tmp_path), "--video", str(tmp_path / "cut.yaml" / "a.mp4")], "cut.yaml is not a folder"),
+    (["play", str(tmp_path), "--camera", "fixed"], "--camera=fixed is of the video that --video=<file> asks for"),
     (["play", str(tmp_path), "--viewer"], "--viewer needs a display"),
     (["export", str(tmp_path)], "holds no checkpoint"),
     (["export", str(tmp_path), "--out", str(tmp_path / "cut.yaml")], "cut.yaml is not a folder"),

@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from playground import registry
 from playground.rendering import gl, video
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
-from playground.rendering.video import frame_stride, render_video
+from playground.rendering.video import choose_camera, frame_stride, render_video
 
 XML = """
 <mujoco>
@@ -127,6 +128,10 @@ def test_what_a_policy_sees_is_beside_it(tmp_path: Path, model: Any, needs_gl: s
   assert frame[:, :64].std() > 10
 
 
+def test_the_swimmer_is_filmed_by_a_camera_that_follows_it():
+  assert choose_camera(registry.load("SwimmerSwimmer6").mj_model) == "tracking1"
+
+
 def test_rows_after_a_nan_are_left_out(tmp_path: Path, model: Any, needs_gl: str):
   qpos = path_of_ball(model, 20)
   qpos[10:] = np.nan
@@ -137,7 +142,7 @@ def test_rows_after_a_nan_are_left_out(tmp_path: Path, model: Any, needs_gl: str
 @pytest.mark.parametrize(
   ("options", "sentence"),
   [
-    ({"camera": "fixd"}, "the model has no camera 'fixd', only fixed. Did you mean 'fixed'?"),
+    ({"camera": "fixd"}, "camera=fixd is no camera of the model; it has fixed. Did you mean 'fixed'?"),
     ({"timeout_s": 0.3}, "took longer than 0.3 s"),
   ],
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import mujoco
 import pandas as pd
 import pytest
 
@@ -287,6 +288,16 @@ def test_a_stage_that_does_not_fit_the_one_before(stage: str, message: str, conf
   (configs / "curriculum/misfit.yaml").write_text(CHAIN.replace("agent.learning_rate=0.002", f"'{stage}'"))
   with pytest.raises(ConfigError, match=message):
     train(compose([*LINE, "curriculum=misfit", f"run_dir={tmp_path / 'chain'}"], configs))
+  assert not (tmp_path / "chain").exists()
+
+
+def test_a_stage_whose_camera_is_not_there(
+  composed: Callable[..., RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><camera name="side"/></worldbody></mujoco>')
+  monkeypatch.setattr(Point, "mj_model", model)
+  with pytest.raises(ConfigError, match=r"Stage near of the chain: video\.camera=sid is no .* Did you mean 'side'\?$"):
+    train(composed("video.camera=sid", f"run_dir={tmp_path / 'chain'}"))
   assert not (tmp_path / "chain").exists()
 
 

@@ -19,6 +19,7 @@ import pytest
 from playground.config import compose
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
 from playground.learning.loop import schedule
+from playground.runs import train as train_module
 from playground.runs.run_dir import RunDirectory
 from playground.runs.start import Start
 from playground.runs.train import cut_short, train
@@ -254,6 +255,15 @@ def test_more_devices_than_there_are(tmp_path: Path, refused: Callable[..., str]
   assert "hardware.devices=99, but this machine has" in refused(
     *TASK, "hardware.devices=99", f"run_dir={tmp_path / 'run'}"
   )
+  assert not (tmp_path / "run").exists()
+
+
+def test_a_camera_that_is_not_there(
+  tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+  monkeypatch.setattr(train_module, "compile_program", pytest.fail)
+  sentence = refused(*TASK, "video.camera=fixd", f"run_dir={tmp_path / 'run'}")
+  assert "video.camera=fixd is no camera of the model; it has fixed, lookatcart. Did you mean 'fixed'?" in sentence
   assert not (tmp_path / "run").exists()
 
 
