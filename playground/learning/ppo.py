@@ -40,9 +40,7 @@ class PPOConfig:
   batch_size: int = 32  # trajectories of one minibatch
   num_minibatches: int = 16
   num_updates_per_batch: int = 2  # passes over the collected trajectories
-  learning_rate: float = 1e-4  # Adam's, at the start
-  schedule: str = "fixed"  # or adaptive: after each training step the learning rate follows `desired_kl`
-  desired_kl: float = 0.01  # of the policies before and after a training step, to within a factor of 2
+  learning_rate: float = 1e-4  # Adam's
   max_grad_norm: float | None = None  # gradients are scaled down to this global norm
   discounting: float = 0.9
   gae_lambda: float = 0.95
@@ -98,8 +96,7 @@ class PPO(Learner):
     networks = ActorCritic(env.observation_size, env.action_size, config.network, network_precision)
     super().__init__(env, config, mesh, networks, config.steps_per_update(env.action_repeat), TrainState(**SPEC))
     clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm else optax.identity()
-    adam = optax.adam if config.schedule == "fixed" else optax.inject_hyperparams(optax.adam)
-    self.optimizer = optax.chain(clip, adam(config.learning_rate))
+    self.optimizer = optax.chain(clip, optax.adam(config.learning_rate))
     self.loss = partial(
       ppo_loss,
       networks=self.networks,
@@ -176,11 +173,6 @@ class PPO(Learner):
     metrics = means | jax.lax.psum(episodes, AXIS)
     metrics["nonfinite_updates"] *= config.num_updates_per_batch * config.num_minibatches
     metrics["learned"] = jnp.ones(())
-    if config.schedule == "adaptive":
-      kl = jax.lax.pmean(log[-1, :, LOSSES.index("approx_kl")].mean(), AXIS)
-      clipping, adam = opt_state
-      rate = metrics["learning_rate"] = _adapted(adam.hyperparams["learning_rate"], kl, config.desired_kl)
-      opt_state = (clipping, adam._replace(hyperparams=adam.hyperparams | {"learning_rate": rate}))
     if vectors := jax.tree.leaves(self.networks.vectors(obs)):
       farthest = jnp.stack([jnp.abs(entry).max() for entry in vectors]).max()
       metrics["obs_farthest"] = jax.lax.pmax(farthest, AXIS)  # of any number from its mean, in standard deviations
@@ -239,9 +231,3 @@ class PPO(Learner):
     """Mean standard deviation of the actor, before squashing, on the first step of the data."""
     logits = self.networks.logits(params.policy, jax.tree.map(lambda x: x[0], obs))
     return self.networks.distribution.create_dist(logits).scale.mean()
-
-
-def _adapted(learning_rate: jax.Array, kl: jax.Array, desired: float) -> jax.Array:
-  """The next learning rate after a training step that moved the policy by `kl`; factors and bounds are RSL-RL's."""
-  factor = jnp.where(kl > 2 * desired, 1 / 1.5, jnp.where(kl < desired / 2, 1.5, 1.0))
-  return jnp.clip(learning_rate * factor, 1e-5, 1e-2)

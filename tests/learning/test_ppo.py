@@ -4,7 +4,6 @@ import dataclasses
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
@@ -14,7 +13,7 @@ from playground.errors import ConfigError
 from playground.hardware.mesh import jit_on_mesh
 from playground.learning.losses import Batch
 from playground.learning.networks import NetworkConfig
-from playground.learning.ppo import PPO, _adapted
+from playground.learning.ppo import PPO
 from tests.dummy import SMALL_PPO, numbers, point_learner
 
 
@@ -68,22 +67,3 @@ def test_environments_can_start_at_all_ages() -> None:
   assert len(set(ages)) > 4
   assert set(ages[: len(ages) // 2]) != set(ages[len(ages) // 2 :]), "each device draws its own"
   np.testing.assert_array_equal(same_age.obs["state"], mixed.obs["state"])
-
-
-@pytest.mark.parametrize(("desired", "direction"), [(1e-6, -1), (10.0, 1), (None, 0)])
-def test_the_learning_rate_follows_the_policys_change(desired: float | None, direction: int) -> None:
-  how: dict[str, Any] = {} if desired is None else {"schedule": "adaptive", "desired_kl": desired}
-  learner = point_learner(dataclasses.replace(SMALL_PPO, **how), num_devices=2)
-  state, metrics = learner.train(learner.init(jax.random.PRNGKey(0), {}), {}, 2)
-  if desired is None:
-    assert "learning_rate" not in metrics
-    return
-  rate = float(state.opt_state[1].hyperparams["learning_rate"])
-  np.testing.assert_allclose(rate, SMALL_PPO.learning_rate * 1.5 ** (2 * direction), rtol=1e-6)
-  np.testing.assert_allclose(metrics["learning_rate"], (rate + rate / 1.5**direction) / 2, rtol=1e-6)
-
-
-def test_the_learning_rate_stays_within_bounds_and_where_the_change_is_as_desired() -> None:
-  adapted = lambda rate, kl: float(_adapted(jnp.float32(rate), jnp.float32(kl), 0.02))
-  np.testing.assert_allclose([adapted(1e-3, kl) for kl in (0.011, 0.039)], 1e-3, rtol=1e-6)
-  np.testing.assert_allclose([adapted(9e-3, 0.001), adapted(1.2e-5, 1.0)], [1e-2, 1e-5], rtol=1e-6)
