@@ -17,8 +17,23 @@ class Launcher(Protocol):
 
   outlives: bool
 
-  def check(self, jobs: Sequence[Job]) -> None:
-    """Raises PlaygroundError for a job that could never start here, before anything does."""
+  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
+    """Args:
+      sweep: what it is to launch.
+      config: its settings.
+      command: what jobs are run with.
+
+    Raises:
+      PlaygroundError: as `check`.
+    """
+    ...
+
+  @staticmethod
+  def check(config: Section, jobs: Sequence[Job]) -> None:
+    """Raises PlaygroundError for what it needs and is not there, settings that cannot be, a job that could never start.
+
+    It is asked before a sweep is laid out, too, and writes nothing.
+    """
     ...
 
   def start(self, job: Job) -> bool:
@@ -38,25 +53,20 @@ class Launcher(Protocol):
     ...
 
 
-def make_launcher(sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND) -> Launcher:
-  """The launcher that `config` (the section `launcher`) names.
-
-  Args:
-    sweep: what it is to launch.
-    config: its settings.
-    command: what jobs are run with.
+def launcher_class(name: str) -> type[Launcher]:
+  """The launcher of that name (`launcher.name`).
 
   Raises:
-    PlaygroundError: what it needs is not installed or not there.
+    ConfigError: what it is made of is not installed.
   """
-  if config.name == "slurm":
+  if name == "slurm":
     from playground.sweep.slurm import SlurmLauncher
 
-    return SlurmLauncher(sweep, config, command)
-  if config.name == "ray":
+    return SlurmLauncher
+  if name == "ray":
     from playground.sweep.ray import RayLauncher
 
-    return RayLauncher(sweep, config, command)
+    return RayLauncher
   from playground.sweep.local import LocalLauncher
 
-  return LocalLauncher(sweep, config, command)
+  return LocalLauncher

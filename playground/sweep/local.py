@@ -12,7 +12,7 @@ from playground.config import Section
 from playground.errors import ConfigError, HardwareError
 from playground.hardware.gpus import visible_gpus
 from playground.sweep.folder import Job, SweepDirectory
-from playground.sweep.mps import MultiProcessService
+from playground.sweep.mps import MultiProcessService, control_program
 from playground.sweep.worker import COMMAND
 
 MEMORY_FRACTION = 0.9  # of a GPU, shared among its slots; the rest is for Warp and the driver
@@ -50,12 +50,8 @@ class LocalLauncher:
   outlives = False
 
   def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
-    gpus = visible_gpus()
-    if config.gpus is not None and config.gpus > len(gpus):
-      raise HardwareError(f"launcher.gpus={config.gpus}, but this machine has {len(gpus)}.")
-    self._gpus = gpus[: config.gpus]
-    if config.mps and (config.slots_per_gpu < 2 or not self._gpus):
-      raise ConfigError("launcher.mps=true is for jobs that share a GPU: a GPU, and launcher.slots_per_gpu above 1.")
+    self.check(config, sweep.jobs)
+    self._gpus = visible_gpus()[: config.gpus]
     self._mps = MultiProcessService(sweep.path) if config.mps else None
     self.slots = make_slots(self._gpus, config.slots_per_gpu, sorted(os.sched_getaffinity(0)), config.cores_per_job)
     self._sweep = sweep
@@ -69,11 +65,20 @@ class LocalLauncher:
         numbers = folder.record.get("slots", [])
         self._taken[job.name] = [slot for slot in self.slots if slot.number in numbers]
 
-  def check(self, jobs: Sequence[Job]) -> None:
+  @staticmethod
+  def check(config: Section, jobs: Sequence[Job]) -> None:
+    gpus = visible_gpus()
+    if config.gpus is not None and config.gpus > len(gpus):
+      raise HardwareError(f"launcher.gpus={config.gpus}, but this machine has {len(gpus)}.")
+    gpus = gpus[: config.gpus]
+    if config.mps and (config.slots_per_gpu < 2 or not gpus):
+      raise ConfigError("launcher.mps=true is for jobs that share a GPU: a GPU, and launcher.slots_per_gpu above 1.")
+    if config.mps:
+      control_program()
     for job in jobs:
-      if (job.needs or 1) > max(1, len(self._gpus)) and self._gpus:
+      if (job.needs or 1) > max(1, len(gpus)) and gpus:
         raise HardwareError(
-          f"Job {job.name} asks for hardware.devices={job.needs}, but launcher=local has {len(self._gpus)} GPUs here."
+          f"Job {job.name} asks for hardware.devices={job.needs}, but launcher=local has {len(gpus)} GPUs here."
         )
 
   def start(self, job: Job) -> bool:

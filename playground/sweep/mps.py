@@ -13,6 +13,16 @@ CONTROL = "nvidia-cuda-mps-control"
 TIMEOUT_S = 60.0
 
 
+def control_program() -> str:
+  """Where the service's control program is; raises HardwareError if it is not installed."""
+  program = shutil.which(CONTROL)
+  if program is None:
+    raise HardwareError(
+      f"launcher.mps=true, but {CONTROL}, which comes with NVIDIA's driver, is not on PATH: leave launcher.mps out."
+    )
+  return program
+
+
 class MultiProcessService:
   """The service for one sweep, of all GPUs that the driver has.
 
@@ -28,17 +38,12 @@ class MultiProcessService:
     Raises:
       HardwareError: it is not installed, or does not start.
     """
-    program = shutil.which(CONTROL)
-    if program is None:
-      raise HardwareError(
-        f"launcher.mps=true, but {CONTROL}, which comes with NVIDIA's driver, is not on PATH: leave launcher.mps out."
-      )
+    self._program = control_program()
     name = hashlib.sha256(str(sweep.resolve()).encode()).hexdigest()[:12]
     pipes = Path(tempfile.gettempdir(), f"playground-mps-{os.getuid()}-{name}")  # its sockets' names must be short
     logs = sweep / "mps"
     for folder in (pipes, logs):
       folder.mkdir(mode=0o700, exist_ok=True)
-    self._program = program
     self.environment = {"CUDA_MPS_PIPE_DIRECTORY": str(pipes), "CUDA_MPS_LOG_DIRECTORY": str(logs)}
     if self._control(command="get_server_list\n")[0] == 0:
       return

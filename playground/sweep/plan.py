@@ -10,6 +10,7 @@ from playground import config as configs
 from playground.config import RunConfig, Section
 from playground.errors import ConfigError
 from playground.sweep.folder import Job, SweepDirectory
+from playground.sweep.launchers import launcher_class
 
 ROOT = Path("results/sweeps")
 
@@ -34,7 +35,7 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
     The sweep, and how it is to be run.
 
   Raises:
-    ConfigError: whatever cannot work; nothing is written then.
+    PlaygroundError: whatever cannot work, the launcher included; nothing is written then.
   """
   settings, chosen, sets = _lines(overrides)
   lines = sets[0]
@@ -55,6 +56,7 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
   found = _find(chosen.sweep_dir, name, lines, jobs)
   if found is not None:
     return found, chosen
+  launcher_class(chosen.launcher.name).check(chosen.launcher, jobs)
   path = chosen.sweep_dir or _new(ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
   settings = [line for line in settings if not line.startswith("sweep_dir=")]
   return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen

@@ -21,25 +21,29 @@ class RayLauncher:
   """See `launchers.Launcher`."""
 
   outlives = False
+  _owned = False  # whether the connection, of which a process has one, was made here
 
   def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
-    address = config.address or os.environ.get("RAY_ADDRESS")
-    self._owned = not ray.is_initialized()
-    if self._owned:
-      try:
-        ray.init(address=address, log_to_driver=False, include_dashboard=False)
-      except (ConnectionError, RuntimeError, ValueError) as error:
-        raise HardwareError(f"launcher=ray: no cluster at {address}: {str(error).splitlines()[0]}") from None
+    self.check(config, sweep.jobs)
     self._sweep = sweep
     self._config = config
     self._command = tuple(command)
     self._tasks: dict[str, Any] = {}
     self._run = ray.remote(max_calls=1)(_run)  # a process for each job, as with the other launchers
 
-  def check(self, jobs: Sequence[Job]) -> None:
+  @staticmethod
+  def check(config: Section, jobs: Sequence[Job]) -> None:
+    """See `launchers.Launcher`; connects to the cluster, or starts one, until `close` or the end of the process."""
+    if not ray.is_initialized():
+      address = config.address or os.environ.get("RAY_ADDRESS")
+      try:
+        ray.init(address=address, log_to_driver=False, include_dashboard=False)
+      except (ConnectionError, RuntimeError, ValueError) as error:
+        raise HardwareError(f"launcher=ray: no cluster at {address}: {str(error).splitlines()[0]}") from None
+      RayLauncher._owned = True
     has = ray.cluster_resources()
     for job in jobs:
-      gpus, cores = self._gpus(job), self._config.cores_per_job
+      gpus, cores = _gpus(config, job), config.cores_per_job
       if gpus > has.get("GPU", 0) or cores > has.get("CPU", 0):
         raise HardwareError(
           f"Job {job.name} takes {gpus:g} GPUs and {cores:g} cores, but Ray's cluster has {has.get('GPU', 0):g} and "
@@ -47,7 +51,7 @@ class RayLauncher:
         )
 
   def start(self, job: Job) -> bool:
-    folder, gpus = self._sweep.folder(job), self._gpus(job)
+    folder, gpus = self._sweep.folder(job), _gpus(self._config, job)
     folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
     task = self._run.options(
       num_cpus=self._config.cores_per_job, num_gpus=gpus, max_retries=self._config.retries, name=job.name
@@ -67,12 +71,15 @@ class RayLauncher:
 
   def close(self) -> None:
     if self._owned:
+      RayLauncher._owned = False
       ray.shutdown()
 
-  def _gpus(self, job: Job) -> float:
-    if self._config.gpus_per_job is not None:
-      return 0 if job.needs == 0 else self._config.gpus_per_job
-    return job.needs if job.needs is not None else min(1, ray.cluster_resources().get("GPU", 0))
+
+def _gpus(config: Section, job: Job) -> float:
+  """What a job takes of the cluster's GPUs."""
+  if config.gpus_per_job is not None:
+    return 0 if job.needs == 0 else config.gpus_per_job
+  return job.needs if job.needs is not None else min(1, ray.cluster_resources().get("GPU", 0))
 
 
 def _run(folder: str, command: tuple[str, ...], timeout: float | None, grace: float, gpus: float) -> int:

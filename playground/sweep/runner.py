@@ -17,7 +17,7 @@ from playground.config import Section
 from playground.errors import CheckpointError
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
-from playground.sweep.launchers import Launcher, make_launcher
+from playground.sweep.launchers import Launcher, launcher_class
 from playground.sweep.results import write_result
 from playground.sweep.view import View
 from playground.sweep.worker import COMMAND
@@ -57,8 +57,8 @@ def run_sweep(
       from playground.sweep.search import Search
 
       search = Search(sweep, settings.search, view.print)
+    make_launcher = launcher_class(settings.launcher.name)
     with contextlib.closing(make_launcher(sweep, settings.launcher, command)) as launcher:
-      launcher.check(sweep.jobs)
       runner = Runner(sweep, launcher, view, settings, search)
       code = runner.run()
     if runner.waited:

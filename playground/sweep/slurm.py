@@ -97,18 +97,9 @@ class SlurmLauncher:
       executor: of submitit; Slurm's if not given.
 
     Raises:
-      ConfigError: settings that do not go together.
-      HardwareError: no Slurm here.
+      PlaygroundError: as `check`.
     """
-    if not config.wait and config.max_parallel is not None:
-      raise ConfigError("launcher.wait=false submits all jobs at once: leave launcher.max_parallel out.")
-    if config.minutes * 60 <= _notice_s(config):
-      raise ConfigError(
-        f"launcher.minutes={config.minutes} leaves no time to train: jobs are asked to save {_notice_s(config)} s "
-        "(launcher.grace + 30) before it is over."
-      )
-    if executor is None and shutil.which("sbatch") is None:
-      raise HardwareError("launcher=slurm, but there is no sbatch here: start it on a machine of the cluster.")
+    self.check(config, sweep.jobs)
     self._folder = sweep.path.absolute() / "slurm"
     self._executor = executor or submitit.SlurmExecutor(self._folder, max_num_timeout=config.requeues)
     self._sweep = sweep
@@ -117,8 +108,18 @@ class SlurmLauncher:
     self._queue = Queue()
     self.submitted: dict[str, Any] = {}
 
-  def check(self, jobs: Sequence[Job]) -> None:
-    """Slurm itself says what it cannot give."""
+  @staticmethod
+  def check(config: Section, jobs: Sequence[Job]) -> None:
+    """See `launchers.Launcher`; what it cannot give a job Slurm itself says."""
+    if not config.wait and config.max_parallel is not None:
+      raise ConfigError("launcher.wait=false submits all jobs at once: leave launcher.max_parallel out.")
+    if config.minutes * 60 <= _notice_s(config):
+      raise ConfigError(
+        f"launcher.minutes={config.minutes} leaves no time to train: jobs are asked to save {_notice_s(config)} s "
+        "(launcher.grace + 30) before it is over."
+      )
+    if shutil.which("sbatch") is None:
+      raise HardwareError("launcher=slurm, but there is no sbatch here: start it on a machine of the cluster.")
 
   def start(self, job: Job) -> bool:
     at_once = self._config.max_parallel

@@ -1,11 +1,13 @@
 """From a command line to a sweep on disk."""
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from playground.config import sweeps
-from playground.errors import ConfigError
+from playground.errors import ConfigError, PlaygroundError
+from playground.sweep import local
 from playground.sweep.plan import plan, settings_of
 
 LINE = ["env=CartpoleBalance,CartpoleSwingup", "seed=1,2", "agent.max_grad_norm=null,1.0", "debug=fast"]
@@ -60,10 +62,42 @@ def test_the_same_command_finds_its_sweep_again(here: Path) -> None:
     plan(["seed=4,5", f"sweep_dir={first.path}"])
 
 
-def test_what_a_job_needs(here: Path) -> None:
+def test_what_a_job_needs(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(local, "visible_gpus", list)  # with one, two are refused
   sweep, _ = plan(["hardware=cpu,gpu", "sweep_dir=a"])
   assert [job.needs for job in sweep.jobs] == [0, None]
   assert plan(["hardware.devices=2", "sweep_dir=b"])[0].jobs[0].needs == 2
+
+
+@pytest.mark.parametrize(
+  ("line", "said"),
+  [
+    ("launcher=slurm", "there is no sbatch here"),
+    ("launcher=slurm launcher.minutes=1", r"launcher\.minutes=1 leaves no time to train"),
+    ("launcher.gpus=2", r"launcher\.gpus=2, but this machine has 1\."),
+    ("launcher.mps=true launcher.slots_per_gpu=2", "nvidia-cuda-mps-control, .* is not on PATH"),
+    ("hardware.devices=2", r"asks for hardware\.devices=2, but launcher=local has 1 GPUs"),
+  ],
+)
+def test_nothing_is_written_when_the_launcher_cannot_work(
+  here: Path, monkeypatch: pytest.MonkeyPatch, line: str, said: str
+) -> None:
+  monkeypatch.setenv("PATH", str(here))
+  monkeypatch.setattr(local, "visible_gpus", lambda: ["0"])
+  with pytest.raises(PlaygroundError, match=said):
+    plan(["seed=1,2", *line.split()])
+  assert list(here.iterdir()) == []
+
+
+@pytest.mark.parametrize(("launcher", "module"), [("slurm", "submitit"), ("ray", "ray")])
+def test_nothing_is_written_when_the_launcher_is_not_installed(
+  here: Path, monkeypatch: pytest.MonkeyPatch, launcher: str, module: str
+) -> None:
+  monkeypatch.delitem(sys.modules, f"playground.sweep.{launcher}", raising=False)
+  monkeypatch.setitem(sys.modules, module, None)
+  with pytest.raises(ConfigError, match=rf"^launcher={launcher} needs .*: pip install .playground-run\[{launcher}\]"):
+    plan(["seed=1,2", f"launcher={launcher}"])
+  assert list(here.iterdir()) == []
 
 
 def test_nothing_is_written_when_a_job_cannot_work(here: Path) -> None:
