@@ -49,9 +49,11 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   error = check_parity(exported, obs, actions)
   folder = Path(out).expanduser() if out else trained.run_dir.path / "export"
   folder.mkdir(parents=True, exist_ok=True)
+  # The contract first, which has the model's hash: whatever ends this in between, the pair that it leaves is refused,
+  # even where the export before had no hash.
+  write_text(folder / "policy.yaml", _yaml(exported.contract))
   with replacing(folder / "policy.onnx") as temporary:
     temporary.write_bytes(exported.model)
-  write_text(folder / "policy.yaml", _yaml(exported.contract))
   console.print(_summary(exported.contract, len(actions), error, 1e6 * exported.latency(obs)), soft_wrap=True)
   console.print(f"written to {folder / 'policy.onnx'} and policy.yaml", soft_wrap=True)
   return 0

@@ -1,5 +1,6 @@
 """A policy as a controller has it: `policy.onnx`, run by ONNX Runtime on one core, and its contract `policy.yaml`."""
 
+import hashlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,7 +25,7 @@ class ExportedPolicy:
     """Takes the ONNX model and what `playground.deploy.contract` says of it.
 
     Raises:
-      CheckpointError: the model is damaged, or takes or gives something else.
+      CheckpointError: the model is damaged, takes or gives something else, or is not the one that the contract is of.
     """
     need("deploy", "onnxruntime")
     import onnxruntime
@@ -40,6 +41,9 @@ class ExportedPolicy:
     found = {end.name: end.shape for end in (*self._session.get_inputs(), *self._session.get_outputs())}
     if found != told:
       raise CheckpointError(f"The policy is not the one that its contract tells of: {found}, and not {told}.")
+    own = hashlib.sha256(model).hexdigest()
+    if facts.get("sha256", own) != own:  # what was exported long ago has none
+      raise CheckpointError("The policy and its contract are not of one export (sha256): export the run again.")
     self.model = model
     self.contract = contract
 
@@ -54,6 +58,7 @@ class ExportedPolicy:
     for file in (path, path.with_suffix(".yaml")):
       if not file.is_file():
         raise CheckpointError(f"{file} does not exist: `playground export <run>` writes a policy and its contract.")
+    model = path.read_bytes()  # before its contract, which is written first: an export meanwhile is noticed
     try:
       contract = yaml.safe_load(path.with_suffix(".yaml").read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError):
@@ -61,7 +66,7 @@ class ExportedPolicy:
     if not isinstance(contract, dict) or contract.get("format") != FORMAT or not set(contract) >= _READ:
       raise CheckpointError(f"{path.with_suffix('.yaml')} is not a policy's contract ({FORMAT}): export the run again.")
     try:
-      return cls(path.read_bytes(), contract)
+      return cls(model, contract)
     except CheckpointError as error:
       raise CheckpointError(f"{path}: {error}") from None
 

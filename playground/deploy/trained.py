@@ -1,5 +1,6 @@
 """A run's policy with its task on C MuJoCo: what is exported, and played."""
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,7 @@ def export_policy(trained: Trained, state: State | None = None) -> ExportedPolic
   params, seen = networks.mlp(policy.params.policy, policy.normalizer if agent.normalize_observations else None)
   inputs = networks.policy_inputs
   model = policy_graph(params, inputs, agent.network.activation, seen, networks.squashed, networks.cnn)
+  content = model.SerializeToString()
   origin = {
     "run": trained.run_dir.path.absolute().name,
     "experiment": trained.config.name,
@@ -72,7 +74,8 @@ def export_policy(trained: Trained, state: State | None = None) -> ExportedPolic
   state = jax.jit(trained.env.reset)(jax.random.PRNGKey(0)) if state is None else state
   config: Mapping[str, Any] = trained.config.resolved["env"]
   contract = describe_policy(trained.env, config, trained.task, origin, inputs, state)
-  return ExportedPolicy(model.SerializeToString(), contract)
+  contract["policy"]["sha256"] = hashlib.sha256(content).hexdigest()
+  return ExportedPolicy(content, contract)
 
 
 def _newest_evaluation(trained: Trained) -> dict[str, float]:

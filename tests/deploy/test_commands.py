@@ -12,9 +12,10 @@ import pytest
 import yaml
 
 from playground.cli.main import main
-from playground.deploy import play
+from playground.deploy import export, play
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.web.server import Watch
+from playground.errors import CheckpointError
 from tests.command import Command, caller
 from tests.deploy.untrained import UntrainedRun, free_port
 
@@ -111,6 +112,41 @@ def test_a_damaged_policy_and_one_of_another_task(
     assert command("play", str(tmp_path / "policy.onnx")) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"error: {tmp_path / 'policy.onnx'}: The policy ") and said in line
+
+
+def test_files_of_two_exports_are_refused(
+  command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  other, out = tmp_path / "other", tmp_path / "out"
+  UntrainedRun(other, "CartpoleBalance", "debug=fast", "env.episode_length=40", scale=0.5).save(STEPS)
+  policy, contract = out / "policy.onnx", out / "policy.yaml"
+  assert command("export", str(other), "--out", str(out)) == 0
+  told = yaml.safe_load(contract.read_text())
+  del told["policy"]["sha256"]
+  contract.write_text(yaml.safe_dump(told))
+  old = policy.read_bytes()
+  ExportedPolicy.load(policy)  # as exported before there was a hash
+  with monkeypatch.context() as patch:
+    patch.setattr(export, "replacing", lambda path: signal.raise_signal(signal.SIGINT))
+    assert command("export", str(run), "--out", str(out)) == 130
+  assert policy.read_bytes() == old, "the contract comes first"
+  capsys.readouterr()
+  assert command("play", str(policy)) == 2
+  sentence = f"{policy}: The policy and its contract are not of one export (sha256): export the run again."
+  assert capsys.readouterr().err == f"error: {sentence}\n"
+  assert command("export", str(run), "--out", str(out)) == 0
+  ExportedPolicy.load(policy)
+
+  def read_text(path: Path, **options: Any) -> str:
+    """An export that comes to its end while a policy is read."""
+    policy.write_bytes(new)
+    return truly(path, **options)
+
+  truly, new = Path.read_text, policy.read_bytes()
+  monkeypatch.setattr(Path, "read_text", read_text)
+  policy.write_bytes(old)
+  with pytest.raises(CheckpointError, match="not of one export"):
+    ExportedPolicy.load(policy)
 
 
 def test_a_display_that_is_not_there(
