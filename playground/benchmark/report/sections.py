@@ -89,7 +89,7 @@ def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     pick = max if quantity == SPEED else min
     for ours in evidence.find(benchmark="compare", who="ours", quantity=quantity):
       call = ours.rows[0].get("call", "")
-      of_it = {name: ours[name] for name in ("task", "source", "device")}
+      of_it = {name: ours[name] for name in ("task", "source", "device", "commit")}
       for peer in evidence.find(benchmark="compare", quantity=quantity, **of_it):
         if peer["who"] != "ours" and peer.rows[0].get("call", "") == call:
           mine, its = (pick(row["value"] for row in figure.rows) for figure in (ours, peer))
