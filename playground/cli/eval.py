@@ -1,7 +1,6 @@
 """`playground eval <run>`: episodes of a trained policy, measured on this machine."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import jax
 from rich.console import Console
@@ -46,7 +45,7 @@ def evaluate_run(
     PlaygroundError: no such run or checkpoint, or one that does not fit, or no such camera.
   """
   console = console or Console()
-  need_place(video, camera)
+  film = need_place(video, camera)
   trained = load_trained(path)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
   count = run.agent.num_eval_envs if episodes is None else episodes
@@ -56,7 +55,7 @@ def evaluate_run(
   need_camera(drawn, camera, "--camera")
   _, model = randomized_models(env, run, 1, count)
   act = lambda policy, obs, key: trained.learner.act(policy, obs, key, deterministic or None)
-  evaluate = make_evaluator(env, act, count, hardware.mesh, 1 if video else 0)
+  evaluate = make_evaluator(env, act, count, hardware.mesh, 1 if film else 0)
   scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model)
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
 
@@ -75,10 +74,10 @@ def evaluate_run(
   out.parent.mkdir(exist_ok=True)
   write_json(out, report)
   console.print(f"written to {out}", soft_wrap=True)
-  if video:
+  if film:
     render_video(
       drawn,
-      out_path=Path(video),
+      out_path=film,
       dt=env.dt * env.action_repeat,
       camera=camera,
       notify=console.print,

@@ -67,7 +67,7 @@ def play(
     raise ConfigError(f"--episodes={episodes} must be above 0.")
   if seed < 0:
     raise ConfigError(f"--seed={seed} must not be negative.")
-  need_place(video, camera)
+  film = need_place(video, camera)
   if viewer:
     from playground.deploy.viewer import need_display
 
@@ -94,7 +94,7 @@ def play(
     watch(Session(env, exported, seed, menu, following), host, port, console)
     return 0
   need_folder(opened.folder, str(opened.folder))
-  evaluate = make_evaluator(env, exported.act, episodes, make_mesh(1), 1 if video else 0)
+  evaluate = make_evaluator(env, exported.act, episodes, make_mesh(1), 1 if film else 0)
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
   origin = exported.contract["origin"]
@@ -102,10 +102,10 @@ def play(
   out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}.json"
   write_json(out, {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "scores": scores, "origin": origin})
   console.print(f"written to {out}", soft_wrap=True)
-  if video:
+  if film:
     render_video(
       env.mj_model,
-      out_path=Path(video),
+      out_path=film,
       dt=env.dt * env.action_repeat,
       camera=camera,
       notify=console.print,

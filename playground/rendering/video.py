@@ -19,7 +19,7 @@ import numpy as np
 
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
 from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
-from playground.runs.files import need_folder, replacing
+from playground.runs.files import need_file, replacing
 
 MAX_FPS = 50.0
 # Names of cameras that look on from where a task is seen best; the swimmer's is tracking1.
@@ -101,7 +101,6 @@ def render_video(
   with scratch as folder, open(f"{folder}/stderr", "w+") as stderr:
     view = {"camera": camera, "width": width, "height": height, "seen": seen}
     trajectory = save_trajectory(Path(folder) / "trajectory.npz", mj_model, qpos, mocap_pos, mocap_quat, dt, **view)
-    out_path.parent.mkdir(parents=True, exist_ok=True)
     environment = gl_environment(backend) | {
       # The child runs this very package, whatever its folder.
       "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
@@ -122,6 +121,7 @@ def render_video(
         os.killpg(child.pid, signal.SIGKILL)  # the whole group: the encoder would live on and write its file
       child.wait()
     if code == 0 and rendered.is_file():
+      out_path.parent.mkdir(parents=True, exist_ok=True)
       with replacing(out_path) as temporary:
         shutil.copyfile(rendered, temporary)
       return out_path
@@ -129,15 +129,19 @@ def render_video(
   return None
 
 
-def need_place(out_path: str | None, camera: str | None = None) -> None:
-  """Raises ConfigError if `--video` names what cannot be written, or only `--camera` is given, before all else."""
-  if out_path is None:
+def need_place(video: str | None, camera: str | None = None) -> Path | None:
+  """Where `--video` says, None if it was not given.
+
+  Raises:
+    ConfigError: it cannot be written there, or only `--camera` was given.
+  """
+  if video is None:
     if camera is not None:
       raise ConfigError(f"--camera={camera} is of the video that --video=<file> asks for.")
-    return
-  if Path(out_path).suffix != ".mp4" or Path(out_path).is_dir():
-    raise ConfigError(f"--video={out_path} must be a file that ends in .mp4.")
-  need_folder(Path(out_path).parent, f"--video={out_path}")
+    return None
+  path = Path(video).expanduser()
+  need_file(path, ".mp4", f"--video={video}")
+  return path
 
 
 def need_camera(model: Any, name: str | None, option: str) -> None:

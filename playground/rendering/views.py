@@ -13,6 +13,7 @@ from playground.envs.wrappers import Vectorize
 from playground.errors import ConfigError
 from playground.randomization import Randomizer
 from playground.rendering.video import camera_names
+from playground.runs.files import need_file, replacing
 
 _GAP = 2  # pixels between two views
 
@@ -33,22 +34,20 @@ def save_views(env: Env, terms: Iterable[Mapping[str, Any]], path: str | Path, c
   import matplotlib.image
 
   path = Path(path).expanduser()
-  if path.suffix != ".png":
-    raise ConfigError(f"--views {path}: the picture must be a .png.")
+  need_file(path, ".png", f"--views={path}")
   if count < 1:
     raise ConfigError(f"--num-views={count} must be above 0.")
   sizes = env.observation_size
   if not isinstance(sizes, Mapping) or not any(key.startswith(PIXELS) for key in sizes):
     have = ", ".join(camera_names(env.mj_model)) or "none"
     raise ConfigError(f"The task sees nothing: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
-  try:
-    path.parent.mkdir(parents=True, exist_ok=True)
-  except OSError as error:
-    raise ConfigError(f"--views {path}: its folder cannot be made: {error.strerror}.") from None
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
   model = Randomizer(env.mj_model, terms).sample_batch(jax.random.split(model_key, count))
   state: Any = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)
-  matplotlib.image.imsave(path, sheet(np.asarray(newest_picture(env, state.obs))))
+  page = sheet(np.asarray(newest_picture(env, state.obs)))
+  path.parent.mkdir(parents=True, exist_ok=True)
+  with replacing(path) as temporary:
+    matplotlib.image.imsave(temporary, page)
   return path
 
 

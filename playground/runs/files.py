@@ -20,6 +20,13 @@ def need_folder(folder: Path, option: str) -> None:
     raise ConfigError(f"{option} cannot be written: {there} is not a folder that you may write to.")
 
 
+def need_file(path: Path, suffix: str, option: str) -> None:
+  """Raises ConfigError, which names the option that it is of, where no file of that suffix can be; makes no folder."""
+  if path.suffix != suffix or path.is_dir():
+    raise ConfigError(f"{option} must be a file that ends in {suffix}.")
+  need_folder(path.parent, option)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
   """Yields a temporary sibling of `path` (same suffix) that takes its place only if the block succeeds."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from playground.benchmark import report
 from playground.benchmark.report import Options, page, run, sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.page import Block, Heading, Picture, Table, Text, to_html, to_markdown
@@ -105,6 +106,20 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
   assert list(shares[1:8]) == ["1", "2", "", "", "", "", "7"]
 
 
+def test_only_what_one_call_measured_stands_beside_each_other(tmp_path: Path):
+  speed = {"benchmark": "compare", "quantity": "training_steps_per_s", "seed": 1}
+  peer = {**speed, "who": "playground 0.2.0"}
+  found = evidence(
+    tmp_path,
+    {**speed, "commit": "old", "value": 100.0},
+    {**peer, "commit": "old", "backend": "jax", "value": 50.0},
+    {**speed, "commit": "new", "value": 120.0},
+    {**peer, "commit": "new", "backend": "warp", "value": 40.0},
+  )
+  rows = table_with(page(found), "times better").rows
+  assert sorted(row[5] for row in rows) == ["2.00", "3.00"]
+
+
 def whole_run(devices: int, setting: str, seed: int, **quantities: float) -> list[dict[str, Any]]:
   columns = {"benchmark": "topology", "devices": devices, "seed": seed}
   columns["setting"] = " ".join(filter(None, (f"hardware.devices={devices}", setting, "agent.num_timesteps=1000")))
@@ -194,6 +209,13 @@ def test_the_committed_results_make_a_page(tmp_path: Path):
 def test_without_rows_it_says_so(tmp_path: Path):
   with pytest.raises(ConfigError, match="no measured row"):
     run(Options(out=str(tmp_path), rows=(str(tmp_path),)))
+
+
+def test_a_folder_that_cannot_be_is_said_before_the_page_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+  monkeypatch.setattr(report, "page", pytest.fail)
+  (tmp_path / "file").touch()
+  with pytest.raises(ConfigError, match=r"^out=.*/file/page cannot be written: .*/file is not a folder that you may"):
+    run(Options(out=str(tmp_path / "file" / "page"), rows=(str(REFERENCE),)))
 
 
 def test_blocks_as_markdown_and_html():

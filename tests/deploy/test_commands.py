@@ -162,11 +162,12 @@ def test_a_video_by_the_camera_that_is_named(
   command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
   filmed: list[Any] = []
-  monkeypatch.setattr(play, "render_video", lambda model, **view: filmed.append(view["camera"]))
-  video = ["--episodes", "1", "--video", str(tmp_path / "a.mp4")]
+  monkeypatch.setattr(play, "render_video", lambda model, **view: filmed.append((view["out_path"], view["camera"])))
+  monkeypatch.setenv("HOME", str(tmp_path))
+  video = ["--episodes", "1", "--video=~/new/a.mp4"]
   assert command("play", str(run), *video, "--camera", "lookatcart") == 0
   assert command("play", str(run), *video) == 0
-  assert filmed == ["lookatcart", None]
+  assert filmed == [(tmp_path / "new" / "a.mp4", camera) for camera in ("lookatcart", None)]
   monkeypatch.setattr(play, "make_evaluator", pytest.fail)
   capsys.readouterr()
   assert command("play", str(run), *video, "--camera", "lookat_cart") == 2

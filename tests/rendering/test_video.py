@@ -151,7 +151,7 @@ def test_failure_is_one_sentence_and_leaves_nothing(
 ):
   said: list[str] = []
   qpos = path_of_ball(model, 500)
-  assert render_video(model, qpos, tmp_path / "a.mp4", dt=0.02, notify=said.append, **options) is None
+  assert render_video(model, qpos, tmp_path / "new" / "a.mp4", dt=0.02, notify=said.append, **options) is None
   assert len(said) == 1 and sentence in said[0] and "\n" not in said[0]
   assert list(tmp_path.iterdir()) == []
 

@@ -9,7 +9,7 @@ from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.page import Block, Heading, Picture, Text, to_html, to_markdown
 from playground.benchmark.report.pixels import pixels
 from playground.errors import ConfigError
-from playground.runs.files import write_text
+from playground.runs.files import need_folder, write_text
 
 PICTURES = "report_pictures"
 TITLE = "Measured"
@@ -33,12 +33,13 @@ def run(options: Options) -> int:
   Raises:
     ConfigError: no rows anywhere, or a folder that cannot be written.
   """
+  out = Path(options.out).expanduser()
+  need_folder(out, f"out={options.out}")
   folders = [Path(folder) for folder in options.rows if Path(folder).is_dir()]
   evidence = Evidence(folders)
   if not evidence.rows:
     raise ConfigError(f"rows={','.join(options.rows)}: there is no measured row in these folders.")
   blocks = page(evidence)
-  out = Path(options.out)
   try:
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     for block in blocks:
