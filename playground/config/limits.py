@@ -39,8 +39,9 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
   (
     "0 or more",
     lambda x: x >= 0,
-    "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient agent.min_replay_size "
-    "agent.augment_pixels curriculum.scale env.njmax env.naconmax_per_env env.naccdmax_per_env env.gripper_delay "
+    "seed agent.num_resets_per_eval agent.entropy_cost agent.vf_loss_coefficient agent.estimation_coefficient "
+    "agent.min_replay_size agent.augment_pixels "
+    "curriculum.scale env.njmax env.naconmax_per_env env.naccdmax_per_env env.gripper_delay "
     "env.noise.level env.reset.box_xy env.reset.box_y env.reset.cube_spread env.reset.joint_std env.reset.target_angle "
     "env.reset.target_spread env.reset.target_xy env.success_steps launcher.grace "
     "launcher.gpus launcher.gpus_per_job launcher.requeues launcher.retries search.seed",

@@ -11,6 +11,7 @@ from flax import linen
 from playground.envs.base import PIXELS
 from playground.errors import ConfigError, nearest
 
+ESTIMATOR = "estimator"  # a layer beside those that act
 NORM_EPSILON = 1e-6 * 255**2  # added to the variance of a picture's channel
 
 _POOLS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -80,6 +81,8 @@ class PixelNetwork(linen.Module):
     output_size: length of the result.
     output_init: of the last layer.
     dtype: of what is computed on the way; parameters and result are float32.
+    estimate_size: length of what the first hidden layer estimates beside the result, 0 for nothing; it is sown among
+      Flax's intermediates as `estimate`, [..., estimate_size].
   """
 
   cnn: CNNConfig
@@ -89,6 +92,7 @@ class PixelNetwork(linen.Module):
   output_size: int
   output_init: Callable[..., jax.Array] = jax.nn.initializers.lecun_uniform()
   dtype: Any = jnp.float32
+  estimate_size: int = 0
 
   @linen.compact
   def __call__(self, pictures: Mapping[str, jax.Array], vector: jax.Array | None) -> jax.Array:
@@ -99,6 +103,9 @@ class PixelNetwork(linen.Module):
     init = jax.nn.initializers.lecun_uniform()
     for i, size in enumerate(self.hidden_layer_sizes):
       hidden = self.activation(linen.Dense(size, dtype=self.dtype, kernel_init=init, name=f"hidden_{i}")(hidden))
+      if i == 0 and self.estimate_size:
+        estimator = linen.Dense(self.estimate_size, kernel_init=init, name=ESTIMATOR)
+        self.sow("intermediates", "estimate", estimator(hidden))
     return linen.Dense(self.output_size, dtype=jnp.float32, kernel_init=self.output_init, name="output")(hidden)
 
 

@@ -8,6 +8,7 @@ from flax import struct
 from playground.learning.networks import ActorCritic, ActorCriticParams
 
 LOSSES = ("total_loss", "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")  # what is logged
+ESTIMATION = "estimation_loss"  # with them where something is estimated
 
 
 class Batch(struct.PyTreeNode):
@@ -48,6 +49,7 @@ def ppo_loss(
   reward_scaling: float = 1.0,
   normalize_advantage: bool = True,
   vf_loss_coefficient: float = 0.5,
+  estimation_coefficient: float = 1.0,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   """Clipped surrogate, value and entropy loss (Schulman et al., 2017) with GAE on the present critic.
 
@@ -64,11 +66,12 @@ def ppo_loss(
     reward_scaling: factor on rewards.
     normalize_advantage: whether advantages get zero mean and unit deviation over the batch.
     vf_loss_coefficient: weight of the value loss (on top of the usual half).
+    estimation_coefficient: weight of the actor's mean squared error in estimating `network.estimated_obs_key`.
 
   Returns:
-    The loss, and `LOSSES` by name.
+    The loss, and `LOSSES` by name, with `ESTIMATION` where something is estimated.
   """
-  logits = networks.logits(params.policy, batch.obs)
+  logits, estimate = networks.logits_and_estimate(params.policy, batch.obs)
   obs = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), batch.obs, batch.last_obs)
   values = networks.value(params.value, obs)  # in one go: the critic is most of the cost
   targets, advantages = gae(batch, values, reward_scaling, discounting, gae_lambda)
@@ -92,7 +95,12 @@ def ppo_loss(
   loss = policy_loss + value_loss - entropy_cost * entropy
   approx_kl = (ratio - 1 - log_ratio).mean()
   clip_fraction = (jnp.abs(ratio - 1) > clipping_epsilon).mean()
-  return loss, dict(zip(LOSSES, (loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction), strict=True))
+  values_of_them = (loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
+  parts: dict[str, jax.Array] = dict(zip(LOSSES, values_of_them, strict=True))
+  if estimate is not None:
+    parts[ESTIMATION] = jnp.square(estimate - batch.obs[networks.estimated_obs_key]).mean()
+    loss = parts["total_loss"] = loss + estimation_coefficient * parts[ESTIMATION]
+  return loss, parts
 
 
 def gae(

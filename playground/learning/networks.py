@@ -15,7 +15,7 @@ from flax import linen, struct
 
 from playground.envs.base import PIXELS, Observation
 from playground.errors import ConfigError, nearest
-from playground.learning.cnn import CNNConfig, PixelNetwork
+from playground.learning.cnn import ESTIMATOR, CNNConfig, PixelNetwork
 
 ACTIVATIONS = {"swish": linen.swish, "relu": linen.relu, "elu": linen.elu, "tanh": linen.tanh, "gelu": linen.gelu}
 
@@ -64,16 +64,22 @@ class Actor:
       raise ConfigError(f"agent.network.activation={config.activation!r} must be one of {allowed}")
     sizes = obs_size if isinstance(obs_size, Mapping) else {"state": (obs_size,)}
     self.pixel_sizes = {key: sizes[key] for key in sorted(sizes) if key.startswith(PIXELS)}
-    for name in ("policy_obs_key", "value_obs_key"):
-      key = getattr(config, name)
-      if key not in sizes.keys() - self.pixel_sizes.keys() and not (key == "" and self.pixel_sizes):
+    self.estimated_obs_key: str = getattr(config, "estimated_obs_key", "")
+    if self.estimated_obs_key and not (self.pixel_sizes and hidden_layer_sizes):
+      raise ConfigError(
+        f"agent.network.estimated_obs_key={self.estimated_obs_key!r} is estimated from pictures by the first layer of "
+        "agent.network.policy_hidden_layer_sizes: this run lacks one of them."
+      )
+    for name in ("policy_obs_key", "value_obs_key", "estimated_obs_key"):
+      key, optional = getattr(config, name, ""), bool(self.pixel_sizes) or name == "estimated_obs_key"
+      if key not in sizes.keys() - self.pixel_sizes.keys() and not (key == "" and optional):
         entries = ", ".join(sizes) + "." + nearest(key, sizes)
         raise ConfigError(f"agent.network.{name}={key!r} must be an entry of the task's observation: {entries}")
     self.precision = precision
     self.action_size = action_size
     self.activation = ACTIVATIONS[config.activation]
     self.policy_obs_key, self.value_obs_key = config.policy_obs_key, config.value_obs_key
-    self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key} - {""}))
+    self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key, self.estimated_obs_key} - {""}))
     self.obs_sizes = {key: sizes[key] for key in self.obs_keys}
     self.distribution = NormalTanhDistribution(event_size=action_size)
     self.cnn: CNNConfig | None = None
@@ -82,7 +88,9 @@ class Actor:
       self.cnn = config.cnn
       init = linen.initializers.orthogonal(0.2)
       sizes = tuple(hidden_layer_sizes)
-      self._actor = self._on_pixels(config.cnn, sizes, self.distribution.param_size, output_init=init)
+      estimated = math.prod(self.obs_sizes[self.estimated_obs_key]) if self.estimated_obs_key else 0
+      how: dict[str, Any] = {"output_init": init, "estimate_size": estimated}
+      self._actor = self._on_pixels(config.cnn, sizes, self.distribution.param_size, **how)
     else:
       self.policy_network = brax_networks.make_policy_network(
         self.distribution.param_size,
@@ -116,6 +124,17 @@ class Actor:
         return self._actor.apply(policy_params, *self._seen(obs, self.policy_obs_key))  # pyright: ignore[reportReturnType]
       return self.policy_network.apply(None, policy_params, obs[self.policy_obs_key])
 
+  def logits_and_estimate(
+    self, policy_params: Any, obs: Mapping[str, jax.Array]
+  ) -> tuple[jax.Array, jax.Array | None]:
+    """`logits`, and what the actor takes `estimated_obs_key` to be, normalised, [..., D]; None where that is empty."""
+    if not self.estimated_obs_key:
+      return self.logits(policy_params, obs), None
+    with self.at_precision():
+      seen = self._seen(obs, self.policy_obs_key)
+      logits, more = self._actor.apply(policy_params, *seen, mutable=["intermediates"])
+      return logits, more["intermediates"]["estimate"][0]  # pyright: ignore[reportReturnType]
+
   def act(
     self, policy: Any, normalizer: Normalizer | None, obs: Observation, key: jax.Array, deterministic: bool = False
   ) -> jax.Array:
@@ -124,9 +143,10 @@ class Actor:
     return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
 
   def mlp(self, policy: Any, normalizer: Any) -> tuple[Mapping[str, Any], tuple[Any, Any] | None]:
-    """The actor's layers as Flax has them, with mean and deviation of its vector (None if it has none, or as it is)."""
+    """The layers that act as Flax has them, with mean and deviation of the vector (None without one, or as it is)."""
     key = self.policy_obs_key
-    return policy["params"], (normalizer.mean[key], normalizer.std[key]) if key and normalizer is not None else None
+    layers = {name: layer for name, layer in policy["params"].items() if name != ESTIMATOR}
+    return layers, (normalizer.mean[key], normalizer.std[key]) if key and normalizer is not None else None
 
   @property
   def policy_inputs(self) -> dict[str, tuple[int, ...]]:
@@ -161,6 +181,7 @@ class NetworkConfig:
   activation: str = "swish"
   policy_obs_key: str = "state"  # entry of a dict observation that the actor sees; "" is none, beside pictures
   value_obs_key: str = "state"  # entry that the critic sees, "privileged_state" for an asymmetric pair
+  estimated_obs_key: str = ""  # entry that the actor learns to estimate from pictures, "" is none
   value_dtype: str = "auto"  # of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere
   cnn: CNNConfig = dataclasses.field(default_factory=CNNConfig)  # for pictures, if the observation has any
 

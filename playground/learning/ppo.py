@@ -22,7 +22,7 @@ from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
 from playground.learning.cnn import random_shift
 from playground.learning.learner import SPEC, Learner, Metrics, TrainState, check_divisible, from_config
-from playground.learning.losses import LOSSES, Batch, ppo_loss
+from playground.learning.losses import ESTIMATION, LOSSES, Batch, ppo_loss
 from playground.learning.networks import ActorCritic, ActorCriticParams, NetworkConfig, Normalizer, normalize
 from playground.learning.rollout import NonfiniteCapture, repeat_unroll, unroll
 
@@ -48,6 +48,7 @@ class PPOConfig:
   clipping_epsilon: float = 0.3
   clipping_epsilon_value: float | None = None  # clips the value loss too, if set
   vf_loss_coefficient: float = 0.5
+  estimation_coefficient: float = 1.0  # of the actor's squared error in estimating `network.estimated_obs_key`
   reward_scaling: float = 1.0
   normalize_observations: bool = False
   normalize_advantage: bool = True
@@ -108,7 +109,9 @@ class PPO(Learner):
       reward_scaling=config.reward_scaling,
       normalize_advantage=config.normalize_advantage,
       vf_loss_coefficient=config.vf_loss_coefficient,
+      estimation_coefficient=config.estimation_coefficient,
     )
+    self.losses = (*LOSSES, ESTIMATION) if networks.estimated_obs_key else LOSSES
 
   def _init(self, key: jax.Array, model: ModelFields) -> TrainState:
     key, net_key, env_key = jax.random.split(key, 3)
@@ -168,7 +171,7 @@ class PPO(Learner):
     (flat, opt_state), log = jax.lax.scan(one_pass, (flat, state.opt_state), passes)
     params = unravel(flat)
 
-    names = (*LOSSES, "grad_norm", "nonfinite_updates")
+    names = (*self.losses, "grad_norm", "nonfinite_updates")
     means = dict(zip(names, jax.lax.pmean(log.mean((0, 1)), AXIS), strict=True))
     metrics = means | jax.lax.psum(episodes, AXIS)
     metrics["nonfinite_updates"] *= config.num_updates_per_batch * config.num_minibatches
@@ -194,7 +197,7 @@ class PPO(Learner):
     carry: tuple[jax.Array, Any],
     x: tuple[jax.Array, jax.Array],
   ) -> tuple[Any, jax.Array]:
-    """One gradient step on the trajectories in `columns`; returns `LOSSES`, the gradient's norm and if it was bad."""
+    """One gradient step on the trajectories in `columns`; returns its losses, the gradient's norm and if it was bad."""
     flat, opt_state = carry
     columns, key = x
     last_obs = jax.tree.map(lambda x: x[columns], batch.last_obs)
@@ -211,7 +214,7 @@ class PPO(Learner):
     finite = jnp.isfinite(norm)  # a bad gradient is counted and left out
     new = (optax.apply_updates(flat, updates), new_opt_state)
     carry = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, carry)
-    log = jnp.stack([*(parts[name] for name in LOSSES), norm])
+    log = jnp.stack([*(parts[name] for name in self.losses), norm])
     return carry, jnp.append(jnp.where(finite, log, 0.0), 1.0 - finite)
 
   def _with_values(self, batch: Batch, params: ActorCriticParams, obs: dict[str, jax.Array]) -> Batch:

@@ -102,7 +102,8 @@ def test_every_pool_is_tried() -> None:
 
 def test_pictures_alone_are_obs() -> None:
   sizes = {"state": (OBS,), "pixels/eye": (9, 8, 3)}
-  nets = ActorCritic(sizes, ACTIONS, NetworkConfig((8,), (4,), policy_obs_key="", value_obs_key="", cnn=CNNS[0]))
+  keys = {"policy_obs_key": "", "value_obs_key": "", "estimated_obs_key": "state"}  # of which the policy needs none
+  nets = ActorCritic(sizes, ACTIONS, NetworkConfig((8,), (4,), **keys, cnn=CNNS[0]))
   layers, normalization = nets.mlp(trained(nets)[0], nets.init_normalizer())
   model = policy_graph(layers, nets.policy_inputs, "swish", normalization, nets.squashed, nets.cnn)
   assert ends(model) == {"obs": [1, 9, 8, 3], "continuous_actions": [1, ACTIONS]}

@@ -121,6 +121,8 @@ def test_shifts_move_a_trajectory_as_one_and_repeat_edges() -> None:
   [
     ({"policy_obs_key": "stat"}, r"policy_obs_key='stat' must be an entry.*Did you mean 'state'"),
     ({"value_obs_key": "pixels/eye"}, r"value_obs_key='pixels/eye' must be an entry"),
+    ({"estimated_obs_key": "stat"}, r"estimated_obs_key='stat' must be an entry.*Did you mean 'state'"),
+    ({"estimated_obs_key": "state", "policy_hidden_layer_sizes": ()}, "from pictures by the first .* lacks one"),
     ({"cnn": dataclasses.replace(TINY, strides=(2, 2))}, "must have one entry for each layer"),
     ({"cnn": dataclasses.replace(TINY, global_pool="mean")}, r"cnn.global_pool='mean' must be one of none, avg"),
     ({"cnn": dataclasses.replace(TINY, activation="rel")}, r"cnn.activation='rel'.*Did you mean 'relu'"),
@@ -134,15 +136,17 @@ def test_what_cannot_be(settings: dict[str, Any], message: str) -> None:
 def test_no_pictures_no_empty_key_and_none_for_sac() -> None:
   with pytest.raises(ConfigError, match="policy_obs_key='' must be an entry"):
     ActorCritic(5, 2, NetworkConfig(policy_obs_key=""))
+  with pytest.raises(ConfigError, match="estimated_obs_key='state' is estimated from pictures"):
+    ActorCritic(5, 2, NetworkConfig(estimated_obs_key="state"))
   with pytest.raises(ConfigError, match="agent=sac reads no pictures: choose agent=ppo"):
     SoftActorCritic(SIZES, 2, SoftNetworkConfig())
 
 
 class Seen(PointTask):
-  """The point, and a picture that is the brighter the farther it is."""
+  """The point, and a picture whose two channels are as bright as it is far to the right and up."""
 
   def _obs(self, data: Any) -> dict[str, jax.Array]:
-    bright = jnp.clip(50 * jnp.abs(data.qpos), 0, 255)
+    bright = jnp.clip(60 * (data.qpos + 2), 0, 255)
     return super()._obs(data) | {"pixels/eye": jnp.broadcast_to(bright, (6, 6, 2)).astype(jnp.uint8)}
 
   def reset(self, rng: jax.Array, model: Any = None) -> State:
@@ -169,6 +173,31 @@ def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: py
   state, metrics = learner.train(state, {}, jnp.int32(1))
   assert metrics["nonfinite_updates"] == 0 and "obs_farthest" not in metrics
   assert all((a != b).any() for a, b in zip(before, numbers(state.params), strict=True) if a.any())
+
+
+def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
+  network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", estimated_obs_key="state", cnn=TINY)
+  config = dataclasses.replace(SMALL_PPO, network=network)
+  learner = PPO(Seen(), config, make_mesh(1), {})
+  state = learner.init(jax.random.PRNGKey(0), {})
+  nets, policy = learner.networks, jax.device_get(state.params.policy)
+  assert policy["params"]["estimator"]["kernel"].shape == (16, 2)
+  obs = nets.select(state.env_state.obs)
+  logits, estimate = nets.logits_and_estimate(policy, obs)
+  np.testing.assert_array_equal(logits, nets.logits(policy, obs))
+  other = obs | {"state": obs["state"] + 1}
+  np.testing.assert_array_equal(estimate, nets.logits_and_estimate(policy, other)[1])  # from pictures alone
+
+  log = []
+  for _ in range(10):
+    state, metrics = learner.train(state, {}, jnp.int32(2))
+    log.append(float(metrics["estimation_loss"]))
+    assert metrics["total_loss"] > 0.5 * metrics["estimation_loss"]
+  assert log[-1] < 0.3 * log[0], log
+  still = dataclasses.replace(config, estimation_coefficient=0.0)
+  learner = PPO(Seen(), still, make_mesh(1), {})
+  after = learner.train(learner.init(jax.random.PRNGKey(0), {}), {}, jnp.int32(2))[0].params.policy["params"]
+  np.testing.assert_array_equal(after["estimator"]["kernel"], policy["params"]["estimator"]["kernel"])
 
 
 def _variables(jaxpr: Any) -> list[Any]:
