@@ -51,7 +51,9 @@ def main() -> None:
 
 def _main(argv: Sequence[str]) -> int:
   args, others = get_args_parser().parse_known_args(argv)
-  overrides = [*args.overrides, *(other for other in others if not other.startswith("-"))]
+  if unknown := [other for other in others if other.startswith("-")]:
+    raise ConfigError(f"{unknown[0]} is no option: `playground-run --help` shows them, and the keys.")
+  overrides = [*args.overrides, *others]
   flags = [arg for arg in argv if arg not in overrides]
   config = None
   if args.help:

@@ -104,6 +104,8 @@ def test_shows_and_does_not_train(
     (["-m", "agent.num_envs=128,7"], "error: Job experiment=quickstart agent.num_envs=7: agent.num_envs=7 does not"),
     (["-m", "agent.learning_rate=interval(0,1)"], "is a range to draw from: add search=optuna"),
     (["-m", "seed=1,2", "--cfg", "all"], "--cfg all shows one run: leave -m out"),
+    (["-m", "sweep=dm_control_ppo", "--dry-run"], "error: --dry-run is no option"),
+    (["--seed", "3"], "error: --seed is no option"),
     (["sweep=dm_control_ppo"], "add -m, as in `playground-run -m sweep=dm_control_ppo`."),
   ],
 )
