@@ -35,7 +35,7 @@ def evaluate_run(
     seed: of the evaluation.
     deterministic: whether the policy acts with its mode instead of sampling (the run's own setting if False).
     video: where to render the first episode to (.mp4).
-    camera: the video's, see `render_video`.
+    camera: the video's, see `render_video`; None is the run's `video.camera`.
     console: for the output.
 
   Returns:
@@ -79,7 +79,7 @@ def evaluate_run(
       drawn,
       out_path=film,
       dt=env.dt * env.action_repeat,
-      camera=camera,
+      camera=camera or run.video.camera,
       notify=console.print,
       **episodes_of(recording, 1),
     )

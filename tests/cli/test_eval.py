@@ -138,8 +138,13 @@ def test_a_video_by_the_camera_that_is_named(
   filmed: list[Any] = []
   monkeypatch.setattr(eval_command, "render_video", lambda model, **view: filmed.append(view["camera"]))
   video = ["--video", str(tmp_path / "a.mp4")]
-  assert command(str(trained), *video, "--camera", "front") == 0
-  assert filmed == ["front"]
+  run = shutil.copytree(trained, tmp_path / "run")
+  config = yaml.safe_load((run / "config.yaml").read_text())
+  config["video"]["camera"] = "side"
+  (run / "config.yaml").write_text(yaml.safe_dump(config))
+  assert command(str(run), *video) == 0
+  assert command(str(run), *video, "--camera", "front") == 0
+  assert filmed == ["side", "front"]  # the run's own, unless another is named
   monkeypatch.setattr(eval_command, "make_evaluator", pytest.fail)
   capsys.readouterr()
   assert command(str(trained), *video, "--camera", "frnt") == 2
