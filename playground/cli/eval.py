@@ -11,7 +11,7 @@ from playground.errors import ConfigError
 from playground.learning.evaluation import make_evaluator
 from playground.rendering.video import need_camera, need_place, render_video
 from playground.rendering.visuals import drawn_model
-from playground.runs.files import write_json
+from playground.runs.files import need_folder, write_json
 from playground.runs.job import episodes_of
 from playground.runs.train import randomized_models
 from playground.runs.trained import load_trained
@@ -42,12 +42,15 @@ def evaluate_run(
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run or checkpoint, or one that does not fit, or no such camera.
+    PlaygroundError: no such run or checkpoint, or one that does not fit, no such camera, or no folder that can be
+      written to.
   """
   console = console or Console()
   film = need_place(video, camera)
   trained = load_trained(path)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
+  folder = trained.run_dir.path / "eval"
+  need_folder(folder, str(folder))
   count = run.agent.num_eval_envs if episodes is None else episodes
   if count < 1:
     raise ConfigError(f"--episodes={count} must be above 0.")
@@ -70,8 +73,8 @@ def evaluate_run(
   report |= {"scores": scores} | hardware.facts
   report |= {"hardware_in_paper": real} if real else {}
   name = f"step_{checkpoint.step:012d}_seed_{seed}{'_deterministic' * deterministic}.json"
-  out = trained.run_dir.path / "eval" / name
-  out.parent.mkdir(exist_ok=True)
+  out = folder / name
+  folder.mkdir(exist_ok=True)
   write_json(out, report)
   console.print(f"written to {out}", soft_wrap=True)
   if film:

@@ -44,10 +44,11 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   if out:
     need_folder(Path(out).expanduser(), f"--out={out}")
   trained = load_exact(path)
+  folder = Path(out).expanduser() if out else trained.run_dir.path / "export"
+  need_folder(folder, str(folder))
   obs, actions, state = record(trained, _ENVS, _DECISIONS)
   exported = export_policy(trained, state)
   error = check_parity(exported, obs, actions)
-  folder = Path(out).expanduser() if out else trained.run_dir.path / "export"
   folder.mkdir(parents=True, exist_ok=True)
   # The contract first, which has the model's hash: whatever ends this in between, the pair that it leaves is refused,
   # even where the export before had no hash.

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import signal
 import socket
 from pathlib import Path
@@ -93,6 +94,16 @@ def test_a_policy_that_acts_otherwise_is_not_written(
   assert command("export", str(run), "--out", str(tmp_path / "out")) == 2
   assert "differ by 1.0e-03, more than 1e-05: nothing is written" in capsys.readouterr().err
   assert not (tmp_path / "out").exists()
+
+
+def test_a_run_that_cannot_be_written_to_is_said_before_anything_is_traced(
+  command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  copied = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("export"))
+  (copied / "export").touch()
+  monkeypatch.setattr("playground.deploy.export.record", pytest.fail)
+  assert command("export", str(copied)) == 2
+  assert f"error: {copied / 'export'} cannot be written:" in capsys.readouterr().err
 
 
 def test_a_damaged_policy_and_one_of_another_task(
