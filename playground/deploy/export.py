@@ -41,11 +41,13 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   """
   console = console or Console()
   need("deploy", "onnx", "onnxruntime")
-  if out:
-    need_folder(Path(out).expanduser(), f"--out={out}")
+  folder = Path(out).expanduser() if out else None
+  if folder:
+    need_folder(folder, f"--out={out}")
   trained = load_exact(path)
-  folder = Path(out).expanduser() if out else trained.run_dir.path / "export"
-  need_folder(folder, str(folder))
+  if folder is None:
+    folder = trained.run_dir.path / "export"
+    need_folder(folder, str(folder))
   obs, actions, state = record(trained, _ENVS, _DECISIONS)
   exported = export_policy(trained, state)
   error = check_parity(exported, obs, actions)

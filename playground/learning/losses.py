@@ -93,14 +93,14 @@ def ppo_loss(
 
   entropy = networks.distribution.entropy(logits, key).mean()
   loss = policy_loss + value_loss - entropy_cost * entropy
+  estimation = {}
+  if estimate is not None:
+    estimation[ESTIMATION] = jnp.square(estimate - batch.obs[networks.estimated_obs_key]).mean()
+    loss += estimation_coefficient * estimation[ESTIMATION]
   approx_kl = (ratio - 1 - log_ratio).mean()
   clip_fraction = (jnp.abs(ratio - 1) > clipping_epsilon).mean()
-  values_of_them = (loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
-  parts: dict[str, jax.Array] = dict(zip(LOSSES, values_of_them, strict=True))
-  if estimate is not None:
-    parts[ESTIMATION] = jnp.square(estimate - batch.obs[networks.estimated_obs_key]).mean()
-    loss = parts["total_loss"] = loss + estimation_coefficient * parts[ESTIMATION]
-  return loss, parts
+  parts = (loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
+  return loss, dict(zip(LOSSES, parts, strict=True)) | estimation
 
 
 def gae(

@@ -89,8 +89,8 @@ class Actor:
       init = linen.initializers.orthogonal(0.2)
       sizes = tuple(hidden_layer_sizes)
       estimated = math.prod(self.obs_sizes[self.estimated_obs_key]) if self.estimated_obs_key else 0
-      how: dict[str, Any] = {"output_init": init, "estimate_size": estimated}
-      self._actor = self._on_pixels(config.cnn, sizes, self.distribution.param_size, **how)
+      params = self.distribution.param_size
+      self._actor = self._on_pixels(config.cnn, sizes, params, output_init=init, estimate_size=estimated)
     else:
       self.policy_network = brax_networks.make_policy_network(
         self.distribution.param_size,
