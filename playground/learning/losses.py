@@ -1,8 +1,8 @@
 """PPO's loss, equal to Brax's `compute_ppo_loss` on the same batch, for data that is normalised already."""
 
-
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 
 from playground.learning.networks import ActorCritic, ActorCriticParams
@@ -66,7 +66,7 @@ def ppo_loss(
     reward_scaling: factor on rewards.
     normalize_advantage: whether advantages get zero mean and unit deviation over the batch.
     vf_loss_coefficient: weight of the value loss (on top of the usual half).
-    estimation_coefficient: weight of the actor's mean squared error in estimating `network.estimated_obs_key`.
+    estimation_coefficient: weight of the actor's mean error (Huber) in estimating `network.estimated_obs_key`.
 
   Returns:
     The loss, and `LOSSES` by name, with `ESTIMATION` where something is estimated.
@@ -95,7 +95,8 @@ def ppo_loss(
   loss = policy_loss + value_loss - entropy_cost * entropy
   estimation = {}
   if estimate is not None:
-    estimation[ESTIMATION] = jnp.square(estimate - batch.obs[networks.estimated_obs_key]).mean()
+    # Not squared: a number that hardly ever changes is hundreds of deviations away when it does.
+    estimation[ESTIMATION] = optax.huber_loss(estimate, batch.obs[networks.estimated_obs_key]).mean()
     loss += estimation_coefficient * estimation[ESTIMATION]
   approx_kl = (ratio - 1 - log_ratio).mean()
   clip_fraction = (jnp.abs(ratio - 1) > clipping_epsilon).mean()

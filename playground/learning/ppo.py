@@ -48,7 +48,7 @@ class PPOConfig:
   clipping_epsilon: float = 0.3
   clipping_epsilon_value: float | None = None  # clips the value loss too, if set
   vf_loss_coefficient: float = 0.5
-  estimation_coefficient: float = 1.0  # of the actor's squared error in estimating `network.estimated_obs_key`
+  estimation_coefficient: float = 1.0  # of the actor's error in estimating `network.estimated_obs_key`
   reward_scaling: float = 1.0
   normalize_observations: bool = False
   normalize_advantage: bool = True

@@ -15,6 +15,7 @@ from playground.errors import ConfigError
 from playground.hardware.mesh import make_mesh
 from playground.learning import ppo
 from playground.learning.cnn import CNN, CNNConfig, random_shift
+from playground.learning.losses import Batch
 from playground.learning.networks import ACTIVATIONS, ActorCritic, NetworkConfig, SoftActorCritic, SoftNetworkConfig
 from playground.learning.ppo import PPO, PPOConfig
 from tests.dummy import SMALL_PPO, PointTask, numbers
@@ -194,6 +195,12 @@ def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
     log.append(float(metrics["estimation_loss"]))
     assert metrics["total_loss"] > 0.5 * metrics["estimation_loss"]
   assert log[-1] < 0.3 * log[0], log
+  far = jax.tree.map(lambda x: jnp.zeros((1, 2, *x.shape[1:]), x.dtype), obs)
+  far |= {"state": jnp.full_like(far["state"], 1000.0)}  # what hardly ever changes, normalised
+  row = jnp.zeros((1, 2))
+  batch = Batch(far, jax.tree.map(lambda x: x[0], far), jnp.zeros((1, 2, learner.env.action_size)), row, row, row, row)
+  _, parts = learner.loss(state.params, batch, jax.random.PRNGKey(0))
+  assert 900 < parts["estimation_loss"] < 1100  # not a million, which would drown what the policy learns
   still = dataclasses.replace(config, estimation_coefficient=0.0)
   learner = PPO(Seen(), still, make_mesh(1), {})
   after = learner.train(learner.init(jax.random.PRNGKey(0), {}), {}, jnp.int32(2))[0].params.policy["params"]
