@@ -30,7 +30,7 @@ OURS: dict[str, dict[str, Any]] = {
   "ppo": {"num_resets_per_eval": 10},  # the default of the script that the paper was run with
 }
 # Sets that are no task's own.
-FOR_ANY_TASK = ("sparse_reward", "bounded_gradients")
+FOR_ANY_TASK = ("sparse_reward", "bounded_gradients", "estimated_state")
 # What a source lists and nobody can have used: Brax's SAC has no such argument and refuses it.
 UNUSABLE = {"sac": ("num_resets_per_eval",), "sac_v020": ("num_resets_per_eval",)}
 
@@ -159,6 +159,14 @@ def test_a_tuned_set_belongs_to_an_agent_and_a_task(option: str):
   assert agent in options("agent")
   listed = {name for source in SOURCES for name in rows(source)}  # some are yet to come
   assert task in {*registry.names(), *listed, *FOR_ANY_TASK}
+
+
+def test_the_pandas_experiment_from_pixels_has_a_set_of_its_own_and_the_task_alone_the_papers():
+  choices = (["experiment=panda_pick_pixels"], ["env=PandaPickCubeCartesianVision"])
+  ours, papers = (compose(choice).agent for choice in choices)
+  assert [ours.num_envs, ours.network.estimated_obs_key] == [4096, "state"]
+  assert [papers.num_envs, papers.network.estimated_obs_key] == [1024, ""]
+  assert compose([*choices[0], "agent=ppo_v020"]).choices["tuned"] == "ppo_v020/PandaPickCubeCartesianVision"
 
 
 def test_the_cheetahs_experiment_limits_gradients_and_the_task_alone_has_the_papers_set():

@@ -162,10 +162,10 @@ class _Files(NamedTuple):
 def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
   """Composes the files."""
   (config, choices), added = _hydra(groups, roots), ()
-  shared = f"{config.agent.name}/{choices['env']}"
+  sets = [f"{agent}/{choices['env']}" for agent in (choices["agent"], config.agent.name)]
   named = any(text.lstrip("~").partition("=")[0] == "tuned" for text in groups)
-  if not named and choices["tuned"] is None and shared in options("tuned", roots):
-    added = (parse(f"tuned={shared}", roots),)  # a variant such as ppo_v020 without a set of its own has ppo's
+  if not named and choices["tuned"] is None and (there := [name for name in sets if name in options("tuned", roots)]):
+    added = (parse(f"tuned={there[0]}", roots),)  # a variant such as ppo_v020 without a set of its own has ppo's
     config, choices = _hydra([*groups, *group_overrides(added)], roots)
   schema, _ = _hydra([f"{g}={c}" for g, c in choices.items() if c and g not in DELTAS] + _NO_DELTAS, roots)
   _check_robot(config, choices, roots)
