@@ -29,9 +29,6 @@ class NoPhysics:
   def compile_ahead(self) -> None:
     return None
 
-  def limit_graphs(self) -> None:
-    return None
-
 
 class PointTask(Env):
   """Position [2] follows the action, reward is minus the distance; NaN or absurd velocity on demand (`*_at` steps)."""

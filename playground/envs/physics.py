@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from playground.envs.warp_kernels import Building, keep_graphs, quiet_warp
+from playground.envs.warp_kernels import Building, quiet_warp
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
@@ -39,7 +39,6 @@ _INTEGRATE = {
 }
 
 WORLDS = "worlds"  # the axis of the batch of environments, for `jax.vmap(axis_name=...)`: Warp's buffers grow with it
-_GRAPHS = 2  # of a routine on a device: a training's and an evaluation's
 _FEW = 64  # environments that few need not be like the average: they get the buffers of so many
 
 
@@ -146,11 +145,6 @@ class Physics:
     if self.impl != "warp" or jax.default_backend() != "gpu":
       return None
     return Building(self.mj_model, self._njmax)
-
-  def limit_graphs(self) -> None:
-    """Bounds the memory of the CUDA graphs that Warp keeps, once all programs that call it are traced."""
-    if self.impl == "warp":
-      keep_graphs(_GRAPHS * jax.local_device_count())
 
   def make(self, **fields: jax.Array) -> PhysicsData:
     """Returns the model's default state with `fields` replaced; derived fields are those of fresh data."""

@@ -69,18 +69,6 @@ class Building:
     self._folder.cleanup()
 
 
-def keep_graphs(most: int) -> None:
-  """Has Warp keep the `most` last used CUDA graphs of each of MJX's routines traced so far, instead of 32.
-
-  A graph is captured for the addresses of the arrays that it is called with, and holds all that its kernels allocate on
-  the way: 0.4 GiB for 8192 environments of the G1. Others are captured anew when they are called, in milliseconds.
-  """
-  from mujoco.mjx.warp import ffi
-
-  for routine in ffi._JAX_CALLABLE_VARIADIC_TUPLE_REGISTRY.values():
-    routine.graph_cache_max = most
-
-
 def quiet_warp() -> Any:
   """The module `warp`, without its messages on starting and on loading kernels; ImportError where there is none."""
   import warp

@@ -122,7 +122,6 @@ def compile_program(learner: Learner, evaluate: Any, model: ModelFields, eval_mo
     reset, _ = submit(learner.reset, state, key, model)
     copied, _ = submit(learner.copy, state)
     compiled = [future.result() for future in (init, train, reset, evaluated, copied)]
-    learner.env.unwrapped.physics.limit_graphs()
     notice = None if kernels is None else kernels.wait()
   finally:
     if kernels is not None:

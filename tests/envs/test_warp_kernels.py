@@ -4,10 +4,8 @@ import os
 import subprocess
 import sys
 
-import jax
 import mujoco
 import pytest
-from mujoco.mjx.warp import ffi
 
 from playground import registry
 from playground.config import compose
@@ -82,7 +80,7 @@ def test_a_stopped_building_leaves_nothing(model):
 
 def test_a_run_waits_and_says_it(model, monkeypatch, tmp_path, capsys):
   """As on a GPU, with a process that fails at once."""
-  made, limited = [], []
+  made = []
 
   def compile_ahead(physics: Physics) -> warp_kernels.Building:
     monkeypatch.setattr(warp_kernels.sys, "executable", "false")
@@ -90,20 +88,9 @@ def test_a_run_waits_and_says_it(model, monkeypatch, tmp_path, capsys):
     return made[0]
 
   monkeypatch.setattr(Physics, "compile_ahead", compile_ahead)
-  monkeypatch.setattr(Physics, "limit_graphs", lambda physics: limited.append(physics))
   assert train(compose([*TASK, "video.enable=false", f"run_dir={tmp_path}/run"])) == 0
   assert "were not compiled ahead" in capsys.readouterr().out
   assert not os.path.exists(made[0]._folder.name)
-  assert len(limited) == 1
-
-
-def test_few_graphs_are_kept():
-  env = registry.load("CartpoleBalance", overrides={"impl": "warp"})
-  jax.jit(env.reset).trace(jax.random.PRNGKey(0))
-  registered = ffi._JAX_CALLABLE_VARIADIC_TUPLE_REGISTRY
-  assert 32 in {routine.graph_cache_max for routine in registered.values()}
-  env.physics.limit_graphs()
-  assert {routine.graph_cache_max for routine in registered.values()} == {2 * jax.local_device_count()}
 
 
 def test_the_cpu_and_mjx_alone_compile_nothing_ahead():
