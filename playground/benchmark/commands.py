@@ -196,7 +196,7 @@ class Pixels(OfTasks):
 
   sizes: tuple[int, ...] = option((32, 64, 128, 256), "sides of the pictures")
   num_envs: tuple[int, ...] = option((1024,), "numbers of environments")
-  compared: bool = option(False, "steps of 1/60 s, in which the paper compares simulators; only for Cartpole")
+  compared: bool = option(False, "up to pictures in steps of 1/60 s, as the paper compares simulators; for Cartpole")
 
   name = "pixels"
 
@@ -220,14 +220,15 @@ class Pixels(OfTasks):
 
   def jobs(self, facts: dict[str, Any]) -> list[Job]:
     jobs = []
+    until = "pixels" if self.compared else "update"  # simulators are compared without policies
     for task in self.chosen():
       conditions = COMPARED_CONDITIONS if self.compared else PIXEL_CONDITIONS.get(task, [])
       for size in self.sizes:
         for count in self.num_envs:
           seen = [f"env.vision.width={size}", f"env.vision.height={size}"]
           setting = [*conditions, *seen, *self.with_envs(task, count)]
-          last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, *setting, "part=update"))}
-          job = self.job("breakdown", task, setting, watch_memory=self.workers == 1)
+          last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, *setting, f"part={until}"))}
+          job = self.job("breakdown", task, setting, watch_memory=self.workers == 1, until=until)
           jobs.append(dataclasses.replace(self.on_one_device(job), last=last))
     return jobs
 

@@ -28,6 +28,7 @@ def test_every_size_and_number_is_a_job_under_the_papers_conditions() -> None:
   assert "randomization=panda_vision" in jobs[-1].arguments["overrides"]
   (compared,) = Pixels(sizes=(80,), compared=True).jobs({})
   assert compared.columns["setting"].startswith(f"env.ctrl_dt={1 / 60} env.sim_dt={1 / 120}")
+  assert compared.last["setting"].endswith("part=pixels")
 
 
 def test_a_task_without_a_camera_is_refused() -> None:
@@ -83,11 +84,12 @@ def test_the_report_has_ours_beside_the_papers(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_real_one(tmp_path: Path) -> None:
-  small = ["sizes=8", "num_envs=8", "seconds=0.2", "cache=true", "hardware=cpu", "debug=fast"]
+@pytest.mark.parametrize("compared", [False, True])
+def test_a_real_one(tmp_path: Path, compared: bool) -> None:
+  small = ["sizes=8", "num_envs=8", "seconds=0.2", "cache=true", "hardware=cpu", "debug=fast", f"compared={compared}"]
   command = [sys.executable, "-m", "playground.cli.bench", "pixels", "tasks=CartpoleBalanceVision", *small]
   done = subprocess.run([*command, f"out={tmp_path}/out.csv"], capture_output=True, text=True, cwd=CHECKOUT)
   assert done.returncode == 0, done.stdout + done.stderr
   rows = pd.read_csv(tmp_path / "out.csv")
-  parts = ["physics", "task", "episodes", "pixels", "inference", "storing", "update"]
+  parts = ["physics", "task", "episodes", "pixels"] + ["inference", "storing", "update"] * (not compared)
   assert [text.split("part=")[1] for text in rows["setting"]] == parts and min(rows["value"]) > 0

@@ -41,8 +41,9 @@ def measure(
   seconds: float,
   lock: str | None,
   watch_memory: bool = False,
+  until: str = "update",
 ) -> None:
-  """A row for each of `PARTS`: seconds a control step of one environment takes with it and all parts before it.
+  """A row for each of `PARTS` up to `until`: seconds a control step of one environment takes with all parts so far.
 
   The parts take turns, and the best of each one's turns counts: their differences are what is looked at. The memory is
   what all parts took together: JAX's, and with `watch_memory` what the GPU's driver says.
@@ -52,9 +53,12 @@ def measure(
     learner, state = subject.learner, subject.learner.init(subject.key(0), subject.model)
     length = getattr(learner.config, "unroll_length", LENGTH)
     calls: dict[str, tuple[Callable[[int], Any], int]] = {}
+    wanted = list(PARTS)[: list(PARTS).index(until) + 1]
     for part, (run, carry, repeat) in _rolls(subject, state, length).items():
-      calls[part] = (_repeat(subject, run, carry), learner.config.num_envs * length * repeat)
-    calls["update"] = (_train(subject, state), learner.steps_per_update)
+      if part in wanted:
+        calls[part] = (_repeat(subject, run, carry), learner.config.num_envs * length * repeat)
+    if "update" in wanted:
+      calls["update"] = (_train(subject, state), learner.steps_per_update)
     for call, _ in calls.values():
       jax.block_until_ready(call(1))
     best = dict.fromkeys(calls, 0.0)
