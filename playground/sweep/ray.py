@@ -4,6 +4,7 @@ import os
 import socket
 from collections.abc import Sequence
 from typing import Any
+from urllib.parse import urlsplit
 
 from playground.config import Section
 from playground.errors import ConfigError, HardwareError
@@ -37,8 +38,9 @@ class RayLauncher:
     if not ray.is_initialized():
       address = config.address or os.environ.get("RAY_ADDRESS")
       try:
+        _knock(address)
         ray.init(address=address, log_to_driver=False, include_dashboard=False)
-      except (ConnectionError, RuntimeError, ValueError) as error:
+      except (OSError, RuntimeError, ValueError) as error:
         raise HardwareError(f"launcher=ray: no cluster at {address}: {str(error).splitlines()[0]}") from None
       RayLauncher._owned = True
     has = ray.cluster_resources()
@@ -73,6 +75,13 @@ class RayLauncher:
     if self._owned:
       RayLauncher._owned = False
       ray.shutdown()
+
+
+def _knock(address: str | None) -> None:
+  """Raises OSError where an address names a host and a port and nobody is there: Ray tries for most of a minute."""
+  place = urlsplit(address if address and "//" in address else f"//{address or ''}")
+  if place.hostname and place.port:
+    socket.create_connection((place.hostname, place.port), timeout=10.0).close()
 
 
 def _gpus(config: Section, job: Job) -> float:
