@@ -1,5 +1,6 @@
 """What types cannot say: choices, ranges, and sizes that must divide. A new limit is a new entry here."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -21,6 +22,7 @@ _CHOICES = {
   "search.sampler": ("tpe", "random", "cmaes"),
 }
 _PATHS = ("run_dir", "resume", "init_from", "sweep_dir", "hardware.cache_dir")
+# Of a number, or (key[]) of each number of a list.
 _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
   (
     "above 0",
@@ -29,6 +31,9 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     "agent.num_minibatches agent.num_updates_per_batch agent.learning_rate agent.max_grad_norm agent.clipping_epsilon "
     "agent.clipping_epsilon_value agent.grad_updates_per_step agent.max_replay_size "
     "agent.alpha_learning_rate agent.desired_kl agent.network.init_noise_std "
+    "agent.network.policy_hidden_layer_sizes[] agent.network.value_hidden_layer_sizes[] "
+    "agent.network.hidden_layer_sizes[] agent.network.cnn.channels[] agent.network.cnn.kernels[] "
+    "agent.network.cnn.strides[] "
     "env.ctrl_dt env.sim_dt env.episode_length env.action_repeat checkpoint.keep "
     "video.every_evals video.episodes video.width video.height hardware.devices profile.steps "
     "env.vision.width env.vision.height env.vision.frames env.vision.farthest "
@@ -43,7 +48,7 @@ _RANGES: tuple[tuple[str, Callable[[float], bool], str], ...] = (
     "agent.min_replay_size agent.augment_pixels "
     "curriculum.scale env.njmax env.naconmax_per_env env.naccdmax_per_env env.gripper_delay "
     "env.noise.level env.reset.box_xy env.reset.box_y env.reset.cube_spread env.reset.joint_std env.reset.target_angle "
-    "env.reset.target_spread env.reset.target_xy env.success_steps launcher.grace "
+    "env.vision.brightness[] env.reset.target_spread env.reset.target_xy env.success_steps launcher.grace "
     "launcher.gpus launcher.gpus_per_job launcher.requeues launcher.retries search.seed",
   ),
   (
@@ -84,9 +89,11 @@ def check_limits(resolved: Mapping[str, Any]) -> None:
       raise wrong_type(key, value, "text (put quotes around a number)")
   for what, holds, keys in _RANGES:
     for key in keys.split():
+      key, is_list, _ = key.partition("[]")
       value = _get(resolved, key)
-      if value is not None and (isinstance(value, str | bool) or not holds(value)):
-        raise ConfigError(f"{key}={format_value(value)} must be a number {what}.")
+      entries = value if is_list and isinstance(value, list) else [value]
+      if value is not None and not all(_is_number(entry) and holds(entry) for entry in entries):
+        raise ConfigError(f"{key}={format_value(value)} must be {'numbers' if is_list else 'a number'} {what}.")
   for what, (length, keys) in _LENGTHS.items():
     for key in keys.split():
       value = _get(resolved, key)
@@ -107,6 +114,10 @@ def _check_batch(num_envs: int | None, batch_size: int | None, num_minibatches: 
       f"agent.num_envs={num_envs} does not divide {product} = {batch_size * num_minibatches}: "
       "choose sizes so that it does."
     )
+
+
+def _is_number(value: Any) -> bool:
+  return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _get(node: Any, key: str) -> Any:

@@ -45,8 +45,6 @@ class Vision(Wrapper):
       near = nearest(str(config.camera), cameras)
       raise ConfigError(f"env.vision.camera={config.camera} is no camera of the model; {have}.{near}")
     brightness = tuple(config.brightness)
-    if len(brightness) != 2 or not 0 <= brightness[0] <= brightness[1]:
-      raise ConfigError(f"env.vision.brightness={list(brightness)} must be two factors, 0 or more, the lower first.")
     if config.image == "segmentation" and env.mj_model.ngeom > _MAX_GEOMS:
       many = f"the model has {env.mj_model.ngeom} geoms, more than the {_MAX_GEOMS} that a byte tells apart"
       raise ConfigError(f"env.vision.image=segmentation: {many}.")

@@ -128,7 +128,6 @@ def test_geoms_are_counted_from_1(seeing: Any) -> None:
     ({"image": "segmentation", "brightness": [0.5, 1.0]}, r"brightness=\[0.5, 1.0\]: geoms have no brightness"),
     ({"camera": "eyes"}, r"env.vision.camera=eyes is no camera .* the task has eye, side.*Did you mean 'eye'"),
     ({"camera": None}, r"env.vision.camera=None is no camera of the model; the task has eye, side"),
-    ({"brightness": [1.0, 0.5]}, r"env.vision.brightness=\[1.0, 0.5\] must be two factors"),
   ],
 )
 def test_settings_that_cannot_be(seeing: Any, settings: dict[str, Any], message: str) -> None:
