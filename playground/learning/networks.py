@@ -70,11 +70,18 @@ class Actor:
         f"agent.network.estimated_obs_key={self.estimated_obs_key!r} is estimated from pictures by the first layer of "
         "agent.network.policy_hidden_layer_sizes: this run lacks one of them."
       )
+    vectors = [key for key in sizes if key not in self.pixel_sizes]
     for name in ("policy_obs_key", "value_obs_key", "estimated_obs_key"):
       key, optional = getattr(config, name, ""), bool(self.pixel_sizes) or name == "estimated_obs_key"
-      if key not in sizes.keys() - self.pixel_sizes.keys() and not (key == "" and optional):
-        entries = ", ".join(sizes) + "." + nearest(key, sizes)
-        raise ConfigError(f"agent.network.{name}={key!r} must be an entry of the task's observation: {entries}")
+      if key not in vectors and not (key == "" and optional):
+        what = "an entry of the task's observation" + " that is no picture" * bool(self.pixel_sizes)
+        entries = ", ".join(vectors) + "." + nearest(key, vectors)
+        raise ConfigError(f"agent.network.{name}={key!r} must be {what}: {entries}")
+    if self.estimated_obs_key and self.estimated_obs_key == config.policy_obs_key:
+      raise ConfigError(
+        f"agent.network.estimated_obs_key={self.estimated_obs_key!r} is what the actor reads: estimate another entry, "
+        'or have it read pictures alone (agent.network.policy_obs_key="").'
+      )
     self.precision = precision
     self.action_size = action_size
     self.activation = ACTIVATIONS[config.activation]
@@ -124,9 +131,7 @@ class Actor:
         return self._actor.apply(policy_params, *self._seen(obs, self.policy_obs_key))  # pyright: ignore[reportReturnType]
       return self.policy_network.apply(None, policy_params, obs[self.policy_obs_key])
 
-  def logits_and_estimate(
-    self, policy_params: Any, obs: Mapping[str, jax.Array]
-  ) -> tuple[jax.Array, jax.Array | None]:
+  def logits_and_estimate(self, policy_params: Any, obs: Mapping[str, jax.Array]) -> tuple[jax.Array, jax.Array | None]:
     """`logits`, and what the actor takes `estimated_obs_key` to be, normalised, [..., D]; None where that is empty."""
     if not self.estimated_obs_key:
       return self.logits(policy_params, obs), None
