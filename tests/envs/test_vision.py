@@ -23,14 +23,14 @@ PIXELS = "pixels/eye"
 
 
 class Shown:
-  """Stands in for the renderer: every pixel is 10 times the environment's age (s), red and blue one less and more."""
+  """Stands in for the renderer: the mean of colours is 100 times the environment's age (s); they differ."""
 
   def __init__(self, physics: Any, view: Any):
     self.view = view
 
   def render(self, model: Any, data: Any) -> tuple[Any, Any]:
     size = (self.view.height, self.view.width)
-    red, green, blue = (jnp.full(size, 100 * data.time + i) for i in (-1, 0, 1))
+    red, green, blue = (jnp.full(size, jnp.round(part * 100 * data.time)) for part in (0.4, 0.6, 2.0))
     rgb = jnp.stack([red, green, blue], axis=-1).astype(jnp.uint8)
     geom = jnp.round(10 * data.time).astype(jnp.int32) - 1  # at first there is none
     return {"eye": {"rgb": rgb, "depth": jnp.full(size, data.time), "segmentation": jnp.full(size, geom)}}, data
@@ -85,7 +85,7 @@ def test_pictures_stand_beside_the_tasks_own_observation(seeing: Any) -> None:
   assert env.observation_parts == {PIXELS: {"rgb[-1]": 3, "rgb[0]": 3}}
   states = roll(env, 1)
   assert states[0].obs[PIXELS].dtype == jnp.uint8
-  assert values(states[1])[-3:] == [9, 10, 11]
+  assert values(states[1])[-3:] == [4, 6, 20]
 
 
 def test_frames_are_of_this_episode_newest_last(seeing: Any) -> None:
