@@ -100,9 +100,10 @@ class BatchRenderer:
 
     @jax.custom_batching.custom_vmap
     def draw(model: mjx.Model, data: PhysicsData) -> Any:
-      context = self._context(len(data.time), lenses)
       axes = jax.tree.map(lambda is_own: 0 if is_own else None, own)
-      return jax.vmap(partial(self._render, context), (axes, 0))(model, data)
+      contexts = self._contexts_of(len(data.time), lenses)
+      branches = [jax.vmap(partial(self._render, context), (axes, 0)) for context in contexts]
+      return jax.lax.switch(_place(), branches, model, data) if len(branches) > 1 else branches[0](model, data)
 
     @draw.def_vmap
     def widen(count: int, mapped: Any, model: mjx.Model, data: PhysicsData) -> Any:
@@ -147,15 +148,19 @@ class BatchRenderer:
     token: Any = full._impl._jax_token  # pyright: ignore[reportOptionalMemberAccess]
     return pictures, token.sum().astype(data.time.dtype)
 
-  def _context(self, size: int, lenses: bool) -> Any:
-    """The renderer's buffers for a batch, on every device that the function being traced runs on."""
+  def _contexts_of(self, size: int, lenses: bool) -> list[Any]:
+    """The renderer's buffers for a batch, on every device that the function being traced runs on.
+
+    Of GPUs one context has the buffers of each. To Warp there is but one CPU: where JAX divides it into several
+    devices, which draw at the same time, each needs a context.
+    """
     devices, view = _devices(), self.view
     key = (size, lenses, *devices)
     if key not in self._contexts:
-      self._contexts[key] = mjx.create_render_context(
+      make = partial(
+        mjx.create_render_context,
         self._physics.mj_model,
         size,
-        devices=devices,
         cam_res=(view.width, view.height),
         cam_active=list(view.cameras),
         render_rgb="rgb" in view.kinds,
@@ -166,6 +171,8 @@ class BatchRenderer:
         use_precomputed_rays=not lenses,
         enabled_geom_groups=list(view.geom_groups),
       )
+      apart = [[device] for device in devices] if "cpu" in devices else [devices]
+      self._contexts[key] = [make(devices=together) for together in apart]
     return self._contexts[key]
 
 
@@ -176,8 +183,13 @@ def _bytes(packed: jax.Array) -> jax.Array:
 
 def _devices() -> list[str]:
   """Warp's names of this process's devices."""
-  if jax.default_backend() != "gpu":
-    return ["cpu"]
   # Inside a function that is mapped over a mesh, its devices: the first ones (hardware.mesh.make_mesh).
   count = max(1, jax.sharding.get_abstract_mesh().size // jax.process_count())
+  if jax.default_backend() != "gpu":
+    return ["cpu"] * count
   return [f"cuda:{device.local_hardware_id}" for device in jax.local_devices()[:count]]
+
+
+def _place() -> jax.Array:
+  """Which of `_devices()` the function being traced runs on, [] int32."""
+  return jax.lax.axis_index(jax.sharding.get_abstract_mesh().axis_names) % len(_devices())
