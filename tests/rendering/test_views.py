@@ -42,5 +42,5 @@ def test_views_differ_by_what_is_drawn(tmp_path: Path) -> None:
   env = registry.load("CartpoleBalanceVision", overrides={"vision.width": 16, "vision.height": 16})
   page = matplotlib.image.imread(save_views(env, [LIGHT], tmp_path / "new/views.png", count=2))
   assert page.shape[:2] == (18, 36)
-  left, right = page[:16, :16], page[:16, 18:34]
-  assert 0 < left.mean() != right.mean() > 0
+  left, right = (page[:16, x : x + 16, :3].max() for x in (0, 18))  # where it is brightest, poses make no difference
+  assert 0 < left != right > 0
