@@ -125,6 +125,8 @@ def test_the_gripper_lags_behind(state: State) -> None:
   assert {int(drawn(key)) for key in jax.random.split(jax.random.PRNGKey(1), 30)} == {0, 1, 2}
   held = state.replace(info=late, data=state.data.replace(ctrl=state.data.ctrl.at[7].set(0.03)))
   assert env.control(held, jnp.array([0.0, 0, 1]))[7] == pytest.approx(0.01)  # closes as it was to, two steps ago
+  sooner = held.replace(info=late | {"action_delay": jnp.array(1)})
+  assert env.control(sooner, jnp.array([0.0, 0, 1]))[7] > 0.03  # opens, as it was to one step ago
 
 
 def begun(env: Any, time: float, state: State) -> State:
