@@ -47,6 +47,7 @@ test-slurm: setup
 
 lint: setup
 	$(BIN)/ruff check
+	$(BIN)/ruff format --check
 	$(BIN)/pyright
 
 # The site is site/index.html. Strict: a link or a reference that leads nowhere is an error (mkdocs.yml).

@@ -176,9 +176,7 @@ class SAC(Learner):
     )
     return after, metrics
 
-  def _collect(
-    self, state: SACState, key: jax.Array, model: ModelFields
-  ) -> tuple[State, NonfiniteCapture, Transition]:
+  def _collect(self, state: SACState, key: jax.Array, model: ModelFields) -> tuple[State, NonfiniteCapture, Transition]:
     """Steps this device's environments once with sampled actions."""
     before = state.env_state
     action = self.act(self.policy(state), before.obs, key, deterministic=False)

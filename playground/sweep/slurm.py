@@ -87,9 +87,7 @@ class SlurmLauncher:
 
   outlives = True
 
-  def __init__(
-    self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND, executor: Any = None
-  ):
+  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND, executor: Any = None):
     """Args:
       sweep: what to launch.
       config: `launcher`.

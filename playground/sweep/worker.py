@@ -29,10 +29,10 @@ class Worker:
 
   def __init__(self, folder: Path, command: Sequence[str] = COMMAND, timeout: float | None = None, grace: float = 60.0):
     """Args:
-      folder: of the job, `<sweep>/jobs/<job>`.
-      command: what the job's overrides are handed to.
-      timeout: seconds until the job is asked to stop.
-      grace: seconds from then until it is killed.
+    folder: of the job, `<sweep>/jobs/<job>`.
+    command: what the job's overrides are handed to.
+    timeout: seconds until the job is asked to stop.
+    grace: seconds from then until it is killed.
     """
     self._folder = JobFolder(Path(folder).absolute())
     self._command = tuple(command)

@@ -48,6 +48,7 @@ PartitionName=low Nodes=node Default=YES PriorityTier=1 GraceTime=20 MaxTime=INF
 PartitionName=high Nodes=node PriorityTier=2 PreemptMode=OFF MaxTime=INFINITE
 """
 
+
 class SlurmCluster:
   """Says what its commands say."""
 

@@ -149,5 +149,3 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkey
     command.retry(path, "seed=3")
   with pytest.raises(CheckpointError, match=r"sweeep is not the folder of a sweep.*Did you mean 'sweep'"):
     command.status(str(tmp_path / "sweeep"))
-
-
