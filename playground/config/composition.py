@@ -27,7 +27,7 @@ from playground.config.chains import (
   stage_overrides,
 )
 from playground.config.files import DELTAS, config_roots, groups, options, search_path_override
-from playground.config.limits import check_limits
+from playground.config.limits import check_limits, check_vision
 from playground.config.overrides import (
   Override,
   canonical,
@@ -177,6 +177,7 @@ def _compose_new(parsed: Sequence[Override], files: Callable[..., _Files], roots
   config, choices, schema, added = files(*group_overrides(parsed))
   resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], schema)
   check_limits(resolved)
+  check_vision([override.key for override in parsed], resolved)
   check_chain(resolved, parsed, roots)
   head = {"name": choices.get("experiment") or choices["env"], "choices": dict(choices)}
   ordered = {key: resolved[key] for key in (*SCALARS, *SECTIONS) if key in resolved}

@@ -1,7 +1,7 @@
 """What types cannot say: choices, ranges, and sizes that must divide. A new limit is a new entry here."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from playground.config.schema import wrong_type
@@ -103,6 +103,13 @@ def check_limits(resolved: Mapping[str, Any]) -> None:
   if contacts is not None and convex is not None and convex > contacts:
     raise ConfigError(f"env.naccdmax_per_env={convex} must not be above env.naconmax_per_env={contacts}.")
   _check_batch(*(_get(resolved, f"agent.{key}") for key in ("num_envs", "batch_size", "num_minibatches")))
+
+
+def check_vision(said: Iterable[str], resolved: Mapping[str, Any]) -> None:
+  """Raises ConfigError where a command line says how a task sees (its keys are `said`) that sees nothing."""
+  unused = [key for key in said if key.startswith("env.vision.") and key != "env.vision.enable"]
+  if unused and _get(resolved, "env.vision.enable") is False:
+    raise ConfigError(f"{unused[0]}: this task sees nothing. Add env.vision.enable=true env.vision.camera=<name>.")
 
 
 def _check_batch(num_envs: int | None, batch_size: int | None, num_minibatches: int | None) -> None:

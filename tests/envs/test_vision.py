@@ -162,3 +162,7 @@ def test_the_settings_are_there_for_every_task() -> None:
     compose(["env=Go1JoystickFlatTerrain", "env.vision.image=grey"])
   with pytest.raises(ConfigError, match=r"env.vision.frames=0 must be a number above 0"):
     compose(["env=Go1JoystickFlatTerrain", "env.vision.frames=0"])
+  for blind in ("env=Go1JoystickFlatTerrain", "env=CartpoleBalanceVision env.vision.enable=false"):
+    compose(blind.split())
+    with pytest.raises(ConfigError, match=r"env.vision.camera: this task sees nothing. Add env.vision.enable=true"):
+      compose([*blind.split(), "env.vision.camera=track"])
