@@ -68,13 +68,15 @@ class Learner(abc.ABC):
   Config: ClassVar[Any]
 
   def __init__(self, env: Env, config: Any, mesh: Mesh, networks: Actor, steps_per_update: int, spec: Any):
-    """Args:
-    env: the task.
-    config: hyperparameters, checked.
-    mesh: devices, one axis named "data".
-    networks: the algorithm's networks.
-    steps_per_update: see above.
-    spec: a training state of PartitionSpecs, how it is divided over the mesh.
+    """Takes the task and its networks.
+
+    Args:
+      env: the task.
+      config: hyperparameters, checked.
+      mesh: devices, one axis named "data".
+      networks: the algorithm's networks.
+      steps_per_update: see above.
+      spec: a training state of PartitionSpecs, how it is divided over the mesh.
     """
     self.config = config
     self.mesh = mesh

@@ -160,16 +160,18 @@ class Loop:
     eval_model: ModelFields,
     save_every_s: float = 300.0,
   ):
-    """Args:
-    learner: the algorithm.
-    program: its compiled functions.
-    marks: the schedule.
-    seed: of the run; evaluations and resets draw from it and the mark they belong to, so they do not depend on
-      where the run was interrupted.
-    hooks: called with rows, states to keep and for whether to stop.
-    model: randomised model fields of the training environments.
-    eval_model: of the evaluation environments.
-    save_every_s: a state is kept at every evaluation, and at marks when this long has passed since the last.
+    """Takes what there is to run.
+
+    Args:
+      learner: the algorithm.
+      program: its compiled functions.
+      marks: the schedule.
+      seed: of the run; evaluations and resets draw from it and the mark they belong to, so they do not depend on
+        where the run was interrupted.
+      hooks: called with rows, states to keep and for whether to stop.
+      model: randomised model fields of the training environments.
+      eval_model: of the evaluation environments.
+      save_every_s: a state is kept at every evaluation, and at marks when this long has passed since the last.
     """
     self._learner = learner
     self._program = program

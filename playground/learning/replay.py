@@ -32,10 +32,12 @@ class ReplayBuffer:
   """Puts transitions in and draws them; pure functions on `Replay`, each device on its share of the environments."""
 
   def __init__(self, max_size: int, num_envs: int, example: Any):
-    """Args:
-    max_size: transitions at most, rounded down to whole steps of all environments.
-    num_envs: environments, over all devices.
-    example: one transition, a tree of float32 arrays or their shapes.
+    """Sizes an empty buffer.
+
+    Args:
+      max_size: transitions at most, rounded down to whole steps of all environments.
+      num_envs: environments, over all devices.
+      example: one transition, a tree of float32 arrays or their shapes.
     """
     row, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, jnp.float32), example))
     self.slots, self.num_envs, self.width = max_size // num_envs, num_envs, row.size

@@ -28,11 +28,13 @@ class Worker:
   """Runs one job. `stop` may be called by a signal handler or another thread."""
 
   def __init__(self, folder: Path, command: Sequence[str] = COMMAND, timeout: float | None = None, grace: float = 60.0):
-    """Args:
-    folder: of the job, `<sweep>/jobs/<job>`.
-    command: what the job's overrides are handed to.
-    timeout: seconds until the job is asked to stop.
-    grace: seconds from then until it is killed.
+    """Takes charge of a job.
+
+    Args:
+      folder: of the job, `<sweep>/jobs/<job>`.
+      command: what the job's overrides are handed to.
+      timeout: seconds until the job is asked to stop.
+      grace: seconds from then until it is killed.
     """
     self._folder = JobFolder(Path(folder).absolute())
     self._command = tuple(command)
