@@ -1,13 +1,14 @@
 """One row a number: the columns of every table that `playground-bench` writes, and the file that holds them."""
 
 import csv
-import threading
-from collections.abc import Iterable, Mapping
+import fcntl
+import io
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from playground.errors import ConfigError
-from playground.runs.files import write_text
 
 COLUMNS = {
   "benchmark": "the command: throughput, startup, scaling, breakdown, pixels, topology, chain, compare, learning",
@@ -45,11 +46,12 @@ QUANTITIES = {
   "wall_clock_s": "of a run without compiling (conditions say where it is in), evaluations included",
 }
 
-KEY = ("benchmark", "task", "agent", "who", "setting", "seed", "quantity", "devices", "device")
-
 
 class Table:
-  """A CSV of rows that grows while measuring; every row is complete on disk as soon as it is added."""
+  """A CSV of rows that grows while measuring; every row is complete on disk as soon as it is added.
+
+  Several commands may add to one at the same time: each has the file to itself while it writes.
+  """
 
   def __init__(self, path: Path):
     """Opens or begins the table; what a kill left of a half-written last row is dropped.
@@ -57,43 +59,67 @@ class Table:
     Raises:
       ConfigError: the file holds something else, or cannot be written.
     """
-    self.path, self._lock = path, threading.Lock()
+    self.path = path
     self._rows: list[dict[str, str]] = []
-    try:
-      path.parent.mkdir(parents=True, exist_ok=True)
-      if path.is_file() and path.stat().st_size:
-        text = path.read_text(encoding="utf-8")
-        whole, newline, rest = text.rpartition("\n")
-        if rest:
-          write_text(path, whole + newline)
-        reader = csv.DictReader(whole.splitlines())
-        if list(reader.fieldnames or ()) != list(COLUMNS):
-          raise ConfigError(f"out={path} is not a table of playground-bench: name another file.")
-        self._rows = list(reader)
-      else:
-        path.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-      raise ConfigError(f"out={path} cannot be used: {getattr(error, 'strerror', None) or error}.") from None
+    with self._to_itself() as file:
+      text = file.read().decode("utf-8", "replace")  # a kill may have cut a character
+      if not text:
+        file.write((",".join(COLUMNS) + "\n").encode())
+      elif next(csv.reader([text.partition("\n")[0]])) != list(COLUMNS):
+        raise ConfigError(f"out={path} is not a table of playground-bench: name another file.")
+      _end_last_row(file)
+      self._rows = list(_rows_of(file))
 
   def add(self, row: Mapping[str, Any]) -> None:
     """Appends a row; columns it does not name are empty.
 
     Raises:
       KeyError: a column or quantity that the schema does not have.
+      ConfigError: the file cannot be written any more.
     """
     if unknown := set(row) - set(COLUMNS):
       raise KeyError(f"no columns of a row: {unknown}")
     if row["quantity"] not in QUANTITIES:
       raise KeyError(f"{row['quantity']} is not in QUANTITIES")
     full = {name: "" if row.get(name) is None else str(row[name]) for name in COLUMNS}
-    with self._lock, self.path.open("a", encoding="utf-8", newline="") as file:
-      csv.DictWriter(file, list(COLUMNS), lineterminator="\n").writerow(full)
-      self._rows.append(full)
+    line = io.StringIO()
+    csv.DictWriter(line, list(COLUMNS), lineterminator="\n").writerow(full)
+    with self._to_itself() as file:
+      _end_last_row(file)
+      file.write(line.getvalue().encode())
+    self._rows.append(full)
 
   def has(self, wanted: Mapping[str, Any]) -> bool:
     """Whether there is a row with these columns."""
     texts = {name: str(value) for name, value in wanted.items()}
     return any(all(row[name] == text for name, text in texts.items()) for row in self._rows)
+
+  @contextmanager
+  def _to_itself(self) -> Iterator[BinaryIO]:
+    """The file, to read and append to, while no other process or thread has it."""
+    try:
+      self.path.parent.mkdir(parents=True, exist_ok=True)
+      with self.path.open("a+b") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.seek(0)
+        yield file
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+      raise ConfigError(f"out={self.path} cannot be used: {getattr(error, 'strerror', None) or error}.") from None
+
+
+def _rows_of(file: BinaryIO) -> Iterable[dict[str, str]]:
+  file.seek(0)
+  return csv.DictReader(io.StringIO(file.read().decode("utf-8"), newline=""))
+
+
+def _end_last_row(file: BinaryIO) -> None:
+  """Drops what a kill left of a half-written row; one that only lacks its line's end, as editors leave it, stays."""
+  file.seek(0)
+  whole, newline, rest = file.read().rpartition(b"\n")
+  if rest and len(next(csv.reader([rest.decode("utf-8", "replace")]))) == len(COLUMNS):
+    file.write(b"\n")
+  elif rest:
+    file.truncate(len(whole + newline))
 
 
 def mean_and_ci95(values: Iterable[float]) -> tuple[float, float | None]:
