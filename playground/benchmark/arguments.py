@@ -1,6 +1,7 @@
 """A command's arguments: `key=value` for the fields of a dataclass, and overrides of the run's configuration."""
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Sequence
@@ -56,6 +57,25 @@ def parse(command: str, options: type[T], arguments: Sequence[str]) -> T:
   return options(**values)
 
 
+def check_amounts(options: Any) -> None:
+  """Raises ConfigError for amounts that cannot be, by the names that all commands have for them."""
+  given = vars(options)
+  for name in ("seconds", "minutes"):
+    if (value := given.get(name)) is not None and not 0 < value < math.inf:
+      raise ConfigError(f"{name}={value:g} must be a number above 0.")
+  for name in ("workers", "seeds", "repeats", "num_timesteps"):
+    if (value := given.get(name)) is not None and value < 1:
+      raise ConfigError(f"{name}={value} must be at least 1.")
+  for name in ("sizes", "num_envs", "devices"):
+    if min(values := given.get(name, ()), default=1) < 1:
+      raise ConfigError(f"{name}={list(values)} must be numbers above 0.")
+  if min(gpus := given.get("gpus", ()), default=0) < 0:
+    raise ConfigError(f"gpus={list(gpus)} must be numbers of GPUs, the first is 0.")
+  for name in ("sizes", "num_envs", "hyperparameters", "backends"):
+    if given.get(name) == ():
+      raise ConfigError(f"{name}= is empty: name at least one, or leave it away.")
+
+
 def help_of(options: type) -> list[str]:
   """A line for each key: its default and what it does."""
   fields = [field for field in dataclasses.fields(options) if field.name != OVERRIDES]
@@ -72,7 +92,8 @@ def _read(key: str, text: str, kind: Any) -> Any:
   (kind,) = (choice for choice in choices if choice is not type(None))
   if typing.get_origin(kind) is tuple:
     item = typing.get_args(kind)[0]
-    return tuple(_item(key, part.strip(), item) for part in text.strip("[]()").split(",") if part.strip())
+    parts = (part.strip() for part in text.strip("[]()").split(","))
+    return tuple(dict.fromkeys(_item(key, part, item) for part in parts if part))  # each once: none is measured twice
   return _item(key, text, kind)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from playground.benchmark.arguments import option
+from playground.benchmark.arguments import check_amounts, option
 from playground.benchmark.jobs import Job, Plan, probe, run_jobs
 from playground.benchmark.peer import PEERS, check_peer
 from playground.benchmark.schema import Table
@@ -58,8 +58,7 @@ class Measuring(abc.ABC):
 
   def check(self) -> None:
     """Raises PlaygroundError for what cannot be measured, before anything expensive."""
-    if self.workers < 1:
-      raise ConfigError(f"workers={self.workers} must be at least 1.")
+    check_amounts(self)
     if self.alone and self.workers > 1:
       raise ConfigError(f"workers={self.workers}: {self.name} wants the machine to itself, workers=1.")
 
@@ -77,10 +76,17 @@ class OfTasks(Measuring):
   agent: str = option("ppo", "ppo or sac")
   seconds: float = option(4.0, "how long to time each number, at least one update")
 
+  sets_devices = True  # whether a device's number is the command's to say
+
   def check(self) -> None:
     super().check()
     check_agent(self.agent)
-    self.configured(self.chosen()[0])
+    if self.sets_devices and any(text.lstrip("+").startswith("hardware.devices=") for text in self.overrides):
+      raise ConfigError(
+        f"hardware.devices= is no override of {self.name}: only topology, with devices=, measures on several."
+      )
+    for task in self.chosen() if self.overrides else self.chosen()[:1]:  # without any, all go as they are
+      self.configured(task)
 
   def chosen(self) -> list[str]:
     return choose_tasks(self.suite, self.tasks)
@@ -96,6 +102,7 @@ class OfTasks(Measuring):
       agent = self.configured(task).agent
       batch = agent.batch_size * max(1, -(-count // (agent.batch_size * agent.num_minibatches)))
       setting += [f"agent.batch_size={batch}"] * (batch != agent.batch_size)
+    self.configured(task, *setting)  # a number that does not fit is said here
     return setting
 
   def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: Any) -> Job:
@@ -120,8 +127,6 @@ class OfRuns(OfTasks):
     super().check()
     if any(text.lstrip("+").startswith("agent.num_timesteps=") for text in self.overrides):
       raise ConfigError(f"agent.num_timesteps= is no override of {self.name}: give num_timesteps=, for all whole runs.")
-    if self.num_timesteps is not None and self.num_timesteps < 1:
-      raise ConfigError(f"num_timesteps={self.num_timesteps} must be at least 1.")
 
   def budget(self) -> list[str]:
     return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
@@ -153,6 +158,7 @@ class Startup(OfTasks):
 
   name = "startup"
   alone = True
+  sets_devices = False
 
   def jobs(self, facts: dict[str, Any]) -> list[Job]:
     last = {"quantity": "start_to_first_update_s", "setting": " ".join((*self.overrides, "warm"))}
@@ -209,9 +215,6 @@ class Pixels(OfTasks):
     super().check()
     if self.agent != "ppo":
       raise ConfigError(f"agent={self.agent} reads no pictures: pixels is of agent=ppo.")
-    for name in ("sizes", "num_envs"):
-      if min(getattr(self, name), default=0) < 1:
-        raise ConfigError(f"{name}={list(getattr(self, name))} must be numbers above 0.")
     if self.compared and self.chosen() != ["CartpoleBalanceVision"]:
       raise ConfigError("compared=true is of CartpoleBalanceVision alone: leave tasks= and suite= away.")
     for task in self.chosen():
@@ -254,6 +257,8 @@ class Topology(OfRuns):
 
   def jobs(self, facts: dict[str, Any]) -> list[Job]:
     counts = self.devices or [2**i for i in range(facts["devices"].bit_length())]
+    if max(counts) > facts["devices"]:
+      raise ConfigError(f"devices={list(counts)}: this machine has {facts['devices']}.")
     seeds = list(range(1, self.seeds + 1))
     rates, runs = [], []
     for task in self.chosen():
@@ -310,6 +315,8 @@ class BesidePeer(OfTasks):
 
   def check(self) -> None:
     super().check()
+    if others := set(self.backends) - {"jax", "warp"}:
+      raise ConfigError(f"backends={','.join(sorted(others))} does not exist: choose from jax, warp.")
     if self.agent not in self.agents:
       raise ConfigError(f"agent={self.agent}: {self.name} is of {' or '.join(self.agents)}.")
     check_peer(self.peer, self.peer_python, self.peer_path, self.peer_menagerie)

@@ -33,6 +33,7 @@ def test_types_and_lists():
     ("A", "B"), (4, 1000), 2.0, rerun=True, overrides=("agent.num_envs=64", "hardware=cpu")
   )
   assert parse("some", Some, ["out=null"]).out is None
+  assert parse("some", Some, ["tasks=A,B,A", "counts=2,2.0"]) == Some(("A", "B"), (2,)), "each once"
   assert parse("some", Some, []) == Some()
 
 

@@ -233,7 +233,7 @@ def test_topology_trains_whole_runs_after_the_rates():
 
 
 def test_whole_runs_that_were_stopped_go_on_where_they_are_missing(tmp_path: Path):
-  jobs = Topology(tasks=("CheetahRun",), seeds=2, devices=(1,), num_timesteps=5000).jobs({})
+  jobs = Topology(tasks=("CheetahRun",), seeds=2, devices=(1,), num_timesteps=5000).jobs({"devices": 1})
   table, facts = Table(tmp_path / "rows.csv"), {"device": "a device"}
   left = lambda: [(job.measure, job.arguments["seeds"]) for each in jobs if (job := each.left(table, facts))]
   whole = {**jobs[1].columns, **facts, "seed": 1}

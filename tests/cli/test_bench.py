@@ -7,6 +7,7 @@ import pytest
 
 from playground.benchmark import commands
 from playground.cli.bench import main
+from playground.errors import ConfigError
 from tests.command import Command, caller
 
 
@@ -32,6 +33,19 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     (["throughput", "tasks=CheetahRun", "seeds=many"], "must be a whole number"),
     (["throughput", "tasks=CheetahRun", "workers=0"], "must be at least 1"),
     (["throughput", "tasks=CheetahRun", "agent.num_env=64"], "agent.num_env"),
+    (["throughput", "tasks=CheetahRun", "seeds=0"], "seeds=0 must be at least 1"),
+    (["throughput", "tasks=CheetahRun", "seconds=-1"], "seconds=-1 must be a number above 0"),
+    (["throughput", "tasks=CheetahRun", "seconds=inf"], "seconds=inf must be a number above 0"),
+    (["throughput", "tasks=CheetahRun", "minutes=nan"], "minutes=nan must be a number above 0"),
+    (["throughput", "tasks=CheetahRun", "gpus=[-1]"], "gpus=[-1] must be numbers of GPUs"),
+    (["throughput", "tasks=CheetahRun", "hardware.devices=2"], "hardware.devices= is no override of throughput"),
+    (["throughput", "tasks=CartpoleBalance,CheetahRun", "env.swing_up=true"], "env.swing_up does not exist"),
+    (["scaling", "tasks=CheetahRun", "num_envs="], "num_envs= is empty"),
+    (["scaling", "tasks=CheetahRun", "num_envs=64,-4"], "num_envs=[64, -4] must be numbers above 0"),
+    (["topology", "tasks=CheetahRun", "devices=0"], "devices=[0] must be numbers above 0"),
+    (["topology", "tasks=CheetahRun", "hyperparameters="], "hyperparameters= is empty"),
+    (["compare", "tasks=CheetahRun", "repeats=0"], "repeats=0 must be at least 1"),
+    (["learning", "tasks=CheetahRun", "backends=jax,cuda"], "backends=cuda does not exist: choose from jax, warp"),
     (["startup", "tasks=CheetahRun", "workers=2"], "wants the machine to itself"),
     (["topology", "tasks=CheetahRun", "hyperparameters=doubled"], "must be fixed, scaled or both"),
     (["chain", "experiment=go1_joystick"], "is no chain"),
@@ -58,6 +72,14 @@ def test_help(command: Command, capsys: pytest.CaptureFixture[str]):
   assert all(name in listed for name in (*commands.COMMANDS, "report", "gate"))
   assert command("throughput", "--help") == 0
   assert "seeds=5" in capsys.readouterr().out
+
+
+def test_what_does_not_fit_the_machine_or_the_task_is_said_before_anything_is_compiled():
+  with pytest.raises(ConfigError, match=r"^devices=\[1, 4\]: this machine has 2\.$"):
+    commands.Topology(tasks=("CartpoleBalance",), devices=(1, 4)).jobs({"devices": 2})
+  with pytest.raises(ConfigError, match=r"agent\.num_envs=3"):
+    commands.Scaling(tasks=("CartpoleBalance",), num_envs=(3,)).jobs({})
+  commands.Startup(tasks=("CartpoleBalance",), overrides=("hardware.devices=1",)).check()
 
 
 def test_commands_stand_for_jobs():
