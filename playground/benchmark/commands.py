@@ -13,6 +13,7 @@ from playground.benchmark.schema import Table
 from playground.benchmark.suites import check_agent, choose_tasks, tasks_of
 from playground.config import RunConfig, compose
 from playground.errors import ConfigError
+from playground.runs.files import need_folder
 
 RESULTS = Path("results/benchmarks")
 TRAINING = "training_steps_per_s"
@@ -284,12 +285,14 @@ class Chain(Measuring):
 
   def check(self) -> None:
     super().check()
+    need_folder(Path(self.runs), f"runs={self.runs}")
     if not compose([f"experiment={self.experiment}", *self.overrides]).stages:
       raise ConfigError(f"experiment={self.experiment} is no chain: choose one that ends in _chain.")
 
   def jobs(self, facts: dict[str, Any]) -> list[Job]:
     agent = compose([f"experiment={self.experiment}", *self.overrides]).agent.name
-    arguments = {"experiment": self.experiment, "overrides": list(self.overrides), "runs": self.runs}
+    arguments = {"experiment": self.experiment, "overrides": list(self.overrides)}
+    arguments |= {"runs": self.runs, "again": self.rerun}
     columns = self.columns(self.experiment, agent)
     last = {"quantity": "wall_clock_s", "setting": " ".join((*self.overrides, "stage=all"))}
     seeds = range(1, self.seeds + 1)

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from playground.benchmark.schema import Table
+from playground.benchmark.schema import Table, commit_of
 from playground.benchmark.worker import ERROR, ROW
 from playground.errors import HardwareError
 from playground.runs.provenance import git_state
@@ -97,9 +97,9 @@ def run_jobs(jobs: Sequence[Job], table: Table, facts: Mapping[str, Any], plan: 
   deadline = None if plan.minutes is None else time.monotonic() + 60 * plan.minutes
   reasons: list[str | None] = []  # of each job that was run, why it failed
   stop = threading.Event()
-  commit, slots = plan.commit or _commit(), plan.gpus or (None,)
+  commit, slots = plan.commit or commit_of(git_state()), plan.gpus or (None,)
   remarks = [f"{plan.workers} processes at once, one timed at a time on a device"] if plan.workers > 1 else []
-  remarks += ["caches of earlier runs" if plan.cache else "cold caches", plan.note]
+  remarks += ["caches of earlier runs" if plan.cache else "cold caches", " ".join(plan.note.split())]
 
   def work(folder: str, slot: int) -> None:
     gpu = slots[slot % len(slots)]
@@ -114,7 +114,7 @@ def run_jobs(jobs: Sequence[Job], table: Table, facts: Mapping[str, Any], plan: 
         conditions = "; ".join(part for part in (row.get("conditions", ""), *remarks) if part)
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         here = {name: facts[name] for name in ("device", "versions")}
-        table.add({**job.columns, **here, **row, "commit": commit, "conditions": conditions, "date": now})
+        table.add({**job.columns, **here, "commit": commit, **row, "conditions": conditions, "date": now})
         where = [row["setting"]] if "setting" in row else []
         where += [f"seed {row['seed']}"] if "seed" in row else []
         print(f"{job}: {row['quantity']} {row['value']:,} {row['unit']} {' '.join(where)}".rstrip(), flush=True)
@@ -140,7 +140,10 @@ def run_jobs(jobs: Sequence[Job], table: Table, facts: Mapping[str, Any], plan: 
   left = len(todo) - len(reasons) + reasons.count(OUT_OF_TIME)
   print(f"{reasons.count(None)} measured, {failed} failed, {left} left: {table.path}")
   if left:
-    print("The time was up: the same command measures the rest.")
+    rest = (
+      "name what is left in tasks=, for rerun=true begins anew" if plan.rerun else "the same command measures the rest"
+    )
+    print(f"The time was up: {rest}.")
   return 1 if failed else 3 if left else 0
 
 
@@ -212,8 +215,3 @@ def _end(process: "subprocess.Popen[str]") -> None:
 def _signal(process: "subprocess.Popen[str]", number: int) -> None:
   with contextlib.suppress(ProcessLookupError):
     os.killpg(process.pid, number)
-
-
-def _commit() -> str:
-  state = git_state()
-  return "" if state is None else state["commit"][:7] + "+" * state["dirty"]

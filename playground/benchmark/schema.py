@@ -122,6 +122,11 @@ def _end_last_row(file: BinaryIO) -> None:
     file.truncate(len(whole + newline))
 
 
+def commit_of(git: Mapping[str, Any] | None) -> str:
+  """The column `commit` for what `git_state` says."""
+  return "" if git is None else git["commit"][:7] + "+" * git["dirty"]
+
+
 def mean_and_ci95(values: Iterable[float]) -> tuple[float, float | None]:
   """Mean, and half the width of its 95 % confidence interval (Student's t); None from one value."""
   import numpy as np

@@ -16,7 +16,7 @@ from playground.benchmark.schema import Table
 from playground.errors import HardwareError
 
 FACTS = {"device": "a device", "versions": "1.0"}
-PLAN = Plan(rerun=False, minutes=None, workers=1, gpus=(), cache=True, commit="abc", note="a note")
+PLAN = Plan(rerun=False, minutes=None, workers=1, gpus=(), cache=True, commit="abc", note="a\n note")
 WORKER = """
 import json, os, sys, time
 job = json.loads(sys.argv[1]); measure, arguments = job["measure"], job["arguments"]
@@ -90,7 +90,11 @@ def test_the_time_is_kept_and_rows_so_far_stay(tmp_path: Path, capsys: pytest.Ca
   plan = Plan(**{**vars(PLAN), "minutes": 1.5 / 60})
   assert run_jobs([job("sleep", "S"), job("train", "T")], table, FACTS, plan) == 3
   assert table.has({"task": "S", "seed": 1}) and not table.has({"task": "T"})
-  assert "0 failed, 2 left" in capsys.readouterr().out
+  said = capsys.readouterr().out
+  assert "0 failed, 2 left" in said and "the same command measures the rest" in said
+  again = Plan(**{**vars(plan), "minutes": 1e-9, "rerun": True})
+  assert run_jobs([job("train", "T")], table, FACTS, again) == 3
+  assert "name what is left in tasks=, for rerun=true begins anew" in capsys.readouterr().out
 
 
 def test_workers_are_spread_over_gpus(tmp_path: Path):

@@ -58,23 +58,56 @@ def test_rate_counts_all_of_the_time():
   assert math.isclose(speed, 10 * sum(calls[1:]) / taken)
 
 
-def test_a_finished_chain_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-  from playground.benchmark.measures import chain
-
-  run = tmp_path / "some_chain_seed_2"
+def write_chain(run: Path, final_return: float = 4.0) -> None:
+  """A finished chain of two stages."""
   manifest = {"impl": "jax", "num_devices": 1, "matmul_precision": "highest", "network_precision": "highest"}
+  manifest["git"] = {"commit": "0123456789", "dirty": True}
   one = {"name": "walk", "folder": "1_walk", "env": "A", "final_return": 3.0, "steps": 100, "wall_clock_s": 5.0}
   two = {"name": "run", "folder": "2_run", "env": "B", "final_return": 4.0, "steps": 50, "wall_clock_s": 2.0}
-  whole = {"env": "B", "final_return": 4.0, "steps": 150, "wall_clock_s": 7.0, "stages": [one, two]}
+  whole = {"env": "B", "final_return": final_return, "steps": 150, "wall_clock_s": 7.0, "stages": [one, two]}
   for folder in ("", "1_walk", "2_run"):
-    (run / folder).mkdir(parents=True)
+    (run / folder).mkdir(parents=True, exist_ok=True)
     write_json(run / folder / "manifest.json", manifest)
   write_json(run / "summary.json", whole)
   write_json(run / "status.json", {"status": "finished"})
-  chain.measure(Facts(), "some_chain", [], str(tmp_path), seeds=[2], lock=None)
-  found = {(row["setting"], row["quantity"]): row["value"] for row in rows(capsys)}
+
+
+def test_a_finished_chain_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+  from playground.benchmark.measures import chain
+
+  write_chain(tmp_path / "some_chain_seed_2")
+  chain.measure(Facts(), "some_chain", [], str(tmp_path), again=False, seeds=[2], lock=None)
+  given = rows(capsys)
+  found = {(row["setting"], row["quantity"]): row["value"] for row in given}
   assert found["stage=walk", "final_return"] == 3.0 and found["stage=run", "wall_clock_s"] == 2.0
   assert found["stage=all", "wall_clock_s"] == 7.0 and found["stage=all", "steps"] == 150
+  assert {row["commit"] for row in given} == {"0123456+"}, "that of the run, whatever reads it"
+
+
+def test_a_chain_of_other_overrides_or_again_is_another_run(
+  monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+  from playground.benchmark.measures import chain
+
+  begun: list[str] = []
+
+  def train(overrides: list[str]) -> None:
+    begun.append(overrides[-1])
+    write_chain(Path(overrides[-1].partition("=")[2]), final_return=10.0 * len(begun))
+
+  def measured(overrides: list[str], again: bool = False) -> float:
+    chain.measure(Facts(), "some_chain", overrides, str(tmp_path), again=again, seeds=[2], lock=None)
+    return next(r["value"] for r in rows(capsys) if r["quantity"] == "final_return" and "stage=all" in r["setting"])
+
+  monkeypatch.setattr(chain, "run_training", train)
+  assert [measured(["a=1"]), measured(["a=2"]), measured([]), measured(["a=1"])] == [10.0, 20.0, 30.0, 10.0]
+  assert [measured(["a=1"], again=True), measured([], again=True)] == [40.0, 50.0]
+  assert len(set(begun)) == 5, "nothing is overwritten"
+
+  stopped = tmp_path / "some_chain_seed_2_2"
+  (stopped / "status.json").write_text('{"status": "preempted"}')
+  (stopped / "config.yaml").touch()
+  assert measured([], again=True) == 60.0 and begun[-1] == f"resume={stopped}"
 
 
 def test_a_peer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -49,6 +49,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     (["startup", "tasks=CheetahRun", "workers=2"], "wants the machine to itself"),
     (["topology", "tasks=CheetahRun", "hyperparameters=doubled"], "must be fixed, scaled or both"),
     (["chain", "experiment=go1_joystick"], "is no chain"),
+    (["chain", f"runs={__file__}/runs"], "test_bench.py is not a folder that you may write to"),
     (["compare", "tasks=CheetahRun", "peer=playground021"], "Did you mean 'playground020'?"),
     (["compare", "tasks=CheetahRun", "peer_python=no_such_python"], "cannot be run"),
     (["compare", "tasks=CheetahRun", f"peer_python={sys.executable}"], "playground 0.2.0 is not installed"),
