@@ -106,6 +106,48 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
   assert list(shares[1:8]) == ["1", "2", "", "", "", "", "7"]
 
 
+def test_memory_is_that_of_the_same_measurement(tmp_path: Path):
+  envs = {"benchmark": "scaling", "setting": "agent.num_envs=8 env.impl=jax agent.num_envs=64 agent.batch_size=32"}
+  found = evidence(
+    tmp_path,
+    {**envs, "quantity": "env_steps_per_s", "value": 1e4},
+    {**envs, "quantity": "peak_memory_gib", "value": 1.0},
+    {**envs, "quantity": "training_steps_per_s", "value": 1e3, "seed": 1},
+    {**envs, "quantity": "peak_memory_gib", "value": 3.0, "seed": 1},
+    {**envs, "quantity": "training_steps_per_s", "value": 10.0, "seed": 1, "agent": "sac"},
+  )
+  assert [list(row[:5]) for row in table_with(page(found), "environments").rows] == [
+    ["CheetahRun env.impl=jax", "environment", "64", "10,000", "1.00"],
+    ["CheetahRun env.impl=jax", "training", "64", "1,000", "3.00"],
+    ["CheetahRun sac env.impl=jax", "training", "64", "10", ""],
+  ]
+
+
+def test_a_breakdown_is_of_one_algorithm_and_setting(tmp_path: Path):
+  row = {"benchmark": "breakdown", "quantity": "seconds_per_step"}
+  sac, small = {"agent": "sac", "date": "2026-02-01"}, "agent.num_envs=64 "
+  found = evidence(
+    tmp_path,
+    *({**row, "setting": f"part={part}", "value": value} for part, value in (("storing", 2e-6), ("update", 4e-6))),
+    *({**row, **sac, "setting": f"part={part}", "value": value} for part, value in (("task", 1e-5), ("update", 4e-5))),
+    {**row, "setting": f"{small}part=update", "value": 5e-6, "date": "2026-01-02"},
+    {**row, "setting": f"{small}part=update", "value": 6e-6, "date": "2026-01-03", "commit": "new"},
+  )
+  table = table_with(page(found), "update (µs)")
+  shown = {row[0]: [cell for cell in row[1:8] if cell] for row in table.rows}
+  assert shown == {"CheetahRun": ["2", "2"], "CheetahRun sac": ["10", "30"], "CheetahRun agent.num_envs=64": ["6"]}
+
+
+def test_what_overrides_changed_is_said(tmp_path: Path):
+  start = {"benchmark": "startup", "quantity": "start_to_first_update_s"}
+  rate = {"benchmark": "topology", "setting": "env.impl=jax hardware.devices=1", "seed": 1, "agent": "sac"}
+  found = evidence(tmp_path, {**start, "setting": "agent.num_envs=64 warm", "value": 9.0}, {**rate, "value": 60.0})
+  blocks = page(found)
+  starts = [list(row[:3]) for row in table_with(blocks, "caches").rows]
+  assert starts == [["CheetahRun agent.num_envs=64", "warm", "9.0"]]
+  assert table_with(blocks, "efficiency").rows[0][0] == "CheetahRun sac env.impl=jax"
+
+
 def test_only_what_one_call_measured_stands_beside_each_other(tmp_path: Path):
   speed = {"benchmark": "compare", "quantity": "training_steps_per_s", "seed": 1}
   peer = {**speed, "who": "playground 0.2.0"}
@@ -204,6 +246,27 @@ def test_the_committed_results_make_a_page(tmp_path: Path):
   assert all(f"| {task} | " in markdown and f"<td>{task}</td>" in html for task in tasks)
   assert "src=" not in html and 'href="http' not in html, "it needs nothing beside it"
   assert (tmp_path / "report_pictures" / "curves.svg").is_file()
+
+
+def test_rows_that_are_being_written_and_damaged_ones(tmp_path: Path):
+  found = evidence(tmp_path, {"seed": 1, "value": 1e6})
+  assert len(found.rows) == 1
+  path = tmp_path / "rows.csv"
+  whole = path.read_text()
+  path.write_text(whole + "throughput,CheetahRun,ppo,ours,,2,training_steps_per_s,9")
+  assert [row["value"] for row in Evidence([tmp_path]).rows] == [1e6], "90000 may have been meant"
+  for value, message in (
+    ("1000 or so", "has '1000 or so' where a number belongs"),
+    ("1,000", "has a line of too many columns"),
+  ):
+    path.write_text(whole.replace("1000000.0", value))
+    with pytest.raises(ConfigError, match=message):
+      run(Options(out=str(tmp_path), rows=(str(tmp_path),)))
+
+
+def test_a_folder_of_rows_that_is_not_there_is_named(tmp_path: Path):
+  with pytest.raises(ConfigError, match=r"^rows=.*/none is not a folder"):
+    run(Options(out=str(tmp_path), rows=(str(REFERENCE), str(tmp_path / "none"))))
 
 
 def test_without_rows_it_says_so(tmp_path: Path):

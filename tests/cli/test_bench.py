@@ -55,7 +55,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     (["compare", "tasks=CheetahRun", f"peer_python={sys.executable}"], "playground 0.2.0 is not installed"),
     (["compare", "tasks=CheetahRun", "agent=sac"], "compare is of ppo"),
     (["learning", "tasks=CheetahRun", "peer_menagerie=no_such_folder"], "holds no robot models"),
-    (["report", "rows=no_such_folder"], "no measured row"),
+    (["report", "rows=no_such_folder"], "rows=no_such_folder is not a folder"),
   ],
 )
 def test_a_mistake_is_one_sentence(

@@ -11,6 +11,7 @@ from playground.benchmark.report.pixels import pixels
 from playground.errors import ConfigError
 from playground.runs.files import need_folder, write_text
 
+ROWS = ("results/reference", "results/benchmarks")
 PICTURES = "report_pictures"
 TITLE = "Measured"
 SECTIONS = (
@@ -24,17 +25,20 @@ class Options:
   """One page, report.md and report.html: the paper's tables with our column, curves, bars, conditions."""
 
   out: str = option("results/benchmarks", "folder of the page")
-  rows: tuple[str, ...] = option(("results/reference", "results/benchmarks"), "folders whose CSVs it is made of")
+  rows: tuple[str, ...] = option(ROWS, "folders whose CSVs it is made of")
 
 
 def run(options: Options) -> int:
   """Writes the page.
 
   Raises:
-    ConfigError: no rows anywhere, or a folder that cannot be written.
+    ConfigError: no rows anywhere, a file of them that is damaged, or a folder that cannot be read or written.
   """
   out = Path(options.out).expanduser()
   need_folder(out, f"out={options.out}")
+  for folder in options.rows:
+    if folder not in ROWS and not Path(folder).is_dir():
+      raise ConfigError(f"rows={folder} is not a folder: name folders of CSVs.")
   folders = [Path(folder) for folder in options.rows if Path(folder).is_dir()]
   evidence = Evidence(folders)
   if not evidence.rows:
@@ -58,6 +62,7 @@ def page(evidence: Evidence) -> list[Block]:
   notes = sections.Notes()
   blocks: list[Block] = [Heading(1, TITLE)]
   blocks.append(Text(f"Made by `playground-bench report` from {', '.join(path.name for path in evidence.files)}."))
+  blocks.append(Text("Training is PPO's where no agent is named; overrides of a run stand behind its task."))
   for section in SECTIONS:
     blocks += section(evidence, notes)
   return [*blocks, *notes.blocks()]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from playground.benchmark.schema import COLUMNS, QUANTITIES, mean_and_ci95
+from playground.errors import ConfigError
 
 # Tables measured before `playground-bench`: their words for what a row's quantity is, and their columns.
 _WORDS = {
@@ -106,8 +107,19 @@ def _before(date: str) -> list[int]:
 
 
 def _read(path: Path) -> list[dict[str, str]]:
-  with path.open(encoding="utf-8", errors="replace", newline="") as file:
-    return list(csv.DictReader(file))
+  """Lines of a CSV, without those that a kill, or a command that is writing them now, left cut short."""
+  try:
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+      return [line for line in csv.DictReader(file) if None not in line.values()]
+  except (OSError, csv.Error) as error:
+    raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from None
+
+
+def _number(path: Path, text: str) -> float:
+  try:
+    return float(text)
+  except ValueError:
+    raise ConfigError(f"{path} has {text!r} where a number belongs: mend or remove that line.") from None
 
 
 def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
@@ -115,14 +127,16 @@ def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
   if not lines or "task" not in lines[0]:
     return
   for line in lines:
-    if "quantity" in line:
+    if None in line:
+      raise ConfigError(f"{path} has a line of too many columns, of {line['task']}: mend or remove it.")
+    if {"quantity", "value"} <= set(line):
       values = {line["quantity"]: line["value"]}
     else:
       values = {name: line[name] for name in line if _WORDS.get(name, name) in QUANTITIES}
     for quantity, value in values.items():
       quantity = _WORDS.get(quantity, quantity)
-      if quantity in QUANTITIES and value not in ("", None):
-        yield _row(path, line, quantity, float(value))
+      if quantity in QUANTITIES and value:
+        yield _row(path, line, quantity, _number(path, value))
 
 
 def _row(path: Path, line: dict[str, str], quantity: str, value: float) -> Row:
@@ -153,6 +167,6 @@ def _curves(path: Path, lines: Sequence[dict[str, str]]) -> dict[str, list[tuple
     name = path.parent.name if path.stem == "metrics" else path.stem.removeprefix("curve_")
     for line in lines:
       if line["eval/episode_reward"]:
-        point = float(line["step"]), float(line["eval/episode_reward"])
+        point = _number(path, line["step"]), _number(path, line["eval/episode_reward"])
         curves.setdefault(line.get("run") or name, []).append(point)
   return curves

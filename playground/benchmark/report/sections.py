@@ -14,6 +14,7 @@ TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipul
 SPEED = "training_steps_per_s"
 PARTS = ("physics", "task", "episodes", "pixels", "inference", "storing", "update")
 _BUDGET = re.compile(r" ?agent\.num_timesteps=\S+")  # in the setting of a whole run on a topology
+_TOPOLOGY = ("hardware.devices=", "hardware.scale_envs=")  # what a topology's setting varies
 _KEY = re.compile(r"^[\w.]+\.(?=\w+=)")  # what an override's key has before its last word
 _CURVE = re.compile(r"(.+?)_((?:ours|peer|ppo|sac|seed)(?:_.*)?)")  # a curve's name: task and run
 
@@ -107,34 +108,38 @@ def startup(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   """From the command to the first update."""
   yield Heading(2, "From the command to the first update")
   rows = []
-  for kind in ("cold", "warm"):
-    for figure in evidence.find(benchmark="startup", quantity="start_to_first_update_s", setting=kind):
-      rows.append([figure["task"], figure["agent"], kind, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
+  for figure in evidence.find(benchmark="startup", quantity="start_to_first_update_s"):
+    kind = figure["setting"].rpartition(" ")[2]
+    rows.append([_named(figure, kind), kind, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
   for figure in evidence.find(benchmark="compare", who="ours", quantity="start_to_first_update_s"):
     if figure.rows[0].get("call"):
       name = f"cold, call {figure.rows[0]['call']}"
-      rows.append([figure["task"], figure["agent"], name, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
-  yield Table(["task", "agent", "caches", "seconds", "device", "note"], sorted(rows)) if rows else nothing("startup")
+      rows.append([_named(figure), name, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
+  yield Table(["task", "caches", "seconds", "device", "note"], sorted(rows)) if rows else nothing("startup")
 
 
 def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   """Steps a second and memory against the number of environments."""
   yield Heading(2, "Against the number of environments")
-  series: dict[str, list[tuple[float, float]]] = {}
+  series: dict[str, dict[float, float]] = {}
   rows = []
   for quantity, label in (("env_steps_per_s", "environment"), ("training_steps_per_s", "training")):
     for figure in evidence.find(benchmark="scaling", who="ours", quantity=quantity):
-      if count := re.search(r"agent\.num_envs=(\d+)", figure["setting"]):
-        series.setdefault(f"{figure['task']}, {label}", []).append((float(count[1]), figure.mean))
-        same = {name: figure[name] for name in ("task", "setting", "device", "commit")}
+      if counts := re.findall(r"agent\.num_envs=(\d+)", figure["setting"]):
+        count = counts[-1]  # the one that holds
+        task = _named(figure, "agent.num_envs=", "agent.batch_size=")
+        line = series.setdefault(f"{task}, {label}, {figure['device']}", {})
+        line.setdefault(float(count), figure.mean)  # the newest
+        same = {name: figure[name] for name in ("task", "agent", "setting", "seed", "device", "commit")}
         memory = evidence.best(benchmark="scaling", quantity="peak_memory_gib", **same)
         used = f"{memory.mean:.2f}" if memory else ""
         device, note = figure["device"], notes.number(figure)
-        rows.append([figure["task"], label, count[1], f"{figure.mean:,.0f}", used, device, note])
+        rows.append([task, label, count, f"{figure.mean:,.0f}", used, device, note])
   if not rows:
     yield nothing("scaling")
     return
-  yield Picture("scaling", figures.lines("steps/s", series, "environments", "steps/s", log=True), "Steps a second.")
+  points = {name: list(line.items()) for name, line in series.items()}
+  yield Picture("scaling", figures.lines("steps/s", points, "environments", "steps/s", log=True), "Steps a second.")
   order = lambda row: (row[0], row[1], int(row[2]))
   yield Table(["task", "", "environments", "steps/s", "memory (GiB)", "device", "note"], sorted(rows, key=order))
 
@@ -153,9 +158,10 @@ def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   for figure, one in _beside_one(figure for figure in found if not _BUDGET.search(figure["setting"])):
     count, kind, device, note = figure["devices"], _hyperparameters(figure), figure["device"], notes.number(figure)
     times = [f"{figure.mean / one:.2f}", f"{figure.mean / one / int(count):.2f}"] if one else ["", ""]
-    groups.setdefault(f"{figure['task']}, {count}", {})[kind] = figure.mean
+    task = _named(figure, *_TOPOLOGY)
+    groups.setdefault(f"{task}, {count} x {device}", {}).setdefault(kind, figure.mean)  # the newest
     seconds = f"{_budget(figure['task'], figure['agent']) / figure.mean:,.0f}"
-    rows.append([figure["task"], count, kind, _with_ci(figure), *times, seconds, device, note])
+    rows.append([task, count, kind, _with_ci(figure), *times, seconds, device, note])
   if rows:
     yield Picture("topology", figures.bars("training steps/s", groups, "steps/s"), "Devices.")
     derived = ["times one device", "efficiency", "its budget takes (s)"]
@@ -183,7 +189,7 @@ def _whole_runs(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     times = f"{one / figure.mean:.2f}" if one else ""
     derived = _short(steps.mean / rate.mean) if steps and rate else ""
     result = [count, _with_ci(figure), times, derived, _with_ci(score) if score else NOT_MEASURED]
-    topology = [figure["task"], figure["devices"], _hyperparameters(figure)]
+    topology = [_named(figure, *_TOPOLOGY, "agent.num_timesteps="), figure["devices"], _hyperparameters(figure)]
     rows.append([*topology, *result, figure["device"], notes.number(figure)])
   measured = ["steps", "measured (s)", "times one device", "derived (s)", "final return"]
   header = ["task", "devices", "hyperparameters", *measured, "device", "note"]
@@ -211,8 +217,7 @@ def _hyperparameters(figure: Figure) -> str:
 
 def _of_topology(figure: Figure) -> tuple[str, ...]:
   """What figures agree in that differ in their devices alone."""
-  varied = ("hardware.devices=", "hardware.scale_envs=")
-  setting = (text for text in figure["setting"].split() if not text.startswith(varied))
+  setting = (text for text in figure["setting"].split() if not text.startswith(_TOPOLOGY))
   return figure["task"], figure["agent"], figure["device"], " ".join(setting)
 
 
@@ -229,9 +234,11 @@ def breakdown(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   bars: dict[str, dict[str, float]] = {}
   rows = []
   found = evidence.find(benchmark="breakdown", quantity="seconds_per_step")
-  for task, device in dict.fromkeys((figure["task"], figure["device"]) for figure in found):
-    same = [figure for figure in reversed(found) if (figure["task"], figure["device"]) == (task, device)]
-    of_it = {figure["setting"].removeprefix("part="): figure for figure in same}
+  measured: dict[tuple[str, str], dict[str, Figure]] = {}
+  for figure in found:
+    parts = measured.setdefault((_named(figure, "part="), figure["device"]), {})
+    parts.setdefault(figure["setting"].rpartition("part=")[2], figure)  # the newest
+  for (task, device), of_it in measured.items():
     have = [part for part in PARTS if part in of_it]
     times = [of_it[part].mean for part in have]
     shares = {p: max(0.0, t - s) * 1e6 for p, t, s in zip(have, times, [0.0, *times[:-1]], strict=True)}
@@ -296,6 +303,12 @@ def runs_by_step(evidence: Evidence) -> dict[str, dict[str, list[tuple[float, fl
     names = {run: [_KEY.sub("", word) for word in run if word not in shared] or [run[0]] for run in runs}
     curves[task] = {" ".join(names[run]): sorted(points.items()) for run, points in sorted(runs.items())}
   return dict(sorted(curves.items()))
+
+
+def _named(figure: Figure, *varied: str) -> str:
+  """A figure's task, its agent unless PPO, and its setting except for what begins with what a section varies."""
+  agent = [figure["agent"]] * (figure["agent"] not in ("ppo", ""))
+  return " ".join([figure["task"], *agent, *(t for t in figure["setting"].split() if not t.startswith(varied))])
 
 
 def _with_ci(figure: Figure) -> str:
