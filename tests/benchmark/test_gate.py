@@ -46,7 +46,28 @@ def test_mistakes(tmp_path: Path):
   with pytest.raises(ConfigError, match="cannot be read"):
     run(Options(table=str(tmp_path / "none.csv")))
   with pytest.raises(ConfigError, match="no committed ratio"):
-    judge({"new": lambda: pair(1)}, {}, 1)
+    judge({"old": pytest.fail, "new": pytest.fail}, {"old": Limit(1.0, 1.5)}, 1)
+
+
+@pytest.mark.parametrize(
+  ("table", "message"),
+  [
+    ("check,ratio,tolerance\n", "holds no check"),
+    ("a machine's name\n", "is not a table of the gate"),
+    ("check,ratio,tolerance\nppo_update,2,nan\n", "ppo_update has ratio 2, tolerance nan"),
+    ("check,ratio,tolerance\nppo_update,0,1.5\n", "ppo_update has ratio 0, tolerance 1.5"),
+    ("check,ratio,tolerance\nppo_update,2\n", "cannot be read"),
+  ],
+)
+def test_a_table_that_would_let_all_pass_is_refused(tmp_path: Path, table: str, message: str):
+  path = tmp_path / "gate.csv"
+  path.write_text(table)
+  with pytest.raises(ConfigError, match=message):
+    run(Options(table=str(path)))
+  if "holds" not in message:
+    with pytest.raises(ConfigError, match=message):
+      run(Options(table=str(path), update=True, checks=("ppo_update",)))
+  assert path.read_text() == table
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ ours in it but uses the machine in the same way; the ratio is compared with the 
 
 import csv
 import dataclasses
+import math
 import statistics
 import sys
 import time
@@ -16,7 +17,7 @@ from typing import Any
 from playground.benchmark.arguments import option
 from playground.config.files import shipped
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.runs.files import write_text
+from playground.runs.files import need_folder, write_text
 
 Timed = Callable[[], Any]  # does its work and waits for it
 Pair = tuple[Timed, Timed]  # ours and the reference, both compiled
@@ -44,6 +45,7 @@ class Limit:
     return self.ratio * self.tolerance
 
 
+COLUMNS = ["check", "ratio", "tolerance"]
 TOLERANCE = 1.5  # two busy cores and other processors move a ratio by up to a third
 
 
@@ -53,6 +55,10 @@ def run(options: Options) -> int:
   limits = _read(path)
   if options.repeats < 1:
     raise ConfigError(f"repeats={options.repeats} must be at least 1.")
+  if not (limits or options.update):
+    raise ConfigError(f"table={path} holds no check: `playground-bench gate update=true table={path}` adds them.")
+  if options.update:
+    need_folder(path.parent, f"table={path}")
   from playground.benchmark.gate.checks import CHECKS
 
   names = options.checks or tuple(CHECKS if options.update else limits)
@@ -65,7 +71,7 @@ def run(options: Options) -> int:
     ratio = measure(CHECKS[name](), options.repeats)
     limits[name] = Limit(ratio, limits[name].tolerance if name in limits else TOLERANCE)
     rows = [f"{name},{limit.ratio:.4g},{limit.tolerance:g}" for name, limit in sorted(limits.items())]
-    write_text(path, "\n".join(["check,ratio,tolerance", *rows]) + "\n")
+    write_text(path, "\n".join([",".join(COLUMNS), *rows]) + "\n")
     print(f"{name}: {ratio:.3g}", flush=True)
   return 0
 
@@ -73,9 +79,9 @@ def run(options: Options) -> int:
 def judge(checks: Mapping[str, Callable[[], Pair]], limits: Mapping[str, Limit], repeats: int) -> int:
   """Compares checks with their limits; a ratio above its limit must show a second time. Returns the exit code."""
   slow = []
+  if new := next((name for name in checks if name not in limits), None):
+    raise ConfigError(f"{new} has no committed ratio: `playground-bench gate update=true checks={new}` adds it.")
   for name, build in checks.items():
-    if name not in limits:
-      raise ConfigError(f"{name} has no committed ratio: `playground-bench gate update=true checks={name}` adds it.")
     pair, limit = build(), limits[name]
     ratio = measure(pair, repeats)
     if ratio > limit.most:
@@ -105,6 +111,16 @@ def _seconds(timed: Timed) -> float:
 def _read(path: Path) -> dict[str, Limit]:
   try:
     with path.open(encoding="utf-8", newline="") as file:
-      return {row["check"]: Limit(float(row["ratio"]), float(row["tolerance"])) for row in csv.DictReader(file)}
-  except (OSError, KeyError, TypeError, ValueError) as error:
+      reader = csv.DictReader(file)
+      if list(reader.fieldnames or ()) != COLUMNS:
+        raise ConfigError(f"table={path} is not a table of the gate: its columns are {','.join(COLUMNS)}.")
+      limits = {row["check"]: Limit(float(row["ratio"]), float(row["tolerance"])) for row in reader}
+  except ConfigError:
+    raise
+  except (OSError, TypeError, ValueError, csv.Error) as error:
     raise ConfigError(f"table={path} cannot be read: {getattr(error, 'strerror', None) or error}.") from None
+  for name, limit in limits.items():
+    if not (0 < limit.ratio < math.inf and 1 <= limit.tolerance < math.inf):
+      told = f"ratio {limit.ratio:g}, tolerance {limit.tolerance:g}"
+      raise ConfigError(f"table={path}: {name} has {told}, which must be above 0 and at least 1.")
+  return limits
