@@ -117,7 +117,7 @@ needs_rsl_rl = pytest.mark.skipif(
 def point_learner(config: Config, num_devices: int = 1, nan_at: int | None = None) -> Learner:
   """The algorithm that a config is of, for the point."""
   algorithm = ALGORITHMS[type(config)]
-  return algorithm(PointTask(nan_at=nan_at), config, make_mesh(num_devices), {})
+  return algorithm(PointTask(nan_at=nan_at), config, make_mesh(num_devices))
 
 
 class Recorder:

@@ -4,8 +4,10 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
+
+from playground.collector import uncollected
 
 ROW, ERROR = "ROW ", "ERROR "  # what a line begins with; other lines are the libraries' own
 
@@ -25,12 +27,27 @@ def main() -> None:
   from playground.errors import PlaygroundError
 
   job = json.loads(sys.argv[1])
+  arguments = job["arguments"]
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # else a GPU looks full from the start
   try:
-    importlib.import_module(f"playground.benchmark.measures.{job['measure']}").measure(Facts(), **job["arguments"])
+    with uncollected(stays=True):
+      if "overrides" in arguments:  # it trains in this process
+        _stand_by(**arguments)
+      measure = importlib.import_module(f"playground.benchmark.measures.{job['measure']}").measure
+    measure(Facts(), **arguments)
   except PlaygroundError as error:
     print(ERROR + " ".join(str(error).split()), flush=True)
     sys.exit(2)
+
+
+def _stand_by(task: str | None = None, agent: str | None = None, overrides: Sequence[str] = (), **_: Any) -> None:
+  """Starts the process that compiles Warp's kernels, as `playground-run` does."""
+  from playground.config import compose
+  from playground.envs.warp_kernels import stand_by
+
+  if task is not None:
+    config = compose([f"env={task}", f"agent={agent}", *overrides])
+    stand_by(config.env, config.hardware.platform)
 
 
 if __name__ == "__main__":

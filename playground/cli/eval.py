@@ -13,7 +13,7 @@ from playground.rendering.video import need_camera, need_place, render_video
 from playground.rendering.visuals import drawn_model
 from playground.runs.files import need_folder, write_json
 from playground.runs.job import episodes_of
-from playground.runs.train import randomized_models
+from playground.runs.train import model_sampler
 from playground.runs.trained import load_trained
 
 
@@ -56,7 +56,7 @@ def evaluate_run(
     raise ConfigError(f"--episodes={count} must be above 0.")
   drawn = drawn_model(env, run.video.visuals)
   need_camera(drawn, camera, "--camera")
-  _, model = randomized_models(env, run, 1, count)
+  _, model = model_sampler(env, run, 1, count)(run.seed)
   act = lambda policy, obs, key: trained.learner.act(policy, obs, key, deterministic or None)
   evaluate = make_evaluator(env, act, count, hardware.mesh, 1 if film else 0)
   scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model)

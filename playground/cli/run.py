@@ -14,6 +14,7 @@ import hydra
 from hydra._internal.utils import get_args_parser  # Hydra has no public name for its own flags
 from hydra.errors import HydraException
 
+from playground.collector import uncollected
 from playground.config import (
   RunConfig,
   compose,
@@ -85,8 +86,12 @@ def _main(argv: Sequence[str]) -> int:
 def _train(config: RunConfig) -> int:
   from rich.console import Console
 
+  from playground.envs.warp_kernels import stand_by
+
+  stand_by(config.env, config.hardware.platform)
   Console().print(tree(config))
-  from playground.runs.train import train  # imports JAX
+  with uncollected(stays=True):
+    from playground.runs.train import train  # imports JAX
 
   return train(config)
 

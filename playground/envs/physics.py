@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from playground.envs.warp_kernels import Building, quiet_warp
+from playground.envs.warp_kernels import Building, dismiss, quiet_warp
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
@@ -143,6 +143,7 @@ class Physics:
   def compile_ahead(self) -> Building | None:
     """Starts to compile what Warp will need on a GPU; None where there is nothing to be gained."""
     if self.impl != "warp" or jax.default_backend() != "gpu":
+      dismiss()
       return None
     return Building(self.mj_model, self._njmax)
 

@@ -4,20 +4,69 @@ Warp compiles a module of kernels when one of them is first launched, so a cold 
 everything else is ready: half a minute to one and a half, longer than tracing and XLA together. Here another process
 walks through a physics step without launching anything, notes the modules it would need, and compiles all of them at
 once into Warp's cache while this one traces. What it should miss is compiled at its first launch, as ever.
+
+What that process imports takes seconds, too. A command that will want it has it stand by while it imports its own.
 """
 
+import contextlib
 import hashlib
+import importlib
+import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
+from playground.collector import uncollected
+
 LIMIT_S = 900.0  # for a machine with few cores; a process that takes longer hangs
+_NEEDS = ("warp", "mujoco.mjx.warp.ffi", "mujoco.mjx.third_party.mujoco_warp")
+_LONGEST = "ccd_kernel"  # in the name of the module that takes NVRTC longest, half a minute and more
+
+_standing_by: list[subprocess.Popen[str]] = []  # one at most
+
+
+def stand_by(env: Mapping[str, Any], platform: str) -> None:
+  """Starts the process for the next `Building` if a run may want it; unused, it ends with this one.
+
+  Call it before what takes long to import; this module does not.
+
+  Args:
+    env: the run's `env` config.
+    platform: `hardware.platform`.
+  """
+  renders = "vision" in env and env["vision"]["enable"]
+  impl = env["cuda_impl"] if env["impl"] == "auto" else env["impl"]
+  no_gpu = "cpu" in (platform, os.environ.get("JAX_PLATFORMS")) or not shutil.which("nvidia-smi")
+  if not (_standing_by or no_gpu) and (renders or impl == "warp"):
+    _standing_by.append(_start())
+
+
+def dismiss() -> None:
+  """Ends the process that stands by, if there is one."""
+  while _standing_by:
+    with _standing_by.pop() as process:
+      process.kill()
+
+
+def _start() -> subprocess.Popen[str]:
+  command = [sys.executable, "-W", "ignore", "-m", __name__]
+  pipe = subprocess.PIPE
+  return subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe, text=True)
+
+
+def _tell(process: subprocess.Popen[str], job: dict[str, Any]) -> None:
+  assert process.stdin is not None
+  with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # what has failed by now is told by `wait`
+    json.dump(job, pipe)
+  process.stdin = None  # so that `communicate` does not write to it
 
 
 class Building:
@@ -42,8 +91,9 @@ class Building:
     self._marker = Path(str(warp.config.kernel_cache_dir), f"playground_{key}")
     self._process: subprocess.Popen[str] | None = None
     if not self._marker.exists():
-      command = [sys.executable, "-W", "ignore", "-m", __name__, str(path), str(njmax or 0)]
-      self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+      self._process = _standing_by.pop() if _standing_by else _start()
+      _tell(self._process, {"model": str(path), "njmax": njmax, "cache": str(self._marker.parents[1])})
+    dismiss()
 
   def wait(self) -> str | None:
     """Waits until all of them are there; returns a sentence if they could not be compiled ahead."""
@@ -81,7 +131,7 @@ def compile_all(mj_model: mujoco.MjModel, njmax: int | None, workers: int) -> No
   """Compiles the kernels of a physics step for this process's device; it cannot launch any afterwards."""
   import warp
 
-  modules = _launched(mj_model, njmax)
+  modules = sorted(_launched(mj_model, njmax), key=lambda module: _LONGEST not in module[0].name)
   device = warp.get_device()
   with ThreadPoolExecutor(workers) as pool:
     list(pool.map(lambda module, block_dim: warp.force_load(device, [module], block_dim), *zip(*modules, strict=True)))
@@ -115,5 +165,16 @@ def _launched(mj_model: mujoco.MjModel, njmax: int | None) -> list[tuple[Any, in
   return list(modules)
 
 
+def _main() -> None:
+  """Imports, waits for a job on stdin, compiles; ends without one."""
+  with uncollected(stays=True):
+    for name in _NEEDS:
+      importlib.import_module(name)
+  if told := sys.stdin.read():
+    job = json.loads(told)
+    os.environ["WARP_CACHE_PATH"] = job["cache"]  # to which Warp adds its version
+    compile_all(mujoco.MjModel.from_binary_path(job["model"]), job["njmax"], len(os.sched_getaffinity(0)))
+
+
 if __name__ == "__main__":
-  compile_all(mujoco.MjModel.from_binary_path(sys.argv[1]), int(sys.argv[2]) or None, len(os.sched_getaffinity(0)))
+  _main()

@@ -25,4 +25,4 @@ def algorithm(name: str) -> type[PPO] | type[SAC] | type[RslRlPPO]:
 def make_learner(env: Env, agent: Any, mesh: Mesh, network_precision: str | None) -> Learner:
   """Builds the algorithm of an `agent` config for a task's own model: to act or to look at, not to train."""
   algorithm_class = algorithm(agent.name)
-  return algorithm_class(env, algorithm_class.Config.from_config(agent), mesh, {}, network_precision)
+  return algorithm_class(env, algorithm_class.Config.from_config(agent), mesh, network_precision)

@@ -4,11 +4,10 @@ The device is not kept waiting: a thread of its own logs and saves what was done
 """
 
 import dataclasses
-import gc
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
@@ -17,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
+from playground.collector import uncollected
 from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import agree, several
-from playground.hardware.mesh import put
+from playground.hardware.mesh import divide, put
 from playground.learning.learner import Learner
 from playground.learning.rollout import Step
 
@@ -86,50 +86,65 @@ class Hooks(Protocol):
 
 @dataclasses.dataclass
 class Program:
-  """The compiled functions of one run, how long they took to make (s), and a sentence on what went wrong with it."""
+  """What one run executes, and on which models.
 
-  init: Any
+  Attributes:
+    train, init, reset, copy: see `Learner`.
+    evaluate: see `evaluation.make_evaluator`.
+    model: randomised model fields of the training environments, each [num_envs, ...].
+    eval_model: of the evaluation environments.
+    trace_s: how long tracing took.
+    compile_s: how long the compilers took from then.
+    notice: a sentence on what went wrong with it, or None.
+  """
+
   train: Any
+  init: Any
   reset: Any
   evaluate: Any
   copy: Any
+  model: ModelFields
+  eval_model: ModelFields
   trace_s: float
   compile_s: float
   notice: str | None
 
 
-def compile_program(learner: Learner, evaluate: Any, model: ModelFields, eval_model: ModelFields) -> Program:
-  """Traces each function once and compiles them side by side, Warp's kernels too, ahead of the first step."""
-  key = jax.ShapeDtypeStruct((2,), jnp.uint32)
-  start, trace_s = time.perf_counter(), 0.0
+def compile_program(learner: Learner, evaluate: Any, draw: Callable[[], tuple[ModelFields, ModelFields]]) -> Program:
+  """Traces each function once and compiles them side by side, Warp's kernels too, ahead of the first step.
+
+  Args:
+    learner: the algorithm.
+    evaluate: (policy, key, model fields) -> scores, jitted.
+    draw: randomised model fields of the training and of the evaluation environments.
+  """
+  key, count = jax.ShapeDtypeStruct((2,), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
+  start = time.perf_counter()
   pool = ThreadPoolExecutor(thread_name_prefix=COMPILER)
   kernels = learner.env.unwrapped.physics.compile_ahead()
-
-  def submit(function: Any, *args: Any) -> tuple[Any, Any]:
-    nonlocal trace_s
-    begin = time.perf_counter()
-    traced = function.trace(*args)
-    lowered = traced.lower()
-    trace_s += time.perf_counter() - begin
-    return pool.submit(lowered.compile), traced.out_info
-
-  collecting = gc.isenabled()
-  gc.disable()  # tracing makes millions of objects that stay: looking through them again and again is a quarter of it
+  submit = lambda traced: pool.submit(traced.lower().compile)
   try:
-    init, state = submit(learner.init, key, model)
-    train, _ = submit(learner.train, state, model, jax.ShapeDtypeStruct((), jnp.int32))
-    evaluated, _ = submit(evaluate, learner.policy(state), key, eval_model)
-    reset, _ = submit(learner.reset, state, key, model)
-    copied, _ = submit(learner.copy, state)
-    compiled = [future.result() for future in (init, train, reset, evaluated, copied)]
+    with uncollected():  # tracing makes millions of objects
+      model, eval_model = jax.eval_shape(draw)
+      init = learner.init.trace(key, model)
+      state = init.out_info
+      train = submit(learner.train.trace(state, model, count))  # first, for it takes XLA longest
+      others = [
+        submit(init),
+        submit(learner.reset.trace(state, key, model)),
+        submit(evaluate.trace(learner.policy(state), key, eval_model)),
+        submit(learner.copy.trace(state)),
+      ]
+      trace_s = time.perf_counter() - start
+      models = divide(draw(), learner.mesh)  # takes seconds, which XLA needs anyway
+      compiled = [future.result() for future in (train, *others)]
     notice = None if kernels is None else kernels.wait()
   finally:
     if kernels is not None:
       kernels.stop()
     pool.shutdown(wait=False, cancel_futures=True)  # an interrupted run does not wait for its compiler
-    if collecting:
-      gc.enable()
-  return Program(*compiled, trace_s=trace_s, compile_s=time.perf_counter() - start - trace_s, notice=notice)
+  compile_s = time.perf_counter() - start - trace_s
+  return Program(*compiled, *models, trace_s=trace_s, compile_s=compile_s, notice=notice)
 
 
 @dataclasses.dataclass
@@ -156,29 +171,23 @@ class Loop:
     marks: list[Mark],
     seed: int,
     hooks: Hooks,
-    model: ModelFields,
-    eval_model: ModelFields,
     save_every_s: float = 300.0,
   ):
     """Takes what there is to run.
 
     Args:
       learner: the algorithm.
-      program: its compiled functions.
+      program: its compiled functions, and the models.
       marks: the schedule.
       seed: of the run; evaluations and resets draw from it and the mark they belong to, so they do not depend on
         where the run was interrupted.
       hooks: called with rows, states to keep and for whether to stop.
-      model: randomised model fields of the training environments.
-      eval_model: of the evaluation environments.
       save_every_s: a state is kept at every evaluation, and at marks when this long has passed since the last.
     """
     self._learner = learner
     self._program = program
     self._marks = marks
     self._hooks = hooks
-    self._model = model
-    self._eval_model = eval_model
     self._save_every_s = save_every_s
     self._init_key, self._eval_key, self._reset_key = jax.random.split(jax.random.PRNGKey(seed), 3)
     self.train_s = 0.0  # device time of training alone
@@ -186,7 +195,7 @@ class Loop:
 
   def init(self) -> Any:
     """The state of a new run."""
-    return self._program.init(self._place(self._init_key), self._model)
+    return self._program.init(self._place(self._init_key), self._program.model)
 
   def run(self, state: Any, update: int | None = None) -> tuple[Any, bool]:
     """Runs to the end of the schedule, or until the hooks say stop.
@@ -222,7 +231,7 @@ class Loop:
     done = Done(mark, num_updates * self._learner.steps_per_update)
     if num_updates:
       start = time.perf_counter()
-      state, done.trained = self._program.train(state, self._model, np.int32(num_updates))
+      state, done.trained = self._program.train(state, self._program.model, np.int32(num_updates))
       jax.block_until_ready(done.trained)
       done.train_s = time.perf_counter() - start
       self.train_s += done.train_s
@@ -230,15 +239,15 @@ class Loop:
       if done.trained["nonfinite"] > 0:
         capture = self._program.copy(state).capture if several() else state.capture
         action_size = self._learner.env.action_size
-        done.captured = jax.device_get(capture).first(state.env_state, action_size, self._model)
+        done.captured = jax.device_get(capture).first(state.env_state, action_size, self._program.model)
     if mark.evaluate:
       start = time.perf_counter()
       policy = self._learner.policy(state)
-      done.evaluated = self._program.evaluate(policy, self._key(self._eval_key, mark), self._eval_model)
+      done.evaluated = self._program.evaluate(policy, self._key(self._eval_key, mark), self._program.eval_model)
       jax.block_until_ready(done.evaluated)
       done.eval_s = time.perf_counter() - start
     if mark.reset:
-      state = self._program.reset(state, self._key(self._reset_key, mark), self._model)
+      state = self._program.reset(state, self._key(self._reset_key, mark), self._program.model)
     late = agree(time.perf_counter() - self._last_save > self._save_every_s)
     due = late or mark.evaluate or mark is self._marks[-1]
     if due and mark.update:

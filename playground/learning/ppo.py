@@ -82,12 +82,11 @@ class PPO(Learner):
 
   Config = PPOConfig
 
-  def __init__(self, env: Env, config: PPOConfig, mesh: Mesh, model: ModelFields, network_precision: str | None = None):
+  def __init__(self, env: Env, config: PPOConfig, mesh: Mesh, network_precision: str | None = None):
     """Args:
       env: the task.
       config: hyperparameters.
       mesh: devices, one axis named "data".
-      model: randomised model fields, each [num_envs, ...]; empty for the task's own model.
       network_precision: matrix-product precision of the networks.
 
     Raises:

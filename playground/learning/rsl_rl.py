@@ -160,9 +160,7 @@ class RslRlPPO(Learner):
 
   Config = RslRlPPOConfig
 
-  def __init__(
-    self, env: Env, config: RslRlPPOConfig, mesh: Mesh, model: ModelFields, network_precision: str | None = None
-  ):
+  def __init__(self, env: Env, config: RslRlPPOConfig, mesh: Mesh, network_precision: str | None = None):
     """See `ppo.PPO` for the arguments and errors."""
     networks = GaussianActorCritic(
       env.observation_size, env.action_size, config.network, network_precision, config.normalize_observations

@@ -2,16 +2,17 @@
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 
 from playground import registry
 from playground.envs.base import Env
+from playground.envs.wrappers import ModelFields
 from playground.errors import ConfigError
 from playground.hardware.distributed import is_main, leaving_at_once, preflight
-from playground.hardware.mesh import divide
 from playground.hardware.scaling import describe_division, scale_envs
 from playground.hardware.setup import setup
 from playground.learning.algorithms import algorithm
@@ -73,12 +74,12 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
   need_camera(drawn, config.video.camera, "video.camera")
-  model, eval_model = divide(randomized_models(env, config, agent.num_envs, agent.num_eval_envs), hardware.mesh)
-  learner = algorithm_class(env, agent, hardware.mesh, model, hardware.network_precision)
+  draw = partial(model_sampler(env, config, agent.num_envs, agent.num_eval_envs), config.seed)
+  learner = algorithm_class(env, agent, hardware.mesh, hardware.network_precision)
   start.notices += learner.notices()
   if hardware.mesh.size > 1:
     start.notices.append(describe_division(config.agent, hardware.mesh.size))
-  start.restore(learner, config.agent.name, model)
+  start.restore(learner, config.agent.name, draw)
 
   num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
   marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
@@ -86,9 +87,9 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
   num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
   evaluate = make_evaluator(env, learner.act, agent.num_eval_envs, hardware.mesh, num_recorded)
   if not is_main():
-    program = compile_program(learner, evaluate, model, eval_model)
+    program = compile_program(learner, evaluate, draw)
     follower = Follower(config, env, interrupts, start.step)
-    loop = Loop(learner, program, marks, config.seed, follower, model, eval_model)
+    loop = Loop(learner, program, marks, config.seed, follower)
     _, completed = _run(loop, learner, start, interrupts)
     return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
   run_dir = start.run_dir or RunDirectory.create(
@@ -102,7 +103,7 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
     for notice in start.notices:
       progress.print(notice)
     progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
-    program = compile_program(learner, evaluate, model, eval_model)
+    program = compile_program(learner, evaluate, draw)
     if program.notice:
       progress.print(program.notice)
     to_compiled_s = process_age_s() - began_s
@@ -111,7 +112,7 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
 
     job = Job(config, run_dir, env, learner, progress, interrupts, start, drawn)
     with contextlib.closing(job):
-      loop = Loop(learner, program, marks, config.seed, job, model, eval_model)
+      loop = Loop(learner, program, marks, config.seed, job)
       state, completed = _run(loop, learner, start, interrupts)
       job.finish(loop, state, completed)
   _say_where(run_dir)
@@ -148,16 +149,28 @@ def _run(loop: Loop, learner: Learner, start: Start, interrupts: Interrupts) -> 
   return loop.run(state, start.update)
 
 
-def randomized_models(
+def model_sampler(
   env: Env, config: "RunConfig", num_envs: int, num_eval_envs: int
-) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-  """Model fields of the training and the evaluation environments, drawn from the run's seed; empty without terms."""
+) -> Callable[[int], tuple[ModelFields, ModelFields]]:
+  """What draws a run's randomised models.
+
+  Returns:
+    A function of the run's seed: model fields of the training environments, each [num_envs, ...], and of the evaluation
+    environments; empty without terms.
+
+  Raises:
+    PlaygroundError: a term that does not go with the model.
+  """
   randomizer = Randomizer(env.mj_model, config.randomization.terms)
-  if not randomizer.fields:
-    return {}, {}
-  train_key, eval_key = jax.random.split(jax.random.fold_in(jax.random.PRNGKey(config.seed), 1))
-  draw = jax.jit(randomizer.sample_batch)
-  return draw(jax.random.split(train_key, num_envs)), draw(jax.random.split(eval_key, num_eval_envs))
+  sample = jax.jit(randomizer.sample_batch)
+
+  def draw(seed: int) -> tuple[ModelFields, ModelFields]:
+    if not randomizer.fields:
+      return {}, {}
+    train_key, eval_key = jax.random.split(jax.random.fold_in(jax.random.PRNGKey(seed), 1))
+    return sample(jax.random.split(train_key, num_envs)), sample(jax.random.split(eval_key, num_eval_envs))
+
+  return draw
 
 
 def _say_where(run_dir: RunDirectory) -> None:

@@ -163,7 +163,7 @@ def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: py
   monkeypatch.setattr(ppo, "random_shift", note)
   network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", cnn=TINY)
   config = dataclasses.replace(SMALL_PPO, network=network, augment_pixels=1)
-  learner = PPO(Seen(), config, make_mesh(1), {})
+  learner = PPO(Seen(), config, make_mesh(1))
   state = learner.init(jax.random.PRNGKey(0), {})
   assert state.env_state.obs["pixels/eye"].dtype == jnp.uint8
   before = numbers(state.params)
@@ -180,7 +180,7 @@ def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: py
 def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
   network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", estimated_obs_key="state", cnn=TINY)
   config = dataclasses.replace(SMALL_PPO, network=network)
-  learner = PPO(Seen(), config, make_mesh(1), {})
+  learner = PPO(Seen(), config, make_mesh(1))
   state = learner.init(jax.random.PRNGKey(0), {})
   nets, policy = learner.networks, jax.device_get(state.params.policy)
   assert policy["params"]["estimator"]["kernel"].shape == (16, 2)
@@ -203,7 +203,7 @@ def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
   _, parts = learner.loss(state.params, batch, jax.random.PRNGKey(0))
   assert 900 < parts["estimation_loss"] < 1100  # not a million, which would drown what the policy learns
   still = dataclasses.replace(config, estimation_coefficient=0.0)
-  learner = PPO(Seen(), still, make_mesh(1), {})
+  learner = PPO(Seen(), still, make_mesh(1))
   after = learner.train(learner.init(jax.random.PRNGKey(0), {}), {}, jnp.int32(2))[0].params.policy["params"]
   np.testing.assert_array_equal(after["estimator"]["kernel"], policy["params"]["estimator"]["kernel"])
 

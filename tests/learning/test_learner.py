@@ -36,7 +36,7 @@ every_algorithm = pytest.mark.parametrize("config", [*JITTED, RSL_RL])
 def built(config: Config, nan_at: int | None = None) -> tuple[Learner, Program]:
   learner = point_learner(config, nan_at=nan_at)
   evaluate = make_evaluator(learner.env.unwrapped, learner.act, config.num_eval_envs, learner.mesh, 1)
-  return learner, compile_program(learner, evaluate, {}, {})
+  return learner, compile_program(learner, evaluate, lambda: ({}, {}))
 
 
 def run(
@@ -48,7 +48,7 @@ def run(
 ) -> tuple[Any, bool]:
   learner, program = built(config, nan_at)
   marks = schedule(updates, 3, 1, max(5, updates // 20))
-  loop = Loop(learner, program, marks, seed=3, hooks=hooks, model={}, eval_model={})
+  loop = Loop(learner, program, marks, seed=3, hooks=hooks)
   return loop.run(*(resumed or (loop.init(), None)))
 
 

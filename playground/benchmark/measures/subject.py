@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +25,7 @@ from playground.hardware.scaling import scale_envs
 from playground.hardware.setup import Hardware, setup
 from playground.learning.algorithms import algorithm
 from playground.learning.learner import Learner
-from playground.runs.train import randomized_models
+from playground.runs.train import model_sampler
 
 ONE_DEVICE = "hardware.devices=1"
 
@@ -37,8 +38,7 @@ class Subject:
   hardware: Hardware
   env: Env
   learner: Learner
-  model: ModelFields
-  eval_model: ModelFields
+  draw: Callable[[int], tuple[ModelFields, ModelFields]]
 
   @classmethod
   def build(cls, facts: Facts, task: str, agent: str, overrides: Sequence[str]) -> "Subject":
@@ -50,8 +50,8 @@ class Subject:
     algorithm_class = algorithm(config.agent.name)
     settings = algorithm_class.Config.from_config(config.agent)
     env = registry.load(task, config=config.env)
-    models = randomized_models(env, config, settings.num_envs, settings.num_eval_envs)
-    learner = algorithm_class(env, settings, hardware.mesh, models[0], hardware.network_precision)
+    draw = model_sampler(env, config, settings.num_envs, settings.num_eval_envs)
+    learner = algorithm_class(env, settings, hardware.mesh, hardware.network_precision)
     facts.update(
       backend=env.impl,
       devices=hardware.mesh.size,
@@ -60,12 +60,12 @@ class Subject:
       versions=versions(),
       conditions=f"hyperparameters {config.choices.get('tuned') or 'not tuned for this task'}",
     )
-    return cls(config, hardware, env, learner, *models)
+    return cls(config, hardware, env, learner, draw)
 
-  def models(self, seed: int) -> ModelFields:
-    """The training environments' randomised models of a seed."""
-    config = dataclasses.replace(self.config, seed=seed)
-    return randomized_models(self.env, config, self.learner.config.num_envs, self.learner.config.num_eval_envs)[0]
+  @functools.cached_property
+  def model(self) -> ModelFields:
+    """The training environments' randomised models."""
+    return self.draw(self.config.seed)[0]
 
   def key(self, seed: int) -> jax.Array:
     """A random key that all devices have."""

@@ -1,6 +1,7 @@
 """Training alone, at full speed: what the paper's throughput tables measure."""
 
 from contextlib import nullcontext
+from functools import partial
 
 import jax
 
@@ -41,12 +42,12 @@ def measure(
     subject = Subject.build(facts, task, agent, overrides)
     learner, conditions = subject.learner, facts["conditions"]
     no_evaluation = jax.jit(lambda policy, key, model: ())
-    program = compile_program(learner, no_evaluation, subject.model, subject.eval_model)
+    program = compile_program(learner, no_evaluation, partial(subject.draw, seeds[0]))
     facts.emit("trace_s", program.trace_s, "s", seed=seeds[0])
     facts.emit("compile_s", program.compile_s, "s", seed=seeds[0])
     warm_up = 1 + (learner.config.prefill_updates if isinstance(learner.config, SACConfig) else 0)
     for seed in seeds:
-      model = subject.models(seed)
+      model = program.model if seed == seeds[0] else subject.draw(seed)[0]
       with alone(lock):
         state = None  # the last seed's goes before the next one's comes: a replay buffer is large
         state = program.init(subject.key(seed), model)
