@@ -161,6 +161,13 @@ def test_only_what_one_call_measured_stands_beside_each_other(tmp_path: Path):
   rows = table_with(page(found), "times better").rows
   assert sorted(row[5] for row in rows) == ["2.00", "3.00"]
 
+  small = "env.impl=jax agent.num_envs=8"
+  of_commands = [{**speed, "value": 100.0}, {**peer, "setting": "env.impl=warp", "value": 50.0}]
+  of_commands += [{**speed, "setting": small, "value": 30.0}]
+  of_commands += [{**peer, "setting": f"{small} env.impl=warp", "value": 10.0}]
+  rows = table_with(page(evidence(tmp_path / "other", *of_commands)), "times better").rows
+  assert [(row[0], row[5]) for row in rows] == [("CheetahRun", "2.00"), (f"CheetahRun {small}", "3.00")]
+
 
 def whole_run(devices: int, setting: str, seed: int, **quantities: float) -> list[dict[str, Any]]:
   columns = {"benchmark": "topology", "devices": devices, "seed": seed}

@@ -92,16 +92,28 @@ def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
       call = ours.rows[0].get("call", "")
       of_it = {name: ours[name] for name in ("task", "source", "device", "commit")}
       for peer in evidence.find(benchmark="compare", quantity=quantity, **of_it):
-        if peer["who"] != "ours" and peer.rows[0].get("call", "") == call:
+        if peer["who"] != "ours" and peer.rows[0].get("call", "") == call and (call or _same_overrides(ours, peer)):
           mine, its = (pick(row["value"] for row in figure.rows) for figure in (ours, peer))
           better = mine / its if quantity == SPEED else its / mine
           what, who = f"{label}, call {call}" if call else label, f"{peer['who']} {peer['backend']}".strip()
-          found = [ours["task"], what, _short(mine), who, _short(its), f"{better:.2f}"]
+          found = [
+            f"{ours['task']} {'' if call else ours['setting']}".strip(),
+            what,
+            _short(mine),
+            who,
+            _short(its),
+            f"{better:.2f}",
+          ]
           rows.append([*found, notes.number(ours), notes.number(peer)])
   if rows:
     yield Table(["task", "", "ours", "peer", "its", "times better", "ours: note", "its: note"], sorted(rows))
   else:
     yield nothing("compare")
+
+
+def _same_overrides(ours: Figure, peer: Figure) -> bool:
+  """Whether both are of one command: the peer's setting adds its backend to the overrides of our run."""
+  return re.sub(r" ?env\.impl=\S+$", "", peer["setting"]) == ours["setting"]
 
 
 def startup(evidence: Evidence, notes: Notes) -> Iterable[Block]:
