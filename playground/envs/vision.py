@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from playground.config.text import format_value
 from playground.envs.base import PIXELS, Env, State
 from playground.envs.physics import PhysicsData, mjx
 from playground.envs.wrappers import Wrapper
@@ -43,7 +44,7 @@ class Vision(Wrapper):
     if config.camera not in cameras:
       have = f"the task has {', '.join(cameras)}" if cameras else "the task has none"
       near = nearest(str(config.camera), cameras)
-      raise ConfigError(f"env.vision.camera={config.camera} is no camera of the model; {have}.{near}")
+      raise ConfigError(f"env.vision.camera={format_value(config.camera)} is no camera of the model; {have}.{near}")
     brightness = tuple(config.brightness)
     if config.image == "segmentation" and env.mj_model.ngeom > _MAX_GEOMS:
       many = f"the model has {env.mj_model.ngeom} geoms, more than the {_MAX_GEOMS} that a byte tells apart"

@@ -94,6 +94,10 @@ class PPO(Learner):
     """
     config.check(mesh.size)
     networks = ActorCritic(env.observation_size, env.action_size, config.network, network_precision)
+    if config.augment_pixels and not networks.pixel_sizes:
+      raise ConfigError(
+        f"agent.augment_pixels={config.augment_pixels} shifts pictures, and the task has none: set it to 0."
+      )
     super().__init__(env, config, mesh, networks, config.steps_per_update(env.action_repeat), TrainState(**SPEC))
     clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm else optax.identity()
     self.optimizer = optax.chain(clip, optax.adam(config.learning_rate))

@@ -127,7 +127,7 @@ def test_geoms_are_counted_from_1(seeing: Any) -> None:
     ({"image": "segmentation", "ngeom": 256}, "the model has 256 geoms, more than the 255 that a byte tells apart"),
     ({"image": "segmentation", "brightness": [0.5, 1.0]}, r"brightness=\[0.5, 1.0\]: geoms have no brightness"),
     ({"camera": "eyes"}, r"env.vision.camera=eyes is no camera .* the task has eye, side.*Did you mean 'eye'"),
-    ({"camera": None}, r"env.vision.camera=None is no camera of the model; the task has eye, side"),
+    ({"camera": None}, r"env.vision.camera=null is no camera of the model; the task has eye, side"),
   ],
 )
 def test_settings_that_cannot_be(seeing: Any, settings: dict[str, Any], message: str) -> None:

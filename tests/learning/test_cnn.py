@@ -177,6 +177,13 @@ def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: py
   assert all((a != b).any() for a, b in zip(before, numbers(state.params), strict=True) if a.any())
 
 
+def test_only_pictures_can_be_shifted() -> None:
+  with pytest.raises(
+    ConfigError, match=r"^agent\.augment_pixels=4 shifts pictures, and the task has none: set it to 0\.$"
+  ):
+    PPO(PointTask(), dataclasses.replace(SMALL_PPO, augment_pixels=4), make_mesh(1))
+
+
 def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
   network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", estimated_obs_key="state", cnn=TINY)
   config = dataclasses.replace(SMALL_PPO, network=network)
