@@ -1,5 +1,6 @@
 """Measurements as processes: rows as they come, what is there is left out, failures do not stop the others."""
 
+import csv
 import dataclasses
 import subprocess
 import sys
@@ -27,6 +28,7 @@ if measure == "train":
   gpu = os.environ["CUDA_VISIBLE_DEVICES"]
   for seed in arguments["seeds"]: row(seed=seed, value=100.0 + seed, conditions="timed", backend=gpu)
 elif measure == "lock": row(seed=1, value=1.0, conditions=f"lock {arguments['lock']}")
+elif measure == "caches": row(value=1.0, conditions=",".join(os.environ.get(name, "") for name in arguments["names"]))
 elif measure == "user": print("ERROR that cannot be."); sys.exit(2)
 elif measure == "bug": sys.exit("Traceback of a bug")
 elif measure == "sleep": row(seed=1, value=1.0); time.sleep(60)
@@ -59,6 +61,20 @@ def test_rows_have_their_columns(tmp_path: Path):
     assert table.has(
       {"task": "A", "seed": seed, "value": 100.0 + seed, "commit": "abc", "conditions": conditions, **FACTS}
     )
+
+
+def test_caches_are_empty_ones_unless_the_users_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+  def caches(**plan: Any) -> list[str]:
+    path = tmp_path / f"rows{plan}.csv"
+    asks = [dataclasses.replace(job("caches", name), arguments={"names": jobs.CACHES}) for name in "AB"]
+    assert run_jobs(asks, Table(path), FACTS, Plan(**{**vars(PLAN), **plan})) == 0
+    return [row["conditions"].split(";")[0] for row in csv.DictReader(path.read_text().splitlines())]
+
+  for name in jobs.CACHES:
+    monkeypatch.setenv(name, "the user's")
+  assert caches(cache=True) == [",".join(["the user's"] * len(jobs.CACHES))] * 2
+  cold = caches(cache=False)
+  assert len(set(cold)) == 2 and not any("the user's" in text for text in cold), "one for each process"
 
 
 def test_only_what_is_missing_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -106,6 +106,20 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
   assert list(shares[1:8]) == ["1", "2", "", "", "", "", "7"]
 
 
+def test_the_best_of_turns_is_the_fastest_and_the_smallest(tmp_path: Path):
+  turns = [
+    {"benchmark": "compare", "who": who, "seed": seed, "quantity": quantity, "value": value * seed}
+    for who, factor in (("ours", 1.0), ("playground 0.2.0", 2.0))
+    for quantity, value in (("training_steps_per_s", 10.0 / factor), ("start_to_first_update_s", 7.0 * factor))
+    for seed in (1, 2)
+  ]
+  rows = table_with(page(evidence(tmp_path, *turns)), "times better").rows
+  assert [[row[1], row[2], row[4], row[5]] for row in rows] == [
+    ["start (s)", "7", "14", "2.00"],
+    ["training steps/s", "20", "10", "2.00"],
+  ]
+
+
 def test_memory_is_that_of_the_same_measurement(tmp_path: Path):
   envs = {"benchmark": "scaling", "setting": "agent.num_envs=8 env.impl=jax agent.num_envs=64 agent.batch_size=32"}
   found = evidence(

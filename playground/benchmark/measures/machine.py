@@ -17,6 +17,8 @@ from playground.runs.provenance import package_versions
 
 _NAMES = {"python": "Python", "jax": "JAX", "mujoco": "MuJoCo", "mujoco-mjx": "MJX", "warp-lang": "Warp"}
 
+INTERVAL_S = 0.5  # between two questions to the driver
+
 
 def measure(facts: Facts, overrides: list[str]) -> None:
   """Says what jobs with these overrides run on: a row whose value is the number of devices."""
@@ -53,7 +55,7 @@ def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
 
   def watch() -> None:
     nonlocal most
-    while not ended.wait(0.5):
+    while not ended.wait(INTERVAL_S):
       most = max(most, ask())
 
   watcher = threading.Thread(target=watch, daemon=True)
