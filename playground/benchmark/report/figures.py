@@ -2,7 +2,8 @@
 
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+import textwrap
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 COLOURS = ("#2f6db5", "#d1762f", "#5a9e57", "#b5479a", "#8a6d3b", "#777777")
@@ -21,21 +22,33 @@ def _svg(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
   return buffer.getvalue()
 
 
+def _wrapped(name: str) -> str:
+  """A name on lines that leave room for the drawing: a setting may be long."""
+  return textwrap.fill(name, 44)
+
+
+def _height(names: Collection[str], least: float) -> float:
+  """Inches that names below each other take, all as much as the longest."""
+  return len(names) * max(least, *(0.2 * len(_wrapped(name).splitlines()) for name in names))
+
+
 def lines(title: str, series: Mapping[str, Points], x: str, y: str, log: bool = False) -> str:
   """Lines over one pair of axes."""
 
   def draw(figure: Any) -> None:
     axes = figure.subplots()
     for colour, (name, points) in zip(COLOURS * len(series), series.items(), strict=False):
-      axes.plot(*zip(*sorted(points), strict=True), marker="o" if len(points) < 12 else "", label=name, color=colour)
+      axes.plot(
+        *zip(*sorted(points), strict=True), marker="o" if len(points) < 12 else "", label=_wrapped(name), color=colour
+      )
     if log:
       axes.set_xscale("log", base=2)
       axes.set_yscale("log")
     axes.set(title=title, xlabel=x, ylabel=y)
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(0, -0.2))
 
-  return _svg((7, 3.6), draw)
+  return _svg((7, 3.2 + _height(series, 0.2)), draw)
 
 
 def curves(groups: Mapping[str, Mapping[str, Points]]) -> str:
@@ -69,12 +82,12 @@ def bars(title: str, groups: Mapping[str, Mapping[str, float]], x: str) -> str:
     for i, name in enumerate(names):
       at = [row + i * height for row, group in enumerate(groups.values()) if name in group]
       axes.barh(at, [g[name] for g in groups.values() if name in g], height, label=name, color=COLOURS[i % 6])
-    axes.set_yticks([row + 0.4 - height / 2 for row in range(len(groups))], list(groups))
+    axes.set_yticks([row + 0.4 - height / 2 for row in range(len(groups))], list(map(_wrapped, groups)))
     axes.invert_yaxis()
     axes.set(title=title, xlabel=x)
     axes.legend(frameon=False)
 
-  return _svg((7, 0.9 + 0.55 * len(groups)), draw)
+  return _svg((7, 0.9 + _height(groups, 0.55)), draw)
 
 
 def stacked(title: str, bars: Mapping[str, Mapping[str, float]], x: str) -> str:
@@ -86,10 +99,10 @@ def stacked(title: str, bars: Mapping[str, Mapping[str, float]], x: str) -> str:
     left = dict.fromkeys(bars, 0.0)
     for i, name in enumerate(names):
       widths = [parts.get(name, 0.0) for parts in bars.values()]
-      axes.barh(list(bars), widths, left=list(left.values()), label=name, color=COLOURS[i % 6])
+      axes.barh(list(map(_wrapped, bars)), widths, left=list(left.values()), label=name, color=COLOURS[i % 6])
       left = {bar: left[bar] + width for bar, width in zip(left, widths, strict=True)}
     axes.invert_yaxis()
     axes.set(title=title, xlabel=x)
     axes.legend(frameon=False, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.25))
 
-  return _svg((7, 1.4 + 0.5 * len(bars)), draw)
+  return _svg((7, 1.4 + _height(bars, 0.5)), draw)
