@@ -295,8 +295,7 @@ class Chain(Measuring):
     arguments |= {"runs": self.runs, "again": self.rerun}
     columns = self.columns(self.experiment, agent)
     last = {"quantity": "wall_clock_s", "setting": " ".join((*self.overrides, "stage=all"))}
-    seeds = range(1, self.seeds + 1)
-    return [Job("chain", {**arguments, "seeds": [seed]}, columns, last) for seed in seeds]
+    return [Job("chain", {**arguments, "seeds": [seed]}, columns, last) for seed in range(1, self.seeds + 1)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -396,5 +395,6 @@ def run(command: Measuring) -> int:
   hardware = [text for text in command.overrides if text.startswith("hardware")]
   facts = probe(hardware, command.gpus)
   plan = Plan(**{field.name: getattr(command, field.name) for field in dataclasses.fields(Plan)})
+  jobs = command.jobs(facts)  # says what does not fit, before anything else is said
   print(f"{facts['devices']} x {facts['device']}; {facts['versions']}")
-  return run_jobs(command.jobs(facts), table, facts, plan)
+  return run_jobs(jobs, table, facts, plan)

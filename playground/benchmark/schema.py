@@ -103,8 +103,10 @@ class Table:
         fcntl.flock(file, fcntl.LOCK_EX)
         file.seek(0)
         yield file
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-      raise ConfigError(f"out={self.path} cannot be used: {getattr(error, 'strerror', None) or error}.") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+      raise ConfigError(f"out={self.path} is damaged ({error}): mend it or name another file.") from None
+    except OSError as error:
+      raise ConfigError(f"out={self.path} cannot be used: {error.strerror}.") from None
 
 
 def _rows_of(file: BinaryIO) -> Iterable[dict[str, str]]:

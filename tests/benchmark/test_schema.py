@@ -85,6 +85,16 @@ def test_other_files_are_left_alone(tmp_path: Path, end: str):
     Table(path / "below")
 
 
+def test_a_damaged_table_is_named_and_kept(tmp_path: Path):
+  path = tmp_path / "rows.csv"
+  Table(path).add(ROW)
+  damaged = path.read_bytes() + b"\xff\xfe\n"
+  path.write_bytes(damaged)
+  with pytest.raises(ConfigError, match=r"is damaged \(.*\): mend it or name another file\.$"):
+    Table(path)
+  assert path.read_bytes() == damaged
+
+
 def test_a_full_disk_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
   def full(file: Any) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")

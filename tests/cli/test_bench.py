@@ -1,6 +1,7 @@
 """`playground-bench`: what it says about mistakes, before anything is started."""
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -52,7 +53,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     (["chain", f"runs={__file__}/runs"], "test_bench.py is not a folder that you may write to"),
     (["compare", "tasks=CheetahRun", "peer=playground021"], "Did you mean 'playground020'?"),
     (["compare", "tasks=CheetahRun", "peer_python=no_such_python"], "cannot be run"),
-    (["compare", "tasks=CheetahRun", f"peer_python={sys.executable}"], "playground 0.2.0 is not installed"),
+    (["compare", "tasks=CheetahRun", f"peer_python={sys.executable}"], "it has none: install it there, or name"),
     (["compare", "tasks=CheetahRun", "agent=sac"], "compare is of ppo"),
     (["learning", "tasks=CheetahRun", "peer_menagerie=no_such_folder"], "holds no robot models"),
     (["report", "rows=no_such_folder"], "rows=no_such_folder is not a folder"),
@@ -81,6 +82,15 @@ def test_what_does_not_fit_the_machine_or_the_task_is_said_before_anything_is_co
   with pytest.raises(ConfigError, match=r"agent\.num_envs=3"):
     commands.Scaling(tasks=("CartpoleBalance",), num_envs=(3,)).jobs({})
   commands.Startup(tasks=("CartpoleBalance",), overrides=("hardware.devices=1",)).check()
+
+
+def test_what_does_not_fit_the_machine_is_all_that_is_said(
+  command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+  monkeypatch.setattr(commands, "probe", lambda *_: {"devices": 1, "device": "a device", "versions": ""})
+  assert command("topology", "tasks=CartpoleBalance", "devices=4", f"out={tmp_path / 'rows.csv'}") == 2
+  captured = capsys.readouterr()
+  assert captured.out == "" and captured.err == "error: devices=[4]: this machine has 1.\n"
 
 
 def test_commands_stand_for_jobs():

@@ -50,5 +50,6 @@ def check_peer(peer: str, python: str, path: str, menagerie: str) -> None:
   if done.returncode or done.stdout.strip() != version:
     found = f"it has {done.stdout.strip()}" if done.returncode == 0 else "it has none"
     raise ConfigError(
-      f"{distribution} {version} is not installed for peer_python={python} (peer_path={path or 'none'}): {found}."
+      f"{distribution} {version} is not installed for peer_python={python} (peer_path={path or 'none'}), {found}: "
+      "install it there, or name the interpreter of an environment that has it."
     )
