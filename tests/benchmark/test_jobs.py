@@ -29,6 +29,7 @@ if measure == "train":
   for seed in arguments["seeds"]: row(seed=seed, value=100.0 + seed, conditions="timed", backend=gpu)
 elif measure == "lock": row(seed=1, value=1.0, conditions=f"lock {arguments['lock']}")
 elif measure == "caches": row(value=1.0, conditions=",".join(os.environ.get(name, "") for name in arguments["names"]))
+elif measure == "read": row(seed=1, value=1.0, commit="earlier")
 elif measure == "user": print("ERROR that cannot be."); sys.exit(2)
 elif measure == "bug": sys.exit("Traceback of a bug")
 elif measure == "sleep": row(seed=1, value=1.0); time.sleep(60)
@@ -61,6 +62,12 @@ def test_rows_have_their_columns(tmp_path: Path):
     assert table.has(
       {"task": "A", "seed": seed, "value": 100.0 + seed, "commit": "abc", "conditions": conditions, **FACTS}
     )
+
+
+def test_what_was_run_earlier_keeps_its_commit(tmp_path: Path):
+  table = Table(tmp_path / "rows.csv")
+  assert run_jobs([job("read")], table, FACTS, PLAN) == 0
+  assert table.has({"seed": 1, "commit": "earlier"})
 
 
 def test_caches_are_empty_ones_unless_the_users_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
