@@ -1,0 +1,124 @@
+"""Options that the commands share, and the jobs that they make of them."""
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from playground.benchmark.arguments import check_amounts, option
+from playground.benchmark.jobs import Job
+from playground.benchmark.suites import check_agent, choose_tasks
+from playground.config import RunConfig, compose
+from playground.errors import ConfigError
+
+TRAINING = "training_steps_per_s"
+QUANTITY = {  # the last row of a measurement
+  "training": TRAINING,
+  "environment": "env_steps_per_s",
+  "breakdown": "seconds_per_step",
+  "startup": "start_to_first_update_s",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Measuring(abc.ABC):
+  """Options of everything that measures."""
+
+  out: str | None = option(None, "CSV that rows are added to; null is results/benchmarks/<command>.csv")
+  rerun: bool = option(False, "measure again what the CSV has already")
+  minutes: float | None = option(None, "stop after this long; the same command again measures the rest")
+  workers: int = option(1, "processes at once: they compile side by side, one at a time is timed on a device")
+  gpus: tuple[int, ...] = option((), "GPUs that the processes are spread over; none is all of them to each")
+  cache: bool = option(False, "reuse compiled programs; compile and start times are then not those of a cold start")
+  commit: str | None = option(None, "what to record where there is no git")
+  note: str = option("", "added to the conditions of every row")
+  overrides: tuple[str, ...] = option((), "of the run's configuration")
+
+  name = "measuring"
+  alone = False  # whether it needs the machine to itself
+
+  @abc.abstractmethod
+  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+    """What is to be measured on a machine of which `facts` are known."""
+
+  def check(self) -> None:
+    """Raises PlaygroundError for what cannot be measured, before anything expensive."""
+    check_amounts(self)
+    if self.alone and self.workers > 1:
+      raise ConfigError(f"workers={self.workers}: {self.name} wants the machine to itself, workers=1.")
+
+  def columns(self, task: str, agent: str, setting: Sequence[str] = (), who: str = "ours") -> dict[str, Any]:
+    texts = " ".join((*self.overrides, *setting))
+    return {"benchmark": self.name, "task": task, "agent": agent, "who": who, "setting": texts}
+
+
+@dataclasses.dataclass(frozen=True)
+class OfTasks(Measuring):
+  """Options of what is measured for tasks of one algorithm."""
+
+  suite: str | None = option(None, "dm_control, locomotion, manipulation or all: the tasks of the paper's tables")
+  tasks: tuple[str, ...] = option((), "tasks by name, instead of a suite or on top")
+  agent: str = option("ppo", "ppo or sac")
+  seconds: float = option(4.0, "how long to time each number, at least one update")
+
+  sets_devices = True  # whether a device's number is the command's to say
+
+  def check(self) -> None:
+    super().check()
+    check_agent(self.agent)
+    if self.sets_devices and any(text.lstrip("+").startswith("hardware.devices=") for text in self.overrides):
+      raise ConfigError(
+        f"hardware.devices= is no override of {self.name}: only topology, with devices=, measures on several."
+      )
+    for task in self.chosen() if self.overrides else self.chosen()[:1]:  # without any, all go as they are
+      self.configured(task)
+
+  def chosen(self) -> list[str]:
+    return choose_tasks(self.suite, self.tasks)
+
+  def configured(self, task: str, *more: str) -> RunConfig:
+    """A task's run; raises ConfigError for overrides that cannot be."""
+    return compose([f"env={task}", f"agent={self.agent}", *self.overrides, *more])
+
+  def with_envs(self, task: str, count: int) -> list[str]:
+    """Overrides for so many environments; PPO's batch grows where each would give less than a trajectory."""
+    setting = [f"agent.num_envs={count}"]
+    if self.agent == "ppo":  # every environment gives a whole number of trajectories, no fewer than tuned
+      agent = self.configured(task).agent
+      batch = agent.batch_size * max(1, -(-count // (agent.batch_size * agent.num_minibatches)))
+      setting += [f"agent.batch_size={batch}"] * (batch != agent.batch_size)
+    self.configured(task, *setting)  # a number that does not fit is said here
+    return setting
+
+  def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: Any) -> Job:
+    """A job with overrides, which `setting` says."""
+    overrides = [*self.overrides, *setting]
+    arguments = {"task": task, "agent": self.agent, "overrides": overrides, "seconds": self.seconds, **arguments}
+    return Job(measure, arguments, self.columns(task, self.agent, setting), {"quantity": QUANTITY[measure]})
+
+  def on_one_device(self, job: Job) -> Job:
+    """The job with one device for each process: what most tables are about, so no setting of its own."""
+    arguments = {**job.arguments, "overrides": [*job.arguments["overrides"], "hardware.devices=1"]}
+    return dataclasses.replace(job, arguments=arguments)
+
+
+@dataclasses.dataclass(frozen=True)
+class OfRuns(OfTasks):
+  """Options of what trains whole runs, too."""
+
+  num_timesteps: int | None = option(None, "control steps of a whole run")
+
+  def check(self) -> None:
+    super().check()
+    if any(text.lstrip("+").startswith("agent.num_timesteps=") for text in self.overrides):
+      raise ConfigError(f"agent.num_timesteps= is no override of {self.name}: give num_timesteps=, for all whole runs.")
+
+  def budget(self) -> list[str]:
+    return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
+
+  def whole_run(self, task: str, agent: str, seed: int, setting: Sequence[str] = ()) -> Job:
+    """A job that trains from beginning to end, for the budget."""
+    setting = [*setting, *self.budget()]
+    told = [*self.overrides, *setting]
+    arguments = {"task": task, "agent": agent, "overrides": told, "told": told, "seeds": [seed]}
+    return Job("run", arguments, self.columns(task, agent, setting), {"quantity": "final_return"})
