@@ -31,7 +31,7 @@ def main() -> None:
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # else a GPU looks full from the start
   try:
     with uncollected(stays=True):
-      if "overrides" in arguments:  # it trains in this process
+      if job["measure"] == "training":  # in this process
         _stand_by(**arguments)
       measure = importlib.import_module(f"playground.benchmark.measures.{job['measure']}").measure
     measure(Facts(), **arguments)
@@ -40,14 +40,13 @@ def main() -> None:
     sys.exit(2)
 
 
-def _stand_by(task: str | None = None, agent: str | None = None, overrides: Sequence[str] = (), **_: Any) -> None:
+def _stand_by(task: str, agent: str, overrides: Sequence[str], **_: Any) -> None:
   """Starts the process that compiles Warp's kernels, as `playground-run` does."""
   from playground.config import compose
   from playground.envs.warp_kernels import stand_by
 
-  if task is not None:
-    config = compose([f"env={task}", f"agent={agent}", *overrides])
-    stand_by(config.env, config.hardware.platform)
+  config = compose([f"env={task}", f"agent={agent}", *overrides])
+  stand_by(config.env, config.hardware.platform)
 
 
 if __name__ == "__main__":

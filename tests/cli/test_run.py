@@ -11,6 +11,7 @@ import yaml
 
 from playground.cli.run import main
 from playground.config import RunConfig, compose, to_yaml
+from playground.envs import warp_kernels
 from playground.errors import HardwareError
 from playground.sweep.folder import SweepDirectory
 from tests.command import Command, caller
@@ -48,6 +49,15 @@ def test_trains_the_default_run_and_prints_it(
   (config,) = trained
   assert config.resolved == compose().resolved
   assert "num_timesteps: 6000000" in capsys.readouterr().out
+
+
+def test_has_warps_compiler_stand_by_for_the_task(
+  command: Command, trained: list[RunConfig], monkeypatch: pytest.MonkeyPatch
+):
+  asked: list[Any] = []
+  monkeypatch.setattr(warp_kernels, "stand_by", lambda env, platform: asked.append((env, platform, len(trained))))
+  assert command("env=PandaPickCube", "hardware=cpu") == 0
+  assert asked == [(trained[0].env, "cpu", 0)]  # before training begins
 
 
 def test_leaves_nothing_of_hydras_behind(command: Command, trained: list[RunConfig], tmp_path: Path):
