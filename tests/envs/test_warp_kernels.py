@@ -173,6 +173,8 @@ def test_the_longest_module_is_compiled_first(model, monkeypatch):
   assert compiled == [(ccd, 64), ("smooth", None), ("solver", 32)]
 
 
-def test_the_cpu_and_mjx_alone_compile_nothing_ahead():
+def test_the_cpu_and_mjx_alone_compile_nothing_ahead(gpu):
   for impl in ("jax", "warp"):
+    warp_kernels.stand_by(env_config(), "auto")
     assert registry.load("CartpoleBalance", overrides={"impl": impl}).physics.compile_ahead() is None
+    assert warp_kernels._standing_by == []
