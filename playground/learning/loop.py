@@ -24,6 +24,7 @@ from playground.learning.learner import Learner
 from playground.learning.rollout import Step
 
 Metrics = dict[str, float]
+Draw = Callable[[], tuple[ModelFields, ModelFields]]  # randomised models, of the training and of the evaluation
 COMPILER = "compiler"  # name of the threads that compile
 
 
@@ -110,7 +111,7 @@ class Program:
   notice: str | None
 
 
-def compile_program(learner: Learner, evaluate: Any, draw: Callable[[], tuple[ModelFields, ModelFields]]) -> Program:
+def compile_program(learner: Learner, evaluate: Any, draw: Draw) -> Program:
   """Traces each function once and compiles them side by side, Warp's kernels too, ahead of the first step.
 
   Args:

@@ -103,7 +103,7 @@ def _check(config: "RunConfig") -> None:
       facts |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(learner.policy_shape())}
       if before is None and config.init_from is not None:
         start = Start(weights=Checkpoint(find_checkpoints(config.init_from)[0]))
-        start.restore(learner, stage.agent.name, {})
+        start.restore(learner, stage.agent.name, lambda: ({}, {}))
       if before is not None:
         _compare(f"env={stage.choices['env']}", facts, *before)
       before = name, facts

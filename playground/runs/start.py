@@ -9,6 +9,7 @@ import jax
 from playground.errors import CheckpointError
 from playground.learning.checkpoints import Checkpoint, find_checkpoints
 from playground.learning.learner import Learner
+from playground.learning.loop import Draw
 from playground.runs.run_dir import RunDirectory
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ class Start:
     """Whether the resumed run has nothing left to do."""
     return self.run_dir is not None and self.run_dir.status.get("status") == "finished"
 
-  def restore(self, learner: Learner, name: str, model: Any) -> None:
+  def restore(self, learner: Learner, name: str, draw: Draw) -> None:
     """Reads what there is to restore, checked against the algorithm and its shapes, before anything is compiled.
 
     Raises:
@@ -89,6 +90,7 @@ class Start:
       source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
       self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is fresh.")
       return
+    model, _ = jax.eval_shape(draw)
     template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), model)
     for path in self.checkpoints:
       try:
