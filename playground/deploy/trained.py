@@ -14,6 +14,7 @@ from playground import registry
 from playground.deploy.contract import describe_policy
 from playground.deploy.graph import policy_graph
 from playground.deploy.policy import ExportedPolicy
+from playground.envs.backend import sees
 from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_training
@@ -98,6 +99,5 @@ def load_on_c_physics(task: str, config: Any) -> Env:
     ConfigError: it sees pictures, and MuJoCo-Warp, which renders them, is not installed.
   """
   config = ConfigDict(config)
-  renders = "vision" in config and config.vision.enable
-  config.impl = "warp" if renders else "jax"  # whose model is the smallest to build; it is not simulated
+  config.impl = "warp" if sees(config) else "jax"  # whose model is the smallest to build; it is not simulated
   return on_c_physics(registry.load(task, config=config))

@@ -10,6 +10,7 @@ import jax
 import mujoco
 from flax import struct
 
+from playground.envs.backend import auto_impl, sees
 from playground.envs.physics import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.envs.warp_kernels import quiet_warp
 from playground.errors import ConfigError
@@ -77,8 +78,7 @@ class Env(abc.ABC):
     self.action_repeat: int = config.action_repeat
     mj_model.opt.timestep = self.sim_dt
     self.mj_model = mj_model
-    renders = "vision" in config and config.vision.enable
-    self.impl = choose_impl(config.impl, config.cuda_impl, renders)
+    self.impl = choose_impl(config.impl, config.cuda_impl, sees(config))
     self.physics = Physics(
       mj_model,
       impl=self.impl,
@@ -171,7 +171,7 @@ def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
     ConfigError: unknown name, Warp asked for where it is not installed or cannot run, or another asked to render.
   """
   if impl == "auto":
-    impl = "warp" if renders else cuda_impl if jax.default_backend() == "gpu" else "jax"
+    impl = auto_impl(cuda_impl, renders, jax.default_backend() == "gpu")
   if impl not in ("jax", "warp"):
     raise ConfigError(f"env.impl={impl!r} must be one of auto, jax, warp.")
   if renders and impl != "warp":

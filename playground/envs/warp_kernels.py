@@ -25,6 +25,7 @@ from typing import Any
 import mujoco
 
 from playground.collector import uncollected
+from playground.envs.backend import auto_impl, sees
 
 LIMIT_S = 900.0  # for a machine with few cores; a process that takes longer hangs
 _NEEDS = ("warp", "mujoco.mjx.warp.ffi", "mujoco.mjx.third_party.mujoco_warp")
@@ -42,10 +43,9 @@ def stand_by(env: Mapping[str, Any], platform: str) -> None:
     env: the run's `env` config.
     platform: `hardware.platform`.
   """
-  renders = "vision" in env and env["vision"]["enable"]
-  impl = env["cuda_impl"] if env["impl"] == "auto" else env["impl"]
+  impl = auto_impl(env["cuda_impl"], sees(env), on_gpu=True) if env["impl"] == "auto" else env["impl"]
   no_gpu = "cpu" in (platform, os.environ.get("JAX_PLATFORMS")) or not shutil.which("nvidia-smi")
-  if not (_standing_by or no_gpu) and (renders or impl == "warp"):
+  if impl == "warp" and not (_standing_by or no_gpu):
     _standing_by.append(_start())
 
 

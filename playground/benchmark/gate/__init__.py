@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from playground.benchmark.arguments import option
+from playground.benchmark.arguments import check_amounts, option
 from playground.config.files import shipped
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.runs.files import need_folder, write_text
@@ -53,8 +53,7 @@ def run(options: Options) -> int:
   """Measures and compares, or writes the table; returns the exit code."""
   path = Path(options.table) if options.table else shipped("benchmarks") / "gate.csv"
   limits = _read(path)
-  if options.repeats < 1:
-    raise ConfigError(f"repeats={options.repeats} must be at least 1.")
+  check_amounts(options)
   if not (limits or options.update):
     raise ConfigError(f"table={path} holds no check: `playground-bench gate update=true table={path}` adds them.")
   if options.update:
