@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "docs/first_policy.ipynb"
 # Pages of the API's reference: modules, and packages all of whose modules are meant.
 API = {
-  "Tasks": ["registry", "envs.base", "envs.physics", "envs.wrappers", "envs.vision"],
+  "Tasks": ["registry", "envs.task", "envs.base", "envs.physics", "envs.wrappers", "envs.vision"],
   "Parts of tasks": ["mdp"],
   "Randomisation": ["randomization"],
   "Scenes": ["robots.scene", "robots.terrain", "robots.tabletop", "robots.in_hand"],

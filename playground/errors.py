@@ -1,6 +1,7 @@
 """Errors a user can act on. Commands print them as one sentence and exit with code 2."""
 
 import difflib
+import errno
 from collections.abc import Iterable
 
 
@@ -22,6 +23,21 @@ class CheckpointError(PlaygroundError):
 
 class HardwareError(PlaygroundError):
   """More, or other, hardware asked for than this machine has."""
+
+
+# What the operating system says of a path, a disk or a limit of the machine, and never because of a bug of ours.
+_OF_THE_MACHINE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP}
+_OF_THE_MACHINE |= {errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ESTALE}
+
+
+def one_sentence(error: Exception) -> str:
+  """What a command prints of an error that the user can act on; raises any other again."""
+  if not isinstance(error, OSError):
+    return f"error: {' '.join(str(error).split())}"
+  if error.errno not in _OF_THE_MACHINE:
+    raise error
+  where = f"{error.filename}: " if error.filename else ""
+  return f"error: {where}{error.strerror}."
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

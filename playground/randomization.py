@@ -1,16 +1,23 @@
-"""Domain randomisation: declarative terms, drawn once per environment, become model fields with a batch axis.
+"""Domain randomisation: the events of a task that draw fields of its model.
 
-A term says which entries of a model field change, how, and what is drawn:
+Such an event says which entries of a model field change, how, and what is drawn:
 
 ```yaml
-terms:
-  - {field: body_mass, target: all, operation: scale, range: [0.9, 1.1]}
-  - {field: body_mass, target: trunk, operation: add, distribution: normal, mean: 0.0, std: 0.5}
+events:
+  link_masses:
+    mode: startup
+    func: model_field
+    params: {field: body_mass, target: all, operation: scale, range: [0.9, 1.1]}
+  payload:
+    mode: startup
+    func: model_field
+    params: {field: body_mass, target: trunk, operation: add, distribution: normal, mean: 0.0, std: 0.5}
 ```
 
-Terms apply in order, each to the result of those before. Lights, cameras, colours and materials are fields like any
-others (docs/vision.md). Derived quantities (`body_subtreemass`, `dof_invweight0`,
-`body_invweight0`, `dof_M0`) keep their nominal values, as in Playground 0.2.0.
+Those of mode `startup` are drawn once an environment and become model fields with a batch axis; those of mode `reset`
+are drawn in each episode (`playground.envs.task`). They apply in order, each to the result of those before. Lights,
+cameras, colours and materials are fields like any others (docs/vision.md). Derived quantities (`body_subtreemass`,
+`dof_invweight0`, `body_invweight0`, `dof_M0`) keep their nominal values, as in Playground 0.2.0.
 """
 
 import dataclasses
@@ -27,6 +34,7 @@ from mujoco import mjx
 from mujoco.mjx._src.math import quat_mul, rotate
 
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.mdp.options import MODEL_FIELD, is_model_field, keys
 
 # Whose rows a field has, by the prefix of its name: object type and number of objects.
 _OBJECTS = {
@@ -70,7 +78,7 @@ _PARAMETERS = {"normal": ("mean", "std"), "bernoulli": ("mean",)}  # of the othe
 
 @dataclasses.dataclass(frozen=True)
 class Term:
-  """One randomisation term, as written in `configs/randomization/*.yaml`.
+  """Parameters of one event of func `model_field`.
 
   Attributes:
     field: a field of `mjx.Model`, of numbers or switches, with a row per geom, body, site, actuator, tendon, pair,
@@ -119,7 +127,7 @@ class Term:
 
   @classmethod
   def parse(cls, term: Mapping[str, Any], key: str) -> "Term":
-    """Checks a term that `key`, e.g. `randomization.terms[0]`, holds; raises ConfigError."""
+    """Checks the parameters that `key`, e.g. `env.events.payload.params`, holds; raises ConfigError."""
     term = dict(term)
     known = [field.name for field in dataclasses.fields(cls)]
     for name in term:
@@ -211,14 +219,19 @@ class Randomizer:
     fields: names of the `mjx.Model` fields that any term touches, in order of first use.
   """
 
-  def __init__(self, mj_model: mujoco.MjModel, terms: Iterable[Mapping[str, Any]]):
-    """Binds terms to a model, whose values of now are the nominal ones.
+  def __init__(self, mj_model: mujoco.MjModel, events: Mapping[str, Any], mode: str = "startup"):
+    """Binds events to a model, whose present values are the nominal ones.
+
+    Args:
+      mj_model: the model.
+      events: a task's `env.events`, of which those of func `model_field` and this mode count.
+      mode: `startup` or `reset`.
 
     Raises:
-      ConfigError: a term that cannot work, with its place in the list.
+      ConfigError: an event that is invalid, with its key.
       UnknownNameError: a key, field, target, operation or distribution that does not exist.
     """
-    self._draws = [_bind(mj_model, Term.parse(t, key), key) for key, t in _keyed(terms)]
+    self._draws = [_bind(mj_model, Term.parse(t, key), key) for key, t in model_fields(events, mode).items()]
     self.fields: tuple[str, ...] = tuple(dict.fromkeys(slot.field for draw in self._draws for slot in draw.slots))
     self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
 
@@ -242,24 +255,48 @@ class Randomizer:
     return [draw.term.describe() | {"values": str(draw.count)} for draw in self._draws]
 
 
-def parse_terms(terms: Iterable[Mapping[str, Any]]) -> list[Term]:
-  """Checks the terms of a `configs/randomization/*.yaml`, as far as can be done without a model.
+def model_fields(events: Mapping[str, Any] | None, mode: str) -> dict[str, Mapping[str, Any]]:
+  """Returns the parameters of the enabled events of func `model_field` and a mode, by their key in the config.
 
   Raises:
-    ConfigError: a term that cannot work, with its place in the list.
+    ConfigError: an event of that func whose mode is neither `startup` nor `reset`, or whose parameters are no mapping.
   """
-  return [Term.parse(term, key) for key, term in _keyed(terms)]
+  found = {}
+  for name, entry in (events or {}).items():
+    if entry is None or not is_model_field(name, entry):
+      continue
+    key = f"env.events.{name}"
+    for field in entry:
+      _choose(f"{key} key", field, keys("events"))
+    if entry.get("mode") not in ("startup", "reset"):
+      raise ConfigError(f"{key}.mode={entry.get('mode')} must be startup or reset: func {MODEL_FIELD} has these two.")
+    if not isinstance(entry.get("enabled", True), bool):
+      raise ConfigError(f"{key}.enabled={entry['enabled']!r} must be true or false.")
+    if not hasattr(entry.get("params"), "keys"):
+      raise ConfigError(f"{key}.params={entry.get('params')!r} is not a mapping such as {{field: body_mass, ...}}.")
+    if entry["mode"] == mode and entry.get("enabled", True):
+      found[f"{key}.params"] = entry["params"]
+  return found
+
+
+def parse_events(events: Mapping[str, Any], mode: str = "startup") -> dict[str, Term]:
+  """Checks the events that draw model fields, as far as can be done without a model; by name.
+
+  Raises:
+    ConfigError: an event that is invalid.
+  """
+  return {key.split(".")[2]: Term.parse(params, key) for key, params in model_fields(events, mode).items()}
 
 
 def domain_randomizer(
-  mj_model: mujoco.MjModel, terms: Iterable[Mapping[str, Any]]
+  mj_model: mujoco.MjModel, events: Mapping[str, Any]
 ) -> Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]:
   """Returns Playground 0.2.0's kind of randomizer, for Brax's wrappers.
 
   The callable maps `(mjx_model, rng[N])` to `(model, in_axes)`: the model with a leading axis N on every randomised
   field, and the same structure with 0 at those fields and None elsewhere, for `jax.vmap`.
   """
-  randomizer = Randomizer(mj_model, terms)
+  randomizer = Randomizer(mj_model, events)
 
   def randomize(mjx_model: mjx.Model, rng: jax.Array) -> tuple[mjx.Model, mjx.Model]:
     in_axes: Any = jax.tree.map(lambda _: None, mjx_model)
@@ -268,14 +305,6 @@ def domain_randomizer(
     return model, in_axes.tree_replace(dict.fromkeys(randomizer.fields, 0))
 
   return randomize
-
-
-def _keyed(terms: Iterable[Mapping[str, Any]]) -> Iterable[tuple[str, Mapping[str, Any]]]:
-  for i, term in enumerate(terms):
-    key = f"randomization.terms[{i}]"
-    if not hasattr(term, "keys"):
-      raise ConfigError(f"{key}={term!r} is not a mapping such as {{field: body_mass, target: all, ...}}.")
-    yield key, term
 
 
 def _choose(key: str, name: Any, known: Iterable[str]) -> None:

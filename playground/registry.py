@@ -9,17 +9,20 @@ my_pkg = "my_pkg:CONFIGS"     # CONFIGS = Path(__file__).parent / "configs", or 
 
 The folder is laid out like our `configs/`: `env/MyTask.yaml`, and whatever else belongs to it (`tuned/ppo/MyTask.yaml`,
 `robot/my_robot.yaml`, `experiment/...`). Its files may use our groups and options in their defaults lists.
+
+Classes of any other package are refused unless the user trusts it (`playground.trust`).
 """
 
 import functools
-import importlib
+import inspect
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 from ml_collections import ConfigDict
 
-from playground.config import compose, override_section, task_names
+from playground.config import compose, config_dict, in_order_of, options, override_section, task_names
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.trust import trusted_object
 
 if TYPE_CHECKING:
   from playground.envs.base import Env
@@ -44,7 +47,7 @@ def config(name: str) -> ConfigDict:
   Raises:
     UnknownNameError: no such task.
   """
-  return _composed(name).env.copy_and_resolve_references()
+  return config_dict(_composed(name).env)
 
 
 get_default_config = config
@@ -61,7 +64,7 @@ def load(
   Args:
     name: one of `names()`.
     config: a whole configuration to use in place of the task's own; it is not changed.
-    overrides: values by dotted key, `{"reward.scales.energy": -0.002}`.
+    overrides: values by dotted key, `{"rewards.joint_power_l1.weight": -0.002}`.
     config_overrides: the same, under the name that Playground 0.2.0 had for it.
 
   Raises:
@@ -69,8 +72,10 @@ def load(
     ConfigError: a value that cannot be.
   """
   default = _composed(name).env if config is None else config
+  if isinstance(config, ConfigDict) and list(config) == sorted(config):  # a copy of a ConfigDict has its keys sorted
+    default = in_order_of(_composed(name).env, config)
   section = override_section("env", default, {**(overrides or {}), **(config_overrides or {})})
-  return build(ConfigDict(section))
+  return build(config_dict(section))
 
 
 def build(env_config: ConfigDict) -> "Env":
@@ -85,21 +90,17 @@ def build(env_config: ConfigDict) -> "Env":
 
 
 def task_class(task: str) -> Callable[[ConfigDict], "Env"]:
-  """Imports the class that `module:Class` names; raises ConfigError if there is none."""
-  module_name, _, class_name = task.partition(":")
-  try:
-    module = importlib.import_module(module_name)
-  except ModuleNotFoundError as error:
-    if not f"{module_name}.".startswith(f"{error.name}."):  # the module is there, something that it needs is not
-      raise
-    raise ConfigError(f"env.task={task}: there is no module {error.name}; write module:Class.") from None
-  except ValueError:  # an empty name
-    raise ConfigError(f"env.task={task} is not of the form module:Class.") from None
-  if not isinstance(getattr(module, class_name, None), type):
-    classes = [n for n, value in vars(module).items() if isinstance(value, type) and value.__module__ == module_name]
-    near = nearest(class_name, classes)
-    raise ConfigError(f"env.task={task}: {module_name} has no class {class_name or '(write module:Class)'}.{near}")
-  return getattr(module, class_name)
+  """Imports the task that `module:Class` names.
+
+  Raises:
+    ConfigError: there is none, or its package is not trusted (`playground.trust`).
+  """
+  found = trusted_object("env.task", task)
+  from playground.envs.base import Env
+
+  if not (isinstance(found, type) and issubclass(found, Env)) or inspect.isabstract(found):
+    raise ConfigError(f"env.task={task} is no task: it must be a class that completes playground.envs.base:Env.")
+  return cast("Callable[[ConfigDict], Env]", found)
 
 
 def get_domain_randomizer(name: str) -> Callable[..., Any] | None:
@@ -109,21 +110,21 @@ def get_domain_randomizer(name: str) -> Callable[..., Any] | None:
     A function `(mjx_model, rng [N]) -> (model, in_axes)`: the model with a leading axis N on every randomised field,
     and the same structure with 0 at those fields and None elsewhere.
   """
-  terms = _composed(name).randomization.terms
-  if not terms:
+  from playground.randomization import domain_randomizer, model_fields
+
+  events: Any = config(name).events
+  if not model_fields(events, "startup"):
     return None
 
   @functools.cache
   def randomizer() -> Callable[..., Any]:
-    from playground.randomization import domain_randomizer
-
-    return domain_randomizer(load(name).mj_model, terms)
+    return domain_randomizer(load(name).mj_model, events)
 
   return lambda mjx_model, rng: randomizer()(mjx_model, rng)
 
 
 def _composed(name: str) -> Any:
   """The composition of a task alone: no tuned set, whose env values belong to an algorithm."""
-  if name not in task_names():
+  if name not in (task_names() if "/" not in name else options("env")):
     raise UnknownNameError(f"Task {name!r} does not exist; `playground list` shows all.{nearest(name, task_names())}")
   return compose([f"env={name}", "tuned=null"])

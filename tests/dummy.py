@@ -31,7 +31,11 @@ class NoPhysics:
 
 
 class PointTask(Env):
-  """Position [2] follows the action, reward is minus the distance; NaN or absurd velocity on demand (`*_at` steps)."""
+  """Position [2] follows the action, reward is minus the distance.
+
+  On demand NaN or absurd velocity in a step (`*_at`), and a first observation of NaN where the point starts to the
+  left (`nan_reset`).
+  """
 
   def __init__(
     self,
@@ -39,9 +43,10 @@ class PointTask(Env):
     action_repeat: int = 1,
     nan_at: int | None = None,
     fast_at: int | None = None,
+    nan_reset: bool = False,
   ):  # pyright: ignore[reportMissingSuperCall]
     self.dt, self.episode_length, self.action_repeat, self.nan_at = 0.1, episode_length, action_repeat, nan_at
-    self.fast_at, self.impl = fast_at, "jax"
+    self.fast_at, self.nan_reset, self.impl = fast_at, nan_reset, "jax"
     self.physics: Any = NoPhysics()
 
   @property
@@ -58,17 +63,20 @@ class PointTask(Env):
     fields |= {"qpos": jax.random.uniform(key, (2,), minval=-1), "qvel": jnp.zeros(2)}
     data = PhysicsData(**fields)
     info = {"rng": rng, "age": jnp.zeros(()), "time": jnp.zeros(())}
-    return State(data, self._obs(data), jnp.zeros(()), jnp.zeros(()), {"distance": jnp.zeros(())}, info)
+    obs = self._obs(data)
+    if self.nan_reset:
+      obs = jax.tree.map(lambda x: jnp.where(data.qpos[0] < 0, jnp.nan, x), obs)
+    return State(data, obs, jnp.zeros(()), jnp.zeros(()), {"distance": jnp.zeros(())}, info)
 
-  def control(self, state: State, action: jax.Array) -> jax.Array:
+  def action_to_ctrl(self, state: State, action: jax.Array) -> jax.Array:
     return action
 
   def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
-    ctrl = self.control(state, action)
+    ctrl = self.action_to_ctrl(state, action)
     data = state.data.replace(qpos=state.data.qpos + 0.1 * ctrl, qvel=ctrl)
-    return self.evaluate(data, state.info, action)
+    return self.post_step(data, state.info, action)
 
-  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     age = info["age"] + 1
     if self.nan_at is not None:
       data = data.replace(qpos=jnp.where(age == self.nan_at, jnp.nan, data.qpos))
@@ -88,7 +96,6 @@ class Point(PointTask):
 
   mj_model: Any = None  # pyright: ignore[reportIncompatibleVariableOverride]
   impl = "jax"
-  parity = False
 
 
 SMALL_PPO = PPOConfig(
@@ -114,10 +121,10 @@ needs_rsl_rl = pytest.mark.skipif(
 )
 
 
-def point_learner(config: Config, num_devices: int = 1, nan_at: int | None = None) -> Learner:
+def point_learner(config: Config, num_devices: int = 1, **events: Any) -> Learner:
   """The algorithm that a config is of, for the point."""
   algorithm = ALGORITHMS[type(config)]
-  return algorithm(PointTask(nan_at=nan_at), config, make_mesh(num_devices))
+  return algorithm(PointTask(**events), config, make_mesh(num_devices))
 
 
 class Recorder:

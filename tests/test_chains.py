@@ -13,9 +13,9 @@ from playground.errors import ConfigError, UnknownNameError
 
 CHAINS = [name for name in options("experiment") if name.endswith("_chain")]
 STAGES = """
-  flat: {num_timesteps: 1000, overrides: ['env.command.max=[1.0, 0.5, 0.5]', agent.num_envs=1024]}
-  fast: {num_timesteps: null, overrides: ['env.command.max=[2.0, 0.5, 0.5]']}
-  slope: {num_timesteps: 3000, overrides: [terrain=slope, env.reward.scales.energy=-0.002]}
+  flat: {num_timesteps: 1000, overrides: ['env.commands.velocity.params.max=[1.0, 0.5, 0.5]', agent.num_envs=1024]}
+  fast: {num_timesteps: null, overrides: ['env.commands.velocity.params.max=[2.0, 0.5, 0.5]']}
+  slope: {num_timesteps: 3000, overrides: [terrain=slope, env.rewards.joint_power_l1.weight=-0.002]}
 """
 
 
@@ -36,9 +36,9 @@ MINE = ["env=Go1JoystickFlatTerrain", "curriculum=mine"]
 
 def test_a_stage_adds_to_those_before_it(configs: Path):
   flat, fast, slope = compose([*MINE, "seed=5"], configs).stages
-  assert [stage.env.command.max[0] for stage in (flat, fast, slope)] == [1.0, 2.0, 2.0]
+  assert [stage.env.commands.velocity.params.max[0] for stage in (flat, fast, slope)] == [1.0, 2.0, 2.0]
   assert [stage.env.scene.terrain for stage in (flat, fast, slope)] == ["flat", "flat", "slope"]
-  assert [stage.env.reward.scales.energy for stage in (fast, slope)] == [-0.001, -0.002]
+  assert [stage.env.rewards.joint_power_l1.weight for stage in (fast, slope)] == [-0.001, -0.002]
   assert [stage.agent.num_timesteps for stage in (flat, fast, slope)] == [1000, 200_000_000, 3000]
   for stage in (flat, fast, slope):
     assert (stage.seed, stage.agent.num_envs, stage.stages) == (5, 1024, ())
@@ -49,9 +49,14 @@ def test_a_stage_adds_to_those_before_it(configs: Path):
 
 
 def test_the_command_line_wins_in_all_stages(configs: Path):
-  overrides = [*MINE, "agent.num_envs=512", "env.reward.scales.energy=-0.5", "curriculum.stages.flat.num_timesteps=7e6"]
+  overrides = [
+    *MINE,
+    "agent.num_envs=512",
+    "env.rewards.joint_power_l1.weight=-0.5",
+    "curriculum.stages.flat.num_timesteps=7e6",
+  ]
   stages = compose(overrides, configs).stages
-  assert {(stage.agent.num_envs, stage.env.reward.scales.energy) for stage in stages} == {(512, -0.5)}
+  assert {(stage.agent.num_envs, stage.env.rewards.joint_power_l1.weight) for stage in stages} == {(512, -0.5)}
   assert stages[0].agent.num_timesteps == 7_000_000
 
 
@@ -60,7 +65,7 @@ def test_another_task_brings_its_own_files(configs: Path):
   a, b = compose([*MINE, "agent=ppo_v020"], configs).stages
   assert (a.choices["tuned"], b.choices["tuned"]) == ("ppo_v020/Go1JoystickFlatTerrain", "ppo/Go1Getup")
   assert b.agent.num_timesteps == 50_000_000
-  assert (b.env.task, b.choices["robot"]) == ("playground.envs.locomotion.getup:Getup", "go1")
+  assert (b.env.task, b.choices["robot"]) == ("playground.envs.locomotion.legged:LeggedTask", "go1")
 
 
 def test_budgets_in_proportion(configs: Path):
@@ -85,7 +90,7 @@ def test_a_shortened_chain_sees_as_much_of_an_episode():
 
 def test_a_chain_starts_at_a_stage_with_what_those_before_it_set(configs: Path, tmp_path: Path):
   (only,) = compose([*MINE, "curriculum.start_at=slope", f"init_from={tmp_path}"], configs).stages
-  assert (only.name, only.env.command.max[0]) == ("Go1JoystickFlatTerrain/slope", 2.0)
+  assert (only.name, only.env.commands.velocity.params.max[0]) == ("Go1JoystickFlatTerrain/slope", 2.0)
   assert only.resolved["init_from"] is None, "the chain says it"
   assert len(compose([*MINE, "curriculum.start_at=flat"], configs).stages) == 3, "the first needs no weights"
 
@@ -117,22 +122,30 @@ def test_every_chain_has_an_experiment():
   [
     (
       "go1_joystick_chain",  # paper, Appendix B.2.5
-      ("env.command.max", "env.scene.terrain", "agent.num_timesteps"),
+      ("env.commands.velocity.params.max", "env.scene.terrain", "agent.num_timesteps"),
       [
         ([1.5, 0.8, 1.2], "flat", 100_000_000),
         ([1.5, 0.8, pytest.approx(2 * pi)], "flat", 50_000_000),
         ([1.5, 0.8, pytest.approx(2 * pi)], "rough", 100_000_000),
       ],
     ),
-    ("go1_getup_chain", ("env.termination.power", "env.reward.scales.dof_vel"), [(400.0, 0.0), (400.0, -0.1)]),
+    (
+      "go1_getup_chain",
+      ("env.terminations.power_above.params.limit", "env.rewards.joint_vel_limits_l2.weight"),
+      [(400.0, 0.0), (400.0, -0.1)],
+    ),
     (
       "go1_footstand_chain",
-      ("env.termination.power", "env.reward.scales.energy", "env.reward.scales.dof_acc"),
-      [(None, 0.0, 0.0), *((watts, -0.003, -2.5e-7) for watts in (400.0, 300.0, 250.0, 200.0))],
+      (
+        "env.terminations.power_above.params.limit",
+        "env.rewards.joint_power_l1.weight",
+        "env.rewards.joint_acc_l2.weight",
+      ),
+      [(None, None, None), *((watts, -0.003, -2.5e-7) for watts in (400.0, 300.0, 250.0, 200.0))],
     ),
     (
       "leap_reorient_chain",  # paper, Section IV-C.1
-      ("env.torque_limits", "env.noise.pose.injection", "agent.num_timesteps", "agent.learning_rate"),
+      ("env.torque_limits", "env.pose_noise.injection", "agent.num_timesteps", "agent.learning_rate"),
       [(False, 0.0, 200_000_000, 3e-4), (True, 0.1, 100_000_000, 1e-4)],
     ),
     ("g1_rough_chain", ("choices.env",), [("G1JoystickFlatTerrain",), ("G1JoystickRoughTerrain",)]),
@@ -141,8 +154,8 @@ def test_every_chain_has_an_experiment():
 def test_chains_are_the_papers(experiment: str, keys: tuple[str, ...], expected: list[Any]):
   def value(node: Any, key: str) -> Any:
     for part in key.split("."):
-      node = node[part]
-    return node
+      node = node.get(part, {})
+    return None if node == {} else node
 
   stages = shipped(experiment).stages
   assert [tuple(value(stage.resolved, key) for key in keys) for stage in stages] == expected
@@ -156,7 +169,7 @@ def test_chains_are_the_papers(experiment: str, keys: tuple[str, ...], expected:
   {
     "curriculum.start_at=slpe": "curriculum.start_at=slpe does not exist: choose from flat, fast, slope. Did you mean",
     "curriculum.start_at=slope": "=slope is not the first stage, so it needs weights to start from: add init_from=<",
-    "curriculum.scale=-1": "curriculum.scale=-1.0 must be a number 0 or more.",
+    "curriculum.scale=-1": "curriculum.scale=-1.0 must be a number from 0 to 1000.",
     "curriculum.stages.slop.num_timesteps=1": "slop.num_timesteps does not exist: curriculum.stages has flat, fast, ",
     "curriculum.stages.flat.num_timesteps=0": "curriculum.stages.flat.num_timesteps=0 must be a whole number above 0",
     "agent.num_timesteps=5": "agent.num_timesteps=5 is not for a chain, whose stages have budgets of their own",

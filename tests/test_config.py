@@ -86,8 +86,9 @@ def test_a_task_chooses_robot_and_randomization_which_the_command_line_overrides
   run = compose(["experiment=go1_joystick"])
   assert (run.choices["robot"], run.choices["randomization"]) == ("go1", "go1")
   assert run.env.robot.name == "go1"
-  assert run.randomization.terms
-  assert compose(["experiment=go1_joystick", "randomization=none"]).randomization.terms == []
+  startup = lambda run: [name for name, event in run.env.events.items() if event.mode == "startup"]
+  assert "payload" in startup(run)
+  assert startup(compose(["experiment=go1_joystick", "randomization=none"])) == []
 
 
 def test_a_generic_task_takes_any_robot():
@@ -239,9 +240,9 @@ ERRORS = {
   "agent.learning_rat=1": ["agent.learning_rat does not exist: agent has", "Did you mean 'agent.learning_rate'?"],
   "agent.network.activatio=relu": ["agent.network has policy_hidden_layer_sizes, ", "'agent.network.activation'?"],
   "agent.network={activatio: relu}": ["agent.network.activatio", "does not exist.", "'agent.network.activation'?"],
-  "env=Go1JoystickFlatTerrain env.reward.scales.enrgy=1": ["env.reward.scales.enrgy", "'env.reward.scales.energy'?"],
+  "env=Go1JoystickFlatTerrain env.rewards.joint_power_l1.wieght=1": ["joint_power_l1.wieght does not", "'weight'?"],
   "agent.name.x=1": ["agent.name.x does not exist: agent.name is a single value."],
-  "randomization.terms.0.field=x": ["randomization.terms is a list of 0."],
+  "agent.network.policy_hidden_layer_sizes.9.x=1": ["agent.network.policy_hidden_layer_sizes is a list of 4."],
   "env@foo=CartpoleBalance": ["env@foo does not exist", "Did you mean 'env'?"],
   "+agent.foo=1": ["agent.foo does not exist: agent has name, num_timesteps, "],
   "++env.foo=1": ["env.foo does not exist: env has "],
@@ -256,7 +257,7 @@ ERRORS = {
   "agent.num_envs=[1]": ["agent.num_envs=[1]", "must be a whole number"],
   "agent.num_envs=???": ["agent.num_envs has no value: set agent.num_envs=<value>."],
   "agent.normalize_advantage=1": ["agent.normalize_advantage=1", "must be true or false, as its default true is."],
-  "agent.name=3": ["agent.name=3", "must be text, as its default ppo is."],
+  "agent.name=3": ["agent.name=3 cannot be set: agent=<name> chooses it, with the keys that it has."],
   "agent.network=3": ["agent.network=3", "must be a mapping with the keys policy_hidden_layer_sizes, "],
   "agent.network.policy_hidden_layer_sizes=8": ["=8 ", "must be a list, as its default [32, 32, 32, 32] is."],
   "agent.network.policy_hidden_layer_sizes=[8,a]": ["policy_hidden_layer_sizes[1]=a ", "must be a whole number"],
@@ -266,29 +267,33 @@ ERRORS = {
   "agent=[1": ["'agent=[1' is not an override: write key=value, such as env=CartpoleBalance"],
   "agent.num_envs": ["'agent.num_envs' is not an override"],
   "agent.num_envs=1,2": ["agent.num_envs=1,2 names several values, which is a sweep: add -m"],
-  "agent.num_timesteps=-5": ["agent.num_timesteps=-5 must be a number above 0."],
-  "agent.num_envs=0": ["agent.num_envs=0 must be a number above 0."],
-  "agent.max_grad_norm=big": ["agent.max_grad_norm=big must be a number above 0."],
-  "agent.max_grad_norm=[1]": ["agent.max_grad_norm=[1] must be a number above 0."],
-  "env.vision.farthest=inf": ["env.vision.farthest=inf must be a number above 0."],
-  "agent.network.policy_hidden_layer_sizes=[8,0]": ["policy_hidden_layer_sizes=[8, 0] must be numbers above 0."],
-  "agent.network.cnn.strides=[0,2]": ["agent.network.cnn.strides=[0, 2] must be numbers above 0."],
-  "agent.network.cnn.kernels=[5,0]": ["agent.network.cnn.kernels=[5, 0] must be numbers above 0."],
-  "agent.network.cnn.channels=[-3,3]": ["agent.network.cnn.channels=[-3, 3] must be numbers above 0."],
-  "hardware.devices=0": ["hardware.devices=0 must be a number above 0."],
-  "agent=sac agent.tau=2": ["agent.tau=2.0 must be a number between 0 and 1."],
-  "agent=sac agent.grad_updates_per_step=0": ["agent.grad_updates_per_step=0 must be a number above 0."],
-  "agent=sac agent.min_replay_size=-1": ["agent.min_replay_size=-1 must be a number 0 or more."],
-  "agent.discounting=2": ["agent.discounting=2.0 must be a number between 0 and 1."],
-  "seed=-1": ["seed=-1 must be a number 0 or more."],
-  "env=PandaPickCube env.success_distance=-1": ["env.success_distance=-1.0 must be a number above 0."],
-  "env=PandaPickCubeCartesian env.gripper_delay=-1": ["env.gripper_delay=-1 must be a number 0 or more."],
-  "env=LeapCubeReorient env.noise.pose.injection=2": ["env.noise.pose.injection=2.0 must be a number between 0 and 1."],
-  "env=PandaPickCube env.njmax=-1": ["env.njmax=-1 must be a number 0 or more."],
+  "agent.num_timesteps=-5": ["agent.num_timesteps=-5 must be a whole number from 1 to 1e+12."],
+  "agent.num_envs=0": ["agent.num_envs=0 must be a whole number from 1 to 16777216."],
+  "agent.max_grad_norm=big": ["agent.max_grad_norm=big must be a number above 0 and at most 1000000000."],
+  "agent.max_grad_norm=[1]": ["agent.max_grad_norm=[1] must be a number above 0 and at most"],
+  "env.vision.farthest=inf": ["env.vision.farthest=inf must be a number above 0 and at most"],
+  "agent.network.policy_hidden_layer_sizes=[8,0]": [
+    "policy_hidden_layer_sizes=[8, 0] must be a list of whole numbers from 1 to 65536."
+  ],
+  "agent.network.cnn.strides=[0,2]": [
+    "agent.network.cnn.strides=[0, 2] must be a list of whole numbers from 1 to 65536."
+  ],
+  "agent.network.cnn.kernels=[5,0]": ["agent.network.cnn.kernels=[5, 0] must be a list of whole numbers from 1 to"],
+  "agent.network.cnn.channels=[-3,3]": ["agent.network.cnn.channels=[-3, 3] must be a list of whole numbers from 1 to"],
+  "hardware.devices=0": ["hardware.devices=0 must be a whole number from 1 to"],
+  "agent=sac agent.tau=2": ["agent.tau=2.0 must be a number from 0 to 1."],
+  "agent=sac agent.grad_updates_per_step=0": ["agent.grad_updates_per_step=0 must be a whole number from 1 to"],
+  "agent=sac agent.min_replay_size=-1": ["agent.min_replay_size=-1 must be a whole number from 0 to"],
+  "agent.discounting=2": ["agent.discounting=2.0 must be a number from 0 to 1."],
+  "seed=-1": ["seed=-1 must be a whole number from 0 to 4294967295."],
+  "env=PandaPickCube env.success_distance=-1": ["env.success_distance=-1.0 must be a number above 0 and at most"],
+  "env=PandaPickCubeCartesian env.gripper_delay=-1": ["env.gripper_delay=-1 must be a whole number from 0 to 1000."],
+  "env=LeapCubeReorient env.pose_noise.injection=2": ["env.pose_noise.injection=2.0 must be a number from 0 to 1."],
+  "env=PandaPickCube env.njmax=-1": ["env.njmax=-1 must be a whole number from 0 to"],
   "env=PandaPickCube env.naccdmax_per_env=30": ["env.naccdmax_per_env=30 must not be above env.naconmax_per_env=24."],
-  "env.vision.brightness=[1]": ["env.vision.brightness=[1.0] must be two numbers, from and to."],
-  "env.vision.brightness=[-1,2]": ["env.vision.brightness=[-1.0, 2.0] must be numbers 0 or more."],
-  "env.vision.brightness=[2,1]": ["env.vision.brightness=[2.0, 1.0] must be two numbers, from and to."],
+  "env.vision.brightness=[1]": ["env.vision.brightness=[1.0] must be 2 numbers from 0 to"],
+  "env.vision.brightness=[-1,2]": ["env.vision.brightness=[-1.0, 2.0] must be 2 numbers from 0 to"],
+  "env.vision.brightness=[2,1]": ["the first not above the second."],
   "env.impl=wrap": ["env.impl=wrap is unknown: choose from auto, jax, warp. Did you mean 'warp'?"],
   "hardware.matmul_precision=higest": ["choose from default, high, highest, ", "Did you mean 'highest'?"],
   "agent.num_envs=100": ["agent.num_envs=100 does not divide", "128 * 8 = 1024"],
@@ -312,9 +317,42 @@ def test_errors_are_one_sentence(line: str):
   assert isinstance(caught.value, UnknownNameError) == ("does not exist" in message and "=/nowhere" not in line)
 
 
-def test_a_command_of_two_numbers_is_refused():
-  with pytest.raises(ConfigError, match=r"env\.command\.max=\[1\.0, 2\.0\] must be three numbers\."):
-    compose(["env=Go1JoystickFlatTerrain", "env.command.max=[1,2]"])
+MOVED = {
+  "env.reward.scales.feet_slip=-1": "env.rewards.feet_slip_l2.weight",
+  "env.reward.tracking_sigma=1": "env.rewards.<term>.params",
+  "env.reward.clip=null": "env.reward_clip",
+  "env.noise.level=0": "env.noise_level",
+  "env.noise.scales.gyro=1": "env.observations.state.<term>.noise",
+  "env.noise.pose.injection=1": "env.pose_noise.injection",
+  "env.obs_scales.gyro=1": "env.observations.state.<term>.scale",
+  "env.obs.state=[gyro]": "env.observations.<group>.<term>",
+  "env.history.joint_pos=3": "env.observations.state.<term>.history",
+  "env.frames=3": "env.observation_frames",
+  "env.termination.low=0.1": "env.terminations.<term>.params",
+  "env.command.max=[1,1,1]": "env.commands.velocity.params.max",
+  "env.command.duration=1": "env.commands.velocity.params.resample_s",
+  "env.gait.frequency=[1,1]": "env.commands.gait.params.frequency",
+  "env.pushes.enable=true": "env.events.push.enabled",
+  "env.pushes.interval=[1,2]": "env.events.push.params.interval_s",
+  "env.reset.xy=1": "env.events.<term>.params",
+  "env.hand.name=leap": "env.robot.name",
+  "env.parity=true": "env=v020/<TaskName>",
+  "randomization.terms=[]": "env.events.<term>, of mode startup",
+}
+
+
+@pytest.mark.parametrize("line", MOVED)
+def test_a_key_of_an_earlier_version_is_answered_with_todays(line: str):
+  with pytest.raises(UnknownNameError) as caught:
+    compose(["env=Go1JoystickFlatTerrain", line])
+  key = line.split("=")[0]
+  assert str(caught.value) == f"{key} is of an earlier version: write {MOVED[line]} (docs/migrate.md has all names)."
+
+
+def test_a_run_of_an_earlier_version_is_refused():
+  saved = {**compose(["env=CartpoleBalance"]).resolved, "randomization": {"terms": []}}
+  with pytest.raises(ConfigError, match=r"is of version 0\.1"):
+    from_saved(saved)
 
 
 def test_a_key_that_only_a_file_sets_is_refused(configs: Path):
@@ -349,7 +387,7 @@ def test_resume_takes_the_runs_own_configuration(run: Path):
     "run_dir=x": ["run_dir=x cannot be given with resume"],
     "init_from={run}": ["resume={run} exclude each other"],
     "hardware.devces=1": ["hardware.devces does not exist", "'hardware.devices'"],
-    "video.width=0": ["video.width=0 must be a number above 0."],
+    "video.width=0": ["video.width=0 must be a whole number from 1 to 8192."],
   }.items(),
 )
 def test_what_resume_refuses(run: Path, override: str, parts: list[str]):
@@ -367,24 +405,26 @@ def test_a_mistyped_run_names_its_neighbour(run: Path):
 
 def test_override_section():
   env = compose(["env=Go1JoystickFlatTerrain"]).env
-  changed = config.override_section("env", env, {"reward.scales.energy": -1, "command.max": (1.0, 0.5, 0.5)})
-  assert changed["reward"]["scales"]["energy"] == -1.0
-  assert changed["command"]["max"] == [1.0, 0.5, 0.5]
-  assert not math.isclose(env.reward.scales.energy, -1)
+  overrides = {"rewards.joint_power_l1.weight": -1, "commands.velocity.params.max": (1.0, 0.5, 0.5)}
+  changed = config.override_section("env", env, overrides | {"rewards.action_l2": {"weight": 1}})
+  assert changed["rewards"]["joint_power_l1"] == {"weight": -1.0}
+  assert changed["commands"]["velocity"]["params"]["max"] == [1.0, 0.5, 0.5]
+  assert list(changed["rewards"]) == [*env.rewards, "action_l2"], "in order"
+  assert not math.isclose(env.rewards.joint_power_l1.weight, -1)
 
 
 def test_a_run_saved_by_an_earlier_version_gets_todays_keys_but_keeps_its_choices() -> None:
   now = compose(["env=Go1JoystickFlatTerrain", "agent.num_envs=512"])
   saved = json.loads(json.dumps(now.resolved))
   del saved["hardware"]["distributed"], saved["video"]["visuals"], saved["agent"]["network"]["value_dtype"]
-  del saved["env"]["pushes"]["kind"], saved["env"]["reward"]["scales"]["energy"]
+  del saved["env"]["settle_s"], saved["env"]["rewards"]["joint_power_l1"]
   saved["video"]["width"] = 320
   again = from_saved(saved)
   assert again.hardware.distributed == now.hardware.distributed
   assert (again.video.visuals, again.video.width) == ("primitives", 320)
   assert again.agent.network.value_dtype == "auto" and again.agent.num_envs == 512
-  assert again.env.pushes.kind == "kick"
-  assert "energy" not in again.env.reward.scales, "a term that the run did not have stays out"
+  assert again.env.settle_s == 0
+  assert "joint_power_l1" not in again.env.rewards, "a term that the run did not have stays out"
 
 
 def test_a_saved_run_whose_task_is_gone_keeps_what_it_has() -> None:

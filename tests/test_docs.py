@@ -1,4 +1,4 @@
-"""The documentation: what its pages tell to type, the package and the terms that they write, the notebook, the site."""
+"""The documentation: the commands of its pages, the packages and events that they write, the notebook, the site."""
 
 import ast
 import inspect
@@ -7,7 +7,6 @@ import re
 import shlex
 import subprocess
 import sys
-import textwrap
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -22,13 +21,18 @@ from playground.randomization import Randomizer
 from playground.rendering.gl import find_gl
 from playground.robots.scene import build_scene
 from playground.sweep.plan import compose_jobs
+from tests.packages import PACKAGES, install, run
 
 REPOSITORY = Path(__file__).parents[1]
 DOCS = REPOSITORY / "docs"
 PAGES = (*DOCS.glob("*.md"), REPOSITORY / "README.md")
 NOTEBOOK = DOCS / "first_policy.ipynb"
-# Names that a page introduces itself, and the one that a page misspells.
-OWN = ("SlideToTarget", "go1_worn", "enrgy")
+MISTAKE = "joint_powr_l1"  # which a page misspells
+# Names that a page introduces itself.
+OWN = ("SlideToTarget", "go1_worn", "=pup", "PupJoystick", "go1_in_wind", MISTAKE)
+# Pages that write out the files of a package of tests/packages, and the files that only the page has.
+PACKAGE_PAGES = {"add-a-robot.md": "robot_only", "add-a-reward.md": "terms_only"}
+ONLY_ON_A_PAGE = ("robot_only/robot_only/configs/env/PupJoystick.yaml",)
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -56,7 +60,7 @@ def names(words: tuple[str, ...], *of: str) -> bool:
 
 @pytest.mark.parametrize("words", [words for words in run_commands() if not names(words, *OWN)], ids=" ".join)
 def test_a_command_composes(words: tuple[str, ...]):
-  overrides = [word for word in words if "=" in word]
+  overrides = [word for word in words if "=" in word and not word.startswith("trust=")]
   if "-m" in words:  # one seed stands for all
     assert compose_jobs([word for word in overrides if not word.startswith("seed=")] + ["seed=1"])
   else:
@@ -74,53 +78,78 @@ def test_every_pip_finds_the_extras_that_are_told():
 
 
 def test_the_tutorials_mistake_is_answered_as_it_says():
-  (words,) = (words for words in run_commands() if names(words, "enrgy"))
+  (words,) = (words for words in run_commands() if names(words, MISTAKE))
   with pytest.raises(UnknownNameError) as caught:
-    compose(list(words))
+    registry.build(compose(list(words)).env)
   assert f"error: {caught.value}\n" in (DOCS / "tutorial.md").read_text(encoding="utf-8")
 
 
 def test_the_page_on_tasks_makes_a_package_that_works(tmp_path: Path):
-  written = files("add-a-task.md")
-  for name, text in written.items():
-    path = tmp_path / Path(name).relative_to("my-tasks")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-  points = tomllib.loads(written["my-tasks/pyproject.toml"])["project"]["entry-points"]["playground.tasks"]
-  info = tmp_path / "my_tasks-0.1.0.dist-info"  # as pip would leave it
-  info.mkdir()
-  (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-tasks\nVersion: 0.1.0\n")
-  lines = [f"{name} = {target}" for name, target in points.items()]
-  (info / "entry_points.txt").write_text("\n".join(["[playground.tasks]", *lines]))
-  code = f"""
-    import sys
-    sys.path.append({str(tmp_path)!r})
+  site = install(write(files("add-a-task.md"), tmp_path) / "my-tasks", tmp_path / "site")
+  code = """
     import jax
     import jax.numpy as jnp
     from playground import registry
     from playground.config import compose
 
-    run = compose(["env=SlideToTarget", "env.reward.scales.effort=-0.5"])
-    assert run.choices["tuned"] == "ppo/SlideToTarget" and run.env.reward.scales.effort == -0.5
-    env = registry.build(run.env)
+    config = compose(["env=SlideToTarget", "env.rewards.action_l2.weight=-0.5", "env.noise_level=0"])
+    assert config.choices["tuned"] == "ppo/SlideToTarget" and config.env.rewards.action_l2.weight == -0.5
+    env = registry.build(config.env)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
     kinds = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
     assert kinds(state) == kinds(after)
+    assert env.observation_parts == {"state": {"joint_pos": 1, "joint_vel": 1, "target_offset": 1}}
 
+    env.physics = env.physics.without_dynamics()
+    info = env.reset(jax.random.PRNGKey(0)).info
     there, away = (env.physics.make(qpos=[x], mocap_pos=[[0.3, 0.0, 0.2]]) for x in (0.3, -0.3))
-    there, away = (env.evaluate(data, {{}}, jnp.ones(1)) for data in (there, away))
-    assert abs(there.metrics["distance_m"]) < 1e-6 and abs(there.reward - 0.5) < 1e-5
-    assert abs(away.metrics["distance_m"] - 0.6) < 1e-5 and 0 < away.metrics["reward/near"] < 0.1, away.metrics
+    there, away = (env.post_step(data, info, jnp.ones(1)) for data in (there, away))
+    assert abs(there.metrics["distance_m"]) < 1e-6 and abs(there.reward - 0.5 * env.dt) < 1e-5
+    assert abs(away.obs[2] - 0.6) < 1e-5 and 0 < away.metrics["reward/near_target"] < 0.1, away.metrics
     """
-  done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True)
-  assert done.returncode == 0, done.stderr
+  run(site, "-c", code)
 
 
-def test_the_page_on_randomisation_writes_terms_that_fit_and_code_that_runs():
+def write(contents: dict[str, str], folder: Path) -> Path:
+  for name, text in contents.items():
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+  return folder
+
+
+@pytest.mark.parametrize(("page", "package"), PACKAGE_PAGES.items())
+def test_a_page_shows_the_package_that_tests_install(page: str, package: str):
+  shown = {name: text for name, text in files(page).items() if name not in ONLY_ON_A_PAGE}
+  there = [path for path in (PACKAGES / package).rglob("*.*") if path.is_file() and path.suffix != ".pyc"]
+  assert shown == {path.relative_to(PACKAGES).as_posix(): path.read_text(encoding="utf-8") for path in there}
+
+
+def test_the_commands_and_the_code_of_the_pages_on_packages(tmp_path: Path):
+  """tests/test_openness.py tests what the packages do."""
+  written = write({name: text for page in PACKAGE_PAGES for name, text in files(page).items()}, tmp_path / "written")
+  for package in PACKAGE_PAGES.values():
+    install(written / package, tmp_path / "site")
+  commands = [words for words in run_commands() if names(words, "=pup", "PupJoystick", "go1_in_wind")]
+  assert len(commands) >= 4
+  (code,) = blocks("add-a-robot.md", "python")[1:]
+  composed = f"""
+from playground.config import compose
+for words in {commands!r}:
+  compose([word for word in words if "=" in word])
+config = compose(["env=PupJoystick"]).env
+assert config.robot.name == "pup" and config.rewards.feet_clearance.weight == -2.0
+assert config.commands.velocity.params.max == [0.8, 0.4, 1.0]
+"""
+  said = run(tmp_path / "site", "-c", composed + code)
+  assert re.search(r"height 0\.2[345]\d m", said) and "[1, 1, 1, 1]" in said, said
+
+
+def test_the_page_on_randomisation_writes_events_that_fit_and_code_that_runs():
   (text,) = files("randomization.md").values()
-  terms = yaml.safe_load(text)["terms"]
-  assert len(Randomizer(build_scene("go1").compile(), terms).describe()) == 4
+  model, events = build_scene("go1").compile(), yaml.safe_load(text)
+  assert [len(Randomizer(model, events, mode).describe()) for mode in ("startup", "reset")] == [3, 1]
   (code,) = blocks("randomization.md", "python")
   scope: dict[str, Any] = {}
   exec(code, scope)
@@ -165,7 +194,7 @@ def test_the_notebook_runs(tmp_path: Path):
   outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
   kinds = {kind for output in outputs for kind in output.get("data", ())}
   said = "".join(output.get("text", "") for output in outputs)
-  assert "image/png" in kinds and "mean reward of 400 decisions" in said
+  assert "image/png" in kinds and "mean reward of 400 steps" in said
   shown = any("video/mp4" in output.get("data", {}).get("text/html", "") for output in outputs)
   assert shown if find_gl() else "No video" in said
 

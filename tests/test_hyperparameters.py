@@ -10,9 +10,10 @@ import pytest
 
 from playground import registry
 from playground.config import RunConfig, compose, options
+from playground.config.files import config_roots, lineage
 
 TABLES = Path(__file__).parents[1] / "benchmarks/paper"
-SOURCES = {"ppo": "paper", "ppo_v020": "upstream_head", "sac": "paper", "sac_v020": "upstream_head"}
+SOURCES = {"ppo_paper": "paper", "ppo_v020": "upstream_head", "sac": "paper", "sac_v020": "upstream_head"}
 
 # Columns that say where a row comes from or what follows from it, not what is set.
 NOT_SET = {
@@ -27,17 +28,17 @@ OF_THE_NETWORK = (
 
 # What we set where the source is silent, and why.
 OURS: dict[str, dict[str, Any]] = {
-  "ppo": {"num_resets_per_eval": 10},  # the default of the script that the paper was run with
+  "ppo_paper": {"num_resets_per_eval": 10},  # the default of the script that the paper was run with
 }
 # Sets that are no task's own.
-FOR_ANY_TASK = ("sparse_reward", "bounded_gradients", "estimated_state")
+FOR_ANY_TASK = ("sparse_reward", "estimated_state")
 # What a source lists and nobody can have used: Brax's SAC has no such argument and refuses it.
 UNUSABLE = {"sac": ("num_resets_per_eval",), "sac_v020": ("num_resets_per_eval",)}
 
 
 def rows(agent: str) -> dict[str, dict[str, str]]:
   """The table's rows of an agent's source, by task."""
-  with (TABLES / f"hyperparameters_{agent.removesuffix('_v020')}.csv").open() as file:
+  with (TABLES / f"hyperparameters_{agent.partition('_')[0]}.csv").open() as file:
     return {row["env"]: row for row in csv.DictReader(file) if row["source"] == SOURCES[agent]}
 
 
@@ -55,10 +56,10 @@ def cases() -> Iterator[Any]:
 
 @functools.cache
 def composed(agent: str, task: str) -> RunConfig:
-  """The run of a pair; a variant without a set of its own is its agent (the test below), and saves a composition."""
-  shared = agent.removesuffix("_v020")
-  if agent != shared and f"{agent}/{task}" not in options("tuned"):
-    return composed(shared, task)
+  """The run of a pair; a variant without a set of its own is the agent it is built on, and saves a composition."""
+  name, *built_on = lineage("agent", agent, config_roots())
+  if built_on and f"{name}/{task}" not in options("tuned"):
+    return composed(built_on[0], task)
   return compose([f"agent={agent}", f"env={task}"])
 
 
@@ -92,7 +93,7 @@ def test_hyperparameters_are_those_of_the_source(agent: str, task: str):
   of = {key: section for section, keys in sections.items() for key in keys}
   resolved = {**run.resolved, "network": run.resolved["agent"].get("network")}
   assert {key: resolved[of.get(key, "agent")][key] for key in expected} == expected
-  assert run.agent.name == agent.removesuffix("_v020")  # so that checkpoints of both go together
+  assert run.agent.name == agent.partition("_")[0]  # so that checkpoints of all variants go together
   assert run.choices["tuned"] == f"{run.choices['agent']}/{task}"
 
 
@@ -133,11 +134,50 @@ def test_rsl_rl_has_the_settings_of_playground_020(task: str, differing: dict[st
   assert (agent["network"]["activation"], agent["network"]["init_noise_std"]) == ("elu", 1.0)
 
 
-def test_the_hoppers_experiments_take_our_set_for_sparse_rewards_and_other_agents_their_own():
-  ppo, sac, v020 = (compose(["experiment=hopper_hop", f"agent={agent}"]) for agent in ("ppo", "sac", "ppo_v020"))
-  assert [run.choices["tuned"] for run in (ppo, sac, v020)] == ["ppo/sparse_reward", "sac/HopperHop", "ppo/HopperHop"]
-  assert (ppo.agent.entropy_cost, ppo.agent.init_at_random_ep_len, ppo.agent.reward_scaling) == (1e-3, True, 10.0)
-  assert compose(ppo.overrides).resolved == ppo.resolved
+@pytest.mark.parametrize(
+  ("task", "chosen"),
+  [
+    ("HopperHop", ("ppo/HopperHop", "ppo_paper/HopperHop", "ppo_paper/HopperHop", "sac/HopperHop")),
+    ("G1JoystickFlatTerrain", ("ppo/G1JoystickFlatTerrain", "ppo_paper/G1JoystickFlatTerrain", None, None)),
+    ("WalkerWalk", ("ppo/WalkerWalk", "ppo/WalkerWalk", "ppo/WalkerWalk", "sac/WalkerWalk")),
+  ],
+)
+def test_a_variant_without_a_set_of_its_own_takes_that_of_the_agent_it_is_built_on(
+  task: str, chosen: tuple[str | None]
+):
+  for agent, expected in zip(("ppo", "ppo_paper", "ppo_v020", "sac"), chosen, strict=True):
+    if expected:
+      run = compose([f"env={task}", f"agent={agent}"])
+      assert run.choices["tuned"] == expected
+      assert compose(run.overrides).resolved == run.resolved
+
+
+@pytest.mark.parametrize("robot", ["G1", "T1"])
+@pytest.mark.parametrize("terrain", ["Flat", "Rough"])
+def test_the_humanoids_take_the_set_of_020_by_default(robot: str, terrain: str):
+  """It makes five times the gradient steps of the paper's at three times the learning rate, and learns to walk."""
+  task = f"{robot}Joystick{terrain}Terrain"
+  ours, published = (compose([f"env={task}", f"agent={agent}"]).resolved["agent"] for agent in ("ppo", "ppo_v020"))
+  assert ours == published
+  assert compose([f"env={task}", "agent=ppo_paper"]).agent.learning_rate == 1e-4
+
+
+def test_defaults_that_are_not_the_papers():
+  agent = lambda task: compose([f"env={task}"]).agent
+  assert agent("BerkeleyHumanoidJoystickFlatTerrain").learning_rate == 3e-4
+  whole = (
+    "SpotFlatTerrainJoystick",
+    "BarkourJoystick",
+    "H1JoystickGaitTracking",
+    "BerkeleyHumanoidJoystickRoughTerrain",
+  )
+  assert [agent(task).num_resets_per_eval for task in whole] == [1, 1, 1, 1]
+  hopper = agent("HopperHop")
+  assert (hopper.entropy_cost, hopper.init_at_random_ep_len, hopper.reward_scaling) == (1e-3, True, 10.0)
+  assert [compose(["env=CheetahRun", f"agent={name}"]).agent.max_grad_norm for name in ("ppo", "ppo_paper")] == [
+    1.0,
+    None,
+  ]
 
 
 def test_the_panda_sees_with_the_papers_cnn_unpooled_and_020_with_its_small_one():
@@ -167,9 +207,3 @@ def test_the_pandas_experiment_from_pixels_has_a_set_of_its_own_and_the_task_alo
   assert [ours.num_envs, ours.network.estimated_obs_key] == [4096, "state"]
   assert [papers.num_envs, papers.network.estimated_obs_key] == [1024, ""]
   assert compose([*choices[0], "agent=ppo_v020"]).choices["tuned"] == "ppo_v020/PandaPickCubeCartesianVision"
-
-
-def test_the_cheetahs_experiment_limits_gradients_and_the_task_alone_has_the_papers_set():
-  limits = [compose([choice]).agent.max_grad_norm for choice in ("experiment=cheetah_run", "env=CheetahRun")]
-  assert limits == [1.0, None]
-  assert compose(["experiment=cheetah_run", "agent=sac"]).choices["tuned"] == "sac/CheetahRun"

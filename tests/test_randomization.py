@@ -5,7 +5,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import ml_collections
 import mujoco
 import numpy as np
 import pytest
@@ -14,14 +13,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco import mjx
 
+from playground.config import config_dict
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError
-from playground.randomization import Randomizer, domain_randomizer, parse_terms
+from playground.randomization import Randomizer, domain_randomizer, parse_events
 from playground.robots.in_hand import CUBES, build_in_hand_scene
 from playground.robots.scene import build_scene
 from playground.robots.tabletop import build_tabletop
 
 CONFIGS = Path(__file__).parents[1] / "configs/randomization"
-GO1 = yaml.safe_load((CONFIGS / "go1.yaml").read_text())["terms"]
+
+
+def shipped(name: str) -> dict[str, Any]:
+  """The events of a file of configs/randomization."""
+  return yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())
+
+
+def events(*terms: Any, mode: str = "startup") -> dict[str, Any]:
+  """Events that draw model fields, of these parameters."""
+  return {f"term_{i}": {"mode": mode, "func": "model_field", "params": term} for i, term in enumerate(terms)}
+
+
+GO1 = shipped("go1")
 SMALL = """
 <mujoco>
   <worldbody>
@@ -142,17 +154,14 @@ def model_of(robot: str) -> mujoco.MjModel:
 def test_every_robots_terms_bind_to_its_model() -> None:
   assert set(DRAWN) == {path.stem for path in CONFIGS.glob("*.yaml")} - {"none"}
   for robot, drawn in DRAWN.items():
-    terms = yaml.safe_load((CONFIGS / f"{robot}.yaml").read_text())["terms"]
-    rows = Randomizer(model_of(robot), terms).describe()
+    rows = Randomizer(model_of(robot), shipped(robot)).describe()
     assert [int(row["values"]) for row in rows] == drawn, robot
 
 
 @pytest.mark.parametrize("robot", ["go1", "berkeley_humanoid", "g1", "t1"])
 def test_strong_draws_go_beyond_the_others(robot: str) -> None:
   """Every term of <robot>.yaml is in <robot>_strong.yaml, on the same entries, at least as wide."""
-  usual, strong = (
-    parse_terms(yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["terms"]) for name in (robot, f"{robot}_strong")
-  )
+  usual, strong = (parse_events(shipped(name)).values() for name in (robot, f"{robot}_strong"))
   for term in usual:
     same = [t for t in strong if (t.field, t.target, t.operation) == (term.field, term.target, term.operation)]
     assert len(same) == 1, term
@@ -161,8 +170,8 @@ def test_strong_draws_go_beyond_the_others(robot: str) -> None:
 
 def test_g1s_feet_slide_alike_in_both_directions() -> None:
   model = build_scene("g1").compile()
-  terms = yaml.safe_load((CONFIGS / "g1.yaml").read_text())["terms"][:1]
-  friction = np.array(Randomizer(model, terms).sample(keys(1)[0])["pair_friction"])
+  first = dict(list(shipped("g1").items())[:1])
+  friction = np.array(Randomizer(model, first).sample(keys(1)[0])["pair_friction"])
   feet = [model.pair(f"{side}_foot_floor").id for side in ("left", "right")]
   assert len(set(friction[feet][:, :2].ravel())) == 1 and 0.4 <= friction[feet[0], 0] <= 1.0
   others = np.delete(np.arange(model.npair), feet)
@@ -175,30 +184,29 @@ def test_terms_apply_in_order(small: mujoco.MjModel) -> None:
   set_then_scale = [fixed | {"operation": "set", "range": [2, 2]}, fixed | {"operation": "scale", "range": [3, 3]}]
   hand = small.body("hand").id
   key = jax.random.PRNGKey(0)
-  assert Randomizer(small, set_then_scale).sample(key)["body_mass"][hand] == pytest.approx(6)
-  assert Randomizer(small, set_then_scale[::-1]).sample(key)["body_mass"][hand] == pytest.approx(2)
+  assert Randomizer(small, events(*set_then_scale)).sample(key)["body_mass"][hand] == pytest.approx(6)
+  assert Randomizer(small, events(*set_then_scale[::-1])).sample(key)["body_mass"][hand] == pytest.approx(2)
 
 
 def test_nothing_to_randomise(small: mujoco.MjModel) -> None:
-  terms = yaml.safe_load((CONFIGS / "none.yaml").read_text())["terms"]
-  randomizer = Randomizer(small, terms)
+  randomizer = Randomizer(small, shipped("none") | events(GOOD, mode="reset") | {"gone": None})
   assert randomizer.fields == () and randomizer.sample_batch(keys(3)) == {} and randomizer.describe() == []
 
 
 def test_shared_draw_and_columns(small: mujoco.MjModel) -> None:
   """Friction of a contact pair: both tangential directions get one value, and no other column changes."""
   term = {"field": "pair_friction", "target": "all", "column": [0, 1], "operation": "set", "range": [0.4, 1.0]}
-  shared = np.asarray(Randomizer(small, [term | {"shared": True}]).sample_batch(keys(8))["pair_friction"])
+  shared = np.asarray(Randomizer(small, events(term | {"shared": True})).sample_batch(keys(8))["pair_friction"])
   assert (shared[:, 0, 0] == shared[:, 0, 1]).all() and np.ptp(shared[:, 0, 0]) > 0
   np.testing.assert_allclose(shared[:, 0, 2:], np.tile(small.pair_friction[0, 2:], (8, 1)), rtol=1e-6)
-  separate = np.asarray(Randomizer(small, [term]).sample_batch(keys(8))["pair_friction"])
+  separate = np.asarray(Randomizer(small, events(term)).sample_batch(keys(8))["pair_friction"])
   assert (separate[:, 0, 0] != separate[:, 0, 1]).all()
 
 
 def test_position_gain_moves_gain_and_bias(small: mujoco.MjModel) -> None:
   for operation, bounds in (("scale", [0.9, 1.1]), ("add", [-2, 2]), ("set", [15, 25])):
     term = {"field": "actuator_kp", "target": "all", "operation": operation, "range": bounds}
-    sample = Randomizer(small, [term]).sample(jax.random.PRNGKey(1))
+    sample = Randomizer(small, events(term)).sample(jax.random.PRNGKey(1))
     gain, bias = sample["actuator_gainprm"], sample["actuator_biasprm"]
     np.testing.assert_allclose(gain[:, 0], -bias[:, 1], rtol=1e-6)
     assert (gain[:, 0] != small.actuator_gainprm[:, 0]).all()
@@ -207,7 +215,7 @@ def test_position_gain_moves_gain_and_bias(small: mujoco.MjModel) -> None:
 
 def test_density_moves_mass_and_inertia_in_proportion(small: mujoco.MjModel) -> None:
   term = {"field": "body_density", "target": ["hand", "base"], "operation": "scale", "range": [0.5, 2.0]}
-  sample = Randomizer(small, [term]).sample(jax.random.PRNGKey(1))
+  sample = Randomizer(small, events(term)).sample(jax.random.PRNGKey(1))
   ratio = np.asarray(sample["body_mass"])[1:] / small.body_mass[1:]
   np.testing.assert_allclose(sample["body_inertia"][1:], small.body_inertia[1:] * ratio[:, None], rtol=1e-6)
   assert ratio[small.body("arm").id - 1] == pytest.approx(1) and len(np.unique(ratio)) == 3
@@ -217,7 +225,7 @@ def test_density_moves_mass_and_inertia_in_proportion(small: mujoco.MjModel) -> 
 def test_a_hands_terms_change_what_the_paper_lists(hand: str) -> None:
   """Friction of the fingertips, cube's mass and centre, joints' calibration, friction and inertia, links, gains."""
   model = model_of(hand)
-  randomizer = Randomizer(model, yaml.safe_load((CONFIGS / f"{hand}.yaml").read_text())["terms"])
+  randomizer = Randomizer(model, shipped(hand))
   batch = {name: np.asarray(value) for name, value in jax.jit(randomizer.sample_batch)(keys(32)).items()}
   nominal = {name: getattr(model, name) for name in batch}
   tips = [model.geom(i).id for i in range(model.ngeom) if model.geom(i).name.endswith("_tip")]
@@ -260,16 +268,16 @@ def test_a_hands_terms_change_what_the_paper_lists(hand: str) -> None:
 )
 def test_targets(small: mujoco.MjModel, field: str, target: Any, rows: list[int]) -> None:
   term = {"field": field, "target": target, "operation": "add", "range": [1, 2]}
-  change = np.asarray(Randomizer(small, [term]).sample(jax.random.PRNGKey(0))[field]) - getattr(small, field)
+  change = np.asarray(Randomizer(small, events(term)).sample(jax.random.PRNGKey(0))[field]) - getattr(small, field)
   assert set(np.flatnonzero(np.abs(change) > 0.5)) == set(rows)
 
 
 def test_distributions(small: mujoco.MjModel) -> None:
   base = {"field": "dof_damping", "target": "wrist", "operation": "set"}
-  log = Randomizer(small, [base | {"distribution": "log_uniform", "range": [0.01, 100]}]).sample_batch(keys(2000))
+  log = Randomizer(small, events(base | {"distribution": "log_uniform", "range": [0.01, 100]})).sample_batch(keys(2000))
   log = np.log10(np.asarray(log["dof_damping"][:, 9]))
   assert abs(log.mean()) < 0.1 and -2.01 < log.min() < -1.9 and 1.9 < log.max() < 2.01
-  normal = Randomizer(small, [base | {"distribution": "normal", "mean": 5, "std": 2}]).sample_batch(keys(2000))
+  normal = Randomizer(small, events(base | {"distribution": "normal", "mean": 5, "std": 2})).sample_batch(keys(2000))
   normal = np.asarray(normal["dof_damping"][:, 9])
   assert abs(normal.mean() - 5) < 0.2 and abs(normal.std() - 2) < 0.15
 
@@ -282,7 +290,7 @@ def test_distributions(small: mujoco.MjModel) -> None:
 def test_ranges_hold(low: float, width: float, operation: str, target: str, seed: int) -> None:
   model = mujoco.MjModel.from_xml_string(SMALL)
   term = {"field": "body_mass", "target": target, "operation": operation, "range": [low, low + width]}
-  sample = np.asarray(Randomizer(model, [term]).sample(jax.random.PRNGKey(seed))["body_mass"])
+  sample = np.asarray(Randomizer(model, events(term)).sample(jax.random.PRNGKey(seed))["body_mass"])
   rows = slice(None) if target == "all" else [model.body(target).id]
   ends = [np.full(4, low), np.full(4, low + width)]
   if operation != "set":
@@ -298,7 +306,7 @@ def test_old_randomizer_drives_a_vmapped_model(small: mujoco.MjModel) -> None:
   """Playground 0.2.0's callable: its output is what vmap needs, and reset poses differ between environments."""
   term = {"field": "body_mass", "target": "all", "operation": "scale", "range": [0.5, 2]}
   model = mjx.put_model(small)
-  batched, in_axes = domain_randomizer(small, [term])(model, keys(4))
+  batched, in_axes = domain_randomizer(small, events(term))(model, keys(4))
   assert batched.body_mass.shape == (4, small.nbody)
   assert in_axes.body_mass == 0 and in_axes.body_ipos is None
   total = jax.vmap(lambda m: jnp.sum(m.body_mass) + jnp.sum(m.qpos0), in_axes=[in_axes])(batched)
@@ -306,8 +314,8 @@ def test_old_randomizer_drives_a_vmapped_model(small: mujoco.MjModel) -> None:
 
 
 def test_terms_may_be_config_dicts(go1: mujoco.MjModel) -> None:
-  config: Any = ml_collections.ConfigDict({"terms": GO1})
-  assert Randomizer(go1, config.terms).fields == Randomizer(go1, GO1).fields
+  config: Any = config_dict(GO1)
+  assert Randomizer(go1, config).fields == Randomizer(go1, GO1).fields
 
 
 def test_describe(go1: mujoco.MjModel) -> None:
@@ -349,14 +357,29 @@ def test_errors_say_what_is_wrong_in_one_sentence(
   small: mujoco.MjModel, change: dict[str, Any], kind: type[PlaygroundError], message: str
 ) -> None:
   with pytest.raises(kind) as error:
-    Randomizer(small, [GOOD, GOOD | change])
+    Randomizer(small, events(GOOD, GOOD | change))
   assert message in str(error.value)
-  assert str(error.value).startswith("randomization.terms[1]") and "\n" not in str(error.value)
+  assert str(error.value).startswith("env.events.term_1.params") and "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("missing", ["field", "target", "operation"])
 def test_missing_keys(small: mujoco.MjModel, missing: str) -> None:
   with pytest.raises(ConfigError, match=f"lacks the key '{missing}'"):
-    Randomizer(small, [{k: v for k, v in GOOD.items() if k != missing}])
-  with pytest.raises(ConfigError, match="is not a mapping"):
-    Randomizer(small, ["body_mass"])  # type: ignore[list-item]
+    Randomizer(small, events({k: v for k, v in GOOD.items() if k != missing}))
+
+
+@pytest.mark.parametrize(
+  ("change", "message"),
+  [
+    ({"params": "body_mass"}, "is not a mapping"),
+    ({"mode": "interval"}, r"env\.events\.term_0\.mode=interval must be startup or reset"),
+    ({"weight": 1}, "'weight' is unknown"),
+  ],
+)
+def test_an_event_that_is_none(small: mujoco.MjModel, change: dict[str, Any], message: str) -> None:
+  with pytest.raises(ConfigError, match=message):
+    Randomizer(small, {"term_0": events(GOOD)["term_0"] | change})
+
+
+def test_a_disabled_event_draws_nothing(small: mujoco.MjModel) -> None:
+  assert Randomizer(small, {"term_0": events(GOOD)["term_0"] | {"enabled": False}}).fields == ()

@@ -13,9 +13,10 @@ import pytest
 from ml_collections import ConfigDict
 
 import playground
-from playground import registry
+from playground import registry, trust
 from playground.config import compose
 from playground.errors import ConfigError, UnknownNameError
+from playground.randomization import Randomizer
 
 GENERIC = [
   ["env=joystick", "robot=go1"],
@@ -38,10 +39,10 @@ def test_names():
 def test_config_is_a_fresh_unlocked_copy():
   config: Any = registry.config("Go1JoystickFlatTerrain")
   assert config.robot.name == "go1"
-  config.reward.scales.energy = 5.0
+  config.rewards.joint_power_l1.weight = 5.0
   config.new = 1
   again: Any = registry.get_default_config("Go1JoystickFlatTerrain")
-  assert again.reward.scales.energy != 5.0
+  assert again.rewards.joint_power_l1.weight != 5.0
   assert isinstance(registry.config("CartpoleBalance"), ConfigDict)
 
 
@@ -68,9 +69,9 @@ def test_load_with_a_config_leaves_it_alone():
     ("CartpolBalance", {}, r"'CartpolBalance' does not exist.*Did you mean 'CartpoleBalance'\?"),
     ("joystick", {}, "'joystick' does not exist"),
     ("CartpoleBalance", {"episode_lenth": 1}, r"env\.episode_lenth does not exist.*'env\.episode_length'"),
-    ("Go1JoystickFlatTerrain", {"reward.scales.enrgy": 1}, r"Did you mean 'env\.reward\.scales\.energy'"),
+    ("Go1JoystickFlatTerrain", {"rewards.joint_powr_l1.weight": 1}, "Did you mean 'joint_power_l1'"),
     ("CartpoleBalance", {"ctrl_dt": "slow"}, r"env\.ctrl_dt=slow .* must be a number"),
-    ("CartpoleBalance", {"episode_length": 0}, r"env\.episode_length=0 must be a number above 0"),
+    ("CartpoleBalance", {"episode_length": 0}, r"env\.episode_length=0 must be a whole number from 1"),
   ],
 )
 def test_load_refuses(name: str, overrides: dict[str, Any], message: str):
@@ -81,11 +82,14 @@ def test_load_refuses(name: str, overrides: dict[str, Any], message: str):
 @pytest.mark.parametrize(
   ("task", "message"),
   [
-    ("playground.envs.dm_control.cartpole:Cartpol", "has no class Cartpol. Did you mean 'Cartpole'"),
-    ("playground.envs.dm_control.cartpole", "has no class"),
+    ("playground.envs.dm_control.cartpole:Cartpol", "has no Cartpol. Did you mean 'Cartpole'"),
+    ("playground.envs.dm_control.cartpole", "not of the form module:name"),
     ("playground.envs.gone:Task", "there is no module playground.envs.gone"),
-    ("gone.deep:Task", "there is no module gone"),
-    (":Task", "not of the form module:Class"),
+    ("gone.deep:Task", "may only name code of playground, which gone is not"),
+    (":Task", "not of the form module:name"),
+    ("playground.envs.base:Env", "is no task"),  # which lacks most of one
+    ("playground.envs.base:State", "is no task"),
+    ("playground.errors:nearest", "is no task"),
   ],
 )
 def test_a_task_that_cannot_be_imported(task: str, message: str):
@@ -96,6 +100,7 @@ def test_a_task_that_cannot_be_imported(task: str, message: str):
 def test_an_import_error_inside_a_tasks_module_is_not_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
   (tmp_path / "needy_task.py").write_text("import surely_not_installed\n")
   monkeypatch.syspath_prepend(tmp_path)
+  monkeypatch.setattr(trust, "_named", {"needy_task"})
   with pytest.raises(ModuleNotFoundError, match="surely_not_installed"):
     registry.task_class("needy_task:Task")
 
@@ -117,6 +122,87 @@ def test_lazy_package():
   assert playground.wrap_for_brax_training.__module__ == "playground.envs.wrappers"
   with pytest.raises(AttributeError, match="nothing"):
     _ = playground.nothing  # pyright: ignore[reportAttributeAccessIssue]
+
+
+# Open terms
+
+
+def built(*overrides: str, task: str = "Go1JoystickFlatTerrain") -> Any:
+  return registry.build(compose([f"env={task}", *overrides, "tuned=null"]).env)
+
+
+def test_terms_from_the_command_line() -> None:
+  env = built(
+    "env.rewards.joint_deviation_l2.weight=-0.1",
+    "env.rewards.knees={func: joint_deviation_l1, weight: -0.5, params: {joints: .*_calf_joint}}",
+    "env.rewards.feet_slip_l2=null",
+    "env.rewards.pose_exp.weight=0",
+    "env.terminations.base_height_below={params: {limit: 0.1}}",
+    "env.terminations.power_above.params.limit=400",
+    "env.observations.state.joint_vel.history=3",
+    "env.observations.state.base_height={}",
+    "env.events.reset_joints_by_scale={mode: reset, params: {scale: [0.9, 1.1]}}",
+  )
+  rewards = {term.name: term for term in env.rewards.terms}
+  assert rewards["joint_deviation_l2"].options.weight == -0.1
+  assert (rewards["knees"].func.__name__, rewards["knees"].params) == (
+    "joint_deviation_l1",
+    {"joints": ".*_calf_joint"},
+  )
+  assert not {"feet_slip_l2", "pose_exp"} & set(rewards)
+  assert [term.name for term in env.terminations.terms] == ["fell_over", "base_height_below", "power_above"]
+  assert env.observation_size == {"state": (48 + 24 + 1,), "privileged_state": (123 + 24 + 1,)}
+  state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+  assert {"reward/knees", "termination/power_above"} <= set(state.metrics)
+
+
+def test_terms_of_any_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  (tmp_path / "my_rewards.py").write_text("def mine(c, factor: float = 1.0):\n  return factor * c.base_height\n")
+  monkeypatch.syspath_prepend(tmp_path)
+  override = "env.rewards.mine={func: 'my_rewards:mine', weight: 0.5, params: {factor: 2}}"
+  with pytest.raises(ConfigError, match=r"^env\.rewards\.mine\.func=my_rewards:mine is refused: .* trust=my_rewards"):
+    built(override)
+  monkeypatch.setattr(trust, "_named", {"my_rewards"})
+  env = built(override)
+  assert (env.rewards.terms[-1].name, env.rewards.terms[-1].params) == ("mine", {"factor": 2})
+  assert "reward/mine" in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
+
+
+@pytest.mark.parametrize(
+  ("override", "message"),
+  [
+    ("rewards.hip_splay.weight=-0.1", "no function 'hip_splay' is registered.* Did you mean 'joint_deviation_l2'?"),
+    ("rewards.joint_devation_l2.weight=-0.1", "Did you mean 'joint_deviation_l"),
+    ("rewards.action_l2={}", r"env\.rewards\.action_l2\.weight is missing: every term of env\.rewards has one"),
+    ("rewards.action_l2.weight=big", r"env\.rewards\.action_l2\.weight=big must be a number from"),
+    ("rewards.feet_slip_l2.params.joints=a", r"params\.joints does not exist: feet_slip_l2 takes no parameters"),
+    ("rewards.feet_clearance.params.targt=1", r"takes target\. Did you mean 'target'"),
+    ("rewards.feet_clearance.params.target=-1", r"params\.target=-1 must be a number above 0 and at most"),
+    ("rewards.joint_deviation_l1={weight: 1, params: {joints: knee}}", "joints='knee' matches no joint of the robot"),
+    ("rewards.feet_slip_l2.when={command_abve: 1}", r"when\.command_abve does not exist.*'command_above'"),
+    ("rewards.mine={func: 'math:sqrt', weight: 1}", r"env\.rewards\.mine\.func=math:sqrt is refused"),
+    ("rewards.action_rate_l2.func=3", r"env\.rewards\.action_rate_l2\.func=3 must be text"),
+    ("terminations.base_height_below={}", r"params\.limit is missing: base_height_below needs it"),
+    ("observations.state.joint_vel.histry=3", r"joint_vel\.histry does not exist.*'history'"),
+    ("observations.state.joint_vel.history=0", r"history=0 must be a whole number from 1"),
+    ("observations.state.linvel.noise.uniform=[2,1]", "linvel.noise.uniform has 2 numbers, which do not divide its 3"),
+    ("observations.state.linvel.scale=[2,1]", "linvel.scale has 2 numbers, which do not divide its 3"),
+    ("observations.state.linvel.noise.uniform=-1", r"noise\.uniform=-1 must be a number or a list of numbers from 0"),
+    ("observations.state.linvel.delay=[2,1]", r"delay=\[2, 1\] must be 2 whole numbers from 0 to 1000, the first not"),
+    ("observations.state.last_act=[]", r"env\.observations\.state\.last_act=\[\] has the wrong type: it must be a map"),
+    ("events.push.enabled=text", r"env\.events\.push\.enabled=text must be true or false"),
+    ("events.payload.params.range={}", r"^env\.events\.payload\.params\.range=\{\}: Cannot merge"),
+    ("observations.state.feet_ps={}", "no function 'feet_ps' is registered.* Did you mean 'feet_pos'"),
+    ("events.push.mode=reset", r"env\.events\.push\.mode=reset: PushByForce is for mode: interval"),
+    ("commands.velocity.params.max=[1,2]", r"params\.max=\[1, 2\] must be 3 numbers from"),
+  ],
+)
+def test_a_term_that_is_none_is_one_sentence(override: str, message: str) -> None:
+  with pytest.raises(ConfigError, match=message) as caught:
+    env = built(f"env.{override}")
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+  assert "\n" not in str(caught.value)
 
 
 # Every key of an env config is read: one that nobody reads is a typo that nobody notices.
@@ -164,6 +250,7 @@ def test_every_key_is_read_and_a_step_keeps_the_states_structure(overrides: list
   read: set[str] = set()
   recorder: Any = Recorder(config, read)
   env = registry.build(recorder)
+  Randomizer(env.mj_model, recorder.get("events"))
   assert env.mj_model.ncam  # for env.vision
   state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
   after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
@@ -204,6 +291,13 @@ def site(tmp_path: Path) -> Path:
         - override /robot@_global_.robot: go1
         - _self_
       """,
+    "tiny/configs/robot/bare_go1.yaml": """
+      # @package env.robot
+      defaults:
+        - go1
+        - _self_
+      pd: null
+      """,
     "tiny/configs/tuned/ppo/TinyBalance.yaml": "# @package _global_\nagent: {num_evals: 3}\n",
     "tiny/configs/experiment/tiny.yaml": "# @package _global_\ndefaults:\n  - override /env: TinyBalance\n",
     "empty.py": "HERE = '/nowhere'\n",
@@ -234,13 +328,15 @@ def test_an_outside_package_adds_tasks(site: Path):
     messages = sorted(str(warning.message) for warning in caught)
     assert len(messages) == 2, messages  # each once
     assert "'broken'" in messages[0] and "not_there" in messages[0], messages
-    assert "'empty'" in messages[1] and "holds no env/<TaskName>.yaml" in messages[1], messages
+    assert "'empty'" in messages[1] and "holds no file such as env/<TaskName>.yaml" in messages[1], messages
     from playground.config import compose
     run = compose(["experiment=tiny", "env.bonus=2"])
     assert (run.name, run.choices["tuned"], run.agent.num_evals) == ("tiny", "ppo/TinyBalance", 3), run
     assert run.env.bonus == 2.0 and run.env.episode_length == 1000
     assert compose(["env=TinyWalk"]).env.robot.name == "go1"
     assert playground.load("TinyBalance", overrides={{"bonus": 2.5}}).bonus == 2.5
+    bare = playground.registry.build(compose(["env=joystick", "robot=bare_go1"]).env).mj_model
+    assert (bare.actuator_gainprm[:, 0] == 35).all(), "pd: null keeps the gains of the MJCF"
     sys.argv = ["playground-run", "experiment=tiny", "--cfg", "job", "--package", "env"]
     from playground.cli.run import main
     main()

@@ -194,7 +194,7 @@ def test_every_job_is_checked_and_named(folder: Path):
     ("seed=1,1", 1, ["seed"]),
     ("tuned=null", 1, []),
     ("tuned=null,ppo/CheetahRun", 2, ["tuned"]),
-    ("experiment=go1_joystick,spot_joystick env.reward.scales.energy=-0.001", 2, ["experiment"]),
+    ("experiment=go1_joystick,spot_joystick env.rewards.joint_power_l1.weight=-0.001", 2, ["experiment"]),
     ("agent.network.policy_hidden_layer_sizes=[8],[8,8]", 2, ["agent.network.policy_hidden_layer_sizes"]),
   ],
 )
@@ -224,7 +224,7 @@ def test_keys_that_jobs_cannot_have(line: str, message: str):
   {
     "launcher=slrm": "launcher=slrm does not exist: choose from local, ray, slurm. Did you mean 'slurm'?",
     "launcher.timeot=3": "launcher.timeot does not exist",
-    "launcher.timeout=-3": "launcher.timeout=-3 must be a number above 0.",
+    "launcher.timeout=-3": "launcher.timeout=-3 must be a number above 0 and at most 1000000000.",
     "launcher.slots_per_gpu=many": "launcher.slots_per_gpu=many has the wrong type",
     "on_error=halt": "on_error=halt is unknown: choose from continue, stop.",
     "launcher=local,slurm": "launcher=local,slurm names several values",

@@ -12,8 +12,9 @@ import yaml
 from playground.errors import ConfigError, UnknownNameError
 from playground.randomization import Randomizer
 from playground.robots.tabletop import build_tabletop
+from tests.test_randomization import events
 
-TERMS = yaml.safe_load((Path(__file__).parents[1] / "configs/randomization/panda_vision.yaml").read_text())["terms"]
+EVENTS = yaml.safe_load((Path(__file__).parents[1] / "configs/randomization/panda_vision.yaml").read_text())
 COUNT = 64
 LIMITS = {"cam_quat": 10.0, "light_dir": 20.0}  # degrees
 
@@ -25,7 +26,7 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture(scope="module")
 def batch(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-  drawn = jax.jit(Randomizer(model, TERMS).sample_batch)(jax.random.split(jax.random.PRNGKey(0), COUNT))
+  drawn = jax.jit(Randomizer(model, EVENTS).sample_batch)(jax.random.split(jax.random.PRNGKey(0), COUNT))
   return {name: np.asarray(value) for name, value in drawn.items()}
 
 
@@ -66,7 +67,7 @@ def test_an_axis_may_be_narrowed(model: mujoco.MjModel) -> None:
     "range": [0.3, 0.3],
     "axis": [[0, 0], [1, 2], [0, 0]],
   }
-  turned = Randomizer(model, [term]).sample(jax.random.PRNGKey(0))["light_dir"][0]
+  turned = Randomizer(model, events(term)).sample(jax.random.PRNGKey(0))["light_dir"][0]
   x, y, z = model.light_dir[0]
   c, s = np.cos(0.3), np.sin(0.3)
   np.testing.assert_allclose(turned, [c * x + s * z, y, c * z - s * x], atol=1e-6)
@@ -93,10 +94,10 @@ def test_shadows_are_switched(batch: dict[str, np.ndarray]) -> None:
 )
 def test_what_does_not_go_together(model: mujoco.MjModel, term: dict[str, Any], message: str) -> None:
   with pytest.raises(ConfigError, match=message):
-    Randomizer(model, [{"target": "top", "operation": "set", **term}])
+    Randomizer(model, events({"target": "top", "operation": "set", **term}))
 
 
 def test_a_light_that_is_not_there(model: mujoco.MjModel) -> None:
   term = {"field": "light_dir", "target": "topp", "operation": "rotate", "range": [0.0, 0.1]}
   with pytest.raises(UnknownNameError, match=r"'topp' is no light of the model. Did you mean 'top'"):
-    Randomizer(model, [term])
+    Randomizer(model, events(term))

@@ -35,16 +35,19 @@ def test_contents(wheel: Path):
   }
   package = {
     path.relative_to(REPOSITORY).as_posix()
-    for pattern in ("*.py", "*.xml")
+    for pattern in ("*.py", "*.xml", "*.yaml")
     for path in (REPOSITORY / "playground").rglob(pattern)
   }
   assert {"playground/configs/config.yaml", "playground/sweeps/dm_control_ppo.yaml"} <= names
   assert any(name.endswith(".xml") for name in package)
+  assert "playground/compat020/configs/env/v020/Go1JoystickFlatTerrain.yaml" in package
   assert {f"playground/{name}" for name in configs} | package <= names
   outside = {name for name in names if not name.startswith("playground/")}
   assert all(name.split("/")[0].endswith(".dist-info") for name in outside)
   assert not any("tests" in Path(name).parts for name in names)
   assert {"LICENSE", "NOTICE"} <= {Path(name).name for name in outside}
+  (points,) = (name for name in outside if name.endswith("entry_points.txt"))
+  assert "[playground.tasks]\ncompat020 = playground.compat020:CONFIGS" in zipfile.ZipFile(wheel).read(points).decode()
 
 
 @pytest.mark.slow

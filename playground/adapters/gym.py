@@ -3,6 +3,10 @@
 One environment runs on C MuJoCo, a batch (`gymnasium.make_vec`) on MJX; `physics=` chooses otherwise.
 """
 
+import atexit
+import importlib
+import os
+import weakref
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +22,9 @@ from playground import registry
 from playground.adapters.episodes import Arrays, Episodes, load_task
 from playground.envs.base import PIXELS, Env, State
 from playground.envs.wrappers import where_done, wrap_for_evaluation
+from playground.errors import ConfigError, PlaygroundError
 from playground.mdp.lookup import lookup
+from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.rendering.video import choose_camera
 
 NAMESPACE = "playground"
@@ -71,13 +77,18 @@ class GymEnv(gymnasium.Env[Any, np.ndarray]):
     return _entry(moment.obs, self._entry), moment.reward, moment.terminated, moment.truncated, moment.metrics
 
   def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-    """The present state as a picture, [height, width, 3] uint8, in the render mode `rgb_array`."""
+    """The present state as an image, [height, width, 3] uint8, in the render mode `rgb_array`.
+
+    Raises:
+      PlaygroundError: no OpenGL works on this machine.
+    """
     state, model = self._episodes.state, self._episodes.env.mj_model
     if self.render_mode is None or state is None:
       return None
     if self._renderer is None:
       model.vis.global_.offheight, model.vis.global_.offwidth = _HEIGHT, _WIDTH
-      self._renderer = mujoco.Renderer(model, _HEIGHT, _WIDTH)
+      self._renderer = _open_renderer(model)
+      atexit.register(_close, weakref.ref(self))  # later, when modules are torn down, OpenGL fails
     data = mujoco.MjData(model)
     for name in ("qpos", "mocap_pos", "mocap_quat"):
       getattr(data, name)[:] = getattr(state.data, name)[0]
@@ -91,10 +102,39 @@ class GymEnv(gymnasium.Env[Any, np.ndarray]):
       self._renderer = None
 
 
-class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
-  """A batch of environments in one program. An episode that has ended begins anew in the next step, freshly drawn."""
+def _close(env: "weakref.ref[GymEnv]") -> None:
+  if (open_env := env()) is not None:
+    open_env.close()
 
-  metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
+
+def _open_renderer(model: mujoco.MjModel) -> mujoco.Renderer:
+  """A renderer that uses the OpenGL which works here, as the videos of runs do.
+
+  MuJoCo chooses when it is imported: GLFW, which needs a screen, unless MUJOCO_GL says otherwise.
+  """
+  from mujoco.rendering.classic import gl_context
+
+  backend = find_gl()
+  if backend is None:
+    raise PlaygroundError(f"render() draws nothing. {NO_GL_REMEDY}")
+  os.environ.pop("PYOPENGL_PLATFORM", None)  # the backend sets its own and refuses another
+  library = backend if backend in ("egl", "osmesa", "cgl") else "glfw"
+  chosen = gl_context.GLContext
+  gl_context.GLContext = importlib.import_module(f"mujoco.{library}").GLContext
+  try:
+    return mujoco.Renderer(model, _HEIGHT, _WIDTH)
+  finally:
+    gl_context.GLContext = chosen
+
+
+class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
+  """A batch of environments in one program. An episode that has ended begins anew by itself, freshly drawn.
+
+  That is in the next step, which takes no action of it, or (`AutoresetMode.SAME_STEP`) in the step that ends it: `info`
+  then has the episode's last observation and metrics under `final_obs` and `final_info`, as gymnasium's own have them.
+  """
+
+  metadata = {"render_modes": []}  # noqa: RUF012
 
   def __init__(
     self,
@@ -103,8 +143,18 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     overrides: Mapping[str, Any] | None = None,
     physics: str = "mjx",
     entry: str | None = None,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
   ):
-    """Builds a task; see `GymEnv`."""
+    """Builds a task; see `GymEnv` for arguments and errors.
+
+    Raises:
+      ConfigError: `AutoresetMode.DISABLED`.
+    """
+    mode = AutoresetMode(autoreset_mode)
+    if mode == AutoresetMode.DISABLED:
+      raise ConfigError("autoreset_mode='Disabled' is not there: choose 'NextStep' or 'SameStep'.")
+    self.metadata = self.metadata | {"autoreset_mode": mode}
+    same_step = mode == AutoresetMode.SAME_STEP
     env = load_task(task, overrides, physics)
     self.num_envs, self._entry = num_envs, entry
     self.single_observation_space = observation_space(env, entry)
@@ -116,9 +166,12 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     def start(key: jax.Array) -> State:
       return batch.reset(jax.random.split(key, num_envs))
 
-    def advance(state: State, action: jax.Array, key: jax.Array) -> State:
-      after, ended = batch.step(state, action), state.done
-      return jax.lax.cond(ended.any(), lambda: where_done(ended, start(key), after), lambda: after)
+    def advance(state: State, action: jax.Array, key: jax.Array) -> tuple[State, State]:
+      """The state to go on from, and what the step itself came to."""
+      after = batch.step(state, action)
+      ended = after.done if same_step else state.done
+      begun = jax.lax.cond(ended.any(), lambda: where_done(ended, start(key), after), lambda: after)
+      return begun, (after if same_step else begun).replace(data=None)
 
     self._start, self._advance = jax.jit(start), jax.jit(advance)
     self._state: State | None = None
@@ -130,10 +183,22 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
 
   def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
     assert self._state is not None, "reset before the first step"
-    state = self._state = self._advance(self._state, np.asarray(actions, np.float32), self._key())
-    obs, info = self._seen(state)
-    done, truncated = np.array(state.done) > 0, np.array(state.info["truncation"]) > 0
-    return obs, np.array(state.reward), done & ~truncated, truncated, info
+    state, last = self._advance(self._state, np.asarray(actions, np.float32), self._key())
+    self._state, (obs, info) = state, self._seen(state)
+    done, truncated = np.array(last.done) > 0, np.array(last.info["truncation"]) > 0
+    if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP and done.any():
+      info |= self._final(last, done)
+    return obs, np.array(last.reward), done & ~truncated, truncated, info
+
+  def _final(self, last: State, done: np.ndarray) -> dict[str, Any]:
+    """The entries on the episodes that ended: an object each in `final_obs`, and who has one under `_<name>`."""
+    obs, metrics = self._seen(last)
+    final_obs = np.full(self.num_envs, None, object)
+    for i in np.flatnonzero(done):
+      final_obs[i] = jax.tree.map(lambda x, i=i: x[i], obs)
+    final_info = {name: np.where(done, values, 0) for name, values in metrics.items()}
+    final_info |= {f"_{name}": done.copy() for name in metrics}
+    return {"final_obs": final_obs, "_final_obs": done.copy(), "final_info": final_info, "_final_info": done.copy()}
 
   def _key(self) -> jax.Array:
     return jax.random.PRNGKey(int(self.np_random.integers(_SEEDS)))

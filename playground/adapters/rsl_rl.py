@@ -8,7 +8,7 @@ reads it is used again by the next step at the earliest, which waits for torch's
 # torch is in an extra, which the type checker may not find
 # pyright: reportMissingImports=false
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -17,8 +17,8 @@ import torch
 from rsl_rl import env as rsl_rl_env
 from tensordict import TensorDict
 
-from playground.envs.base import PIXELS, Env, State
-from playground.envs.wrappers import wrap_for_training
+from playground.envs.base import PIXELS, Env, Observation, State
+from playground.envs.wrappers import FINAL_OBS, AutoReset, wrap_for_evaluation
 from playground.errors import ConfigError
 from playground.learning.rollout import episode_sums
 from playground.randomization import Randomizer
@@ -41,8 +41,10 @@ class VecEnv(rsl_rl_env.VecEnv):
   """What RSL-RL steps: episodes that begin anew by themselves, one batch on one device.
 
   Observations have the groups `policy` and `critic`. `extras["time_outs"]` is 1 where time ended the episode, and not
-  the task, so that RSL-RL adds the value of what would have come; `extras["log"]` has the means of reward, length and
-  the task's metrics over the episodes that ended in the step, if any did.
+  the task, so that RSL-RL adds the value of what would have come; `extras["final_obs"]` are the observations that the
+  step itself made, in the same groups: where an episode ended, its last (RSL-RL 5 does not look at them and takes the
+  value of the observation before instead; an algorithm of yours may). `extras["log"]` has the means of reward, length
+  and the task's metrics over the episodes that ended in the step, if any did.
 
   Attributes:
     state: the present state, a batch.
@@ -86,14 +88,18 @@ class VecEnv(rsl_rl_env.VecEnv):
 
   def get_observations(self) -> TensorDict:
     """The present observations."""
-    obs: Any = self.state.obs
-    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    return self._grouped(self.state.obs)
+
+  def _grouped(self, obs: Observation) -> TensorDict:
+    entries: Any = obs if isinstance(obs, Mapping) else {"state": obs}
     return TensorDict({group: to_torch(entries[entry]) for group, entry in self.groups.items()}, [self.num_envs])
 
   def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Applies actions, [num_envs, num_actions], clipped to [-1, 1]; see RSL-RL's `VecEnv.step` for what it returns."""
     state = self.state = self._step(self.state, to_jax(actions.clamp(-1.0, 1.0)))
     extras: dict[str, Any] = {"time_outs": to_torch(state.info["truncation"])}
+    if FINAL_OBS in state.info:
+      extras[FINAL_OBS] = self._grouped(state.info[FINAL_OBS])
     if self._log:
       sums = self._sums(state)
       if ended := float(sums["episodes"]):
@@ -108,7 +114,7 @@ def vec_env(
   num_envs: int,
   *,
   seed: int = 0,
-  terms: Sequence[Mapping[str, Any]] = (),
+  events: Mapping[str, Any] | None = None,
   groups: Mapping[str, str] | None = None,
 ) -> VecEnv:
   """Makes a batch of environments of a task for RSL-RL.
@@ -117,15 +123,16 @@ def vec_env(
     env: the task, from `registry.load`.
     num_envs: how many.
     seed: of the episodes and the models.
-    terms: domain randomisation, drawn once for each environment (`compose(["env=..."]).randomization.terms`).
+    events: domain randomisation, drawn once for each environment (`compose(["env=..."]).env.events`).
     groups: see `VecEnv`.
 
   Raises:
     ConfigError: the task shows pictures.
   """
-  batch, groups = wrap_for_training(env), dict(groups or group_entries(env))
+  batch = AutoReset(wrap_for_evaluation(env), keep_final_obs=True)
+  groups = dict(groups or group_entries(env))
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
-  randomizer = Randomizer(env.mj_model, terms) if terms else None
+  randomizer = Randomizer(env.mj_model, events) if events else None
   model = jax.jit(randomizer.sample_batch)(jax.random.split(model_key, num_envs)) if randomizer else {}
   state = jax.jit(batch.reset)(jax.random.split(reset_key, num_envs), model)
   step = jax.jit(batch.step)

@@ -33,6 +33,7 @@ COMPARED_CONDITIONS = [f"env.ctrl_dt={1 / 60}", f"env.sim_dt={1 / 120}", "env.ep
 class Throughput(OfTasks):
   """Training steps/s of each task at the paper's hyperparameters on one device, compile and start time, memory."""
 
+  agent: str = option("ppo_paper", "ppo_paper, ppo or sac")
   seeds: int = option(5, "trainings timed, seeds 1 to this")
 
   name = "throughput"
@@ -103,7 +104,7 @@ class Pixels(OfTasks):
 
   def check(self) -> None:
     super().check()
-    if self.agent != "ppo":
+    if not self.agent.startswith("ppo"):
       raise ConfigError(f"agent={self.agent} reads no pictures: pixels is of agent=ppo.")
     if self.compared and self.chosen() != ["CartpoleBalanceVision"]:
       raise ConfigError("compared=true is of CartpoleBalanceVision alone: leave tasks= and suite= away.")

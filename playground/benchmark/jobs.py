@@ -20,9 +20,10 @@ from typing import Any
 from playground.benchmark.schema import Table, commit_of
 from playground.benchmark.worker import ERROR, ROW
 from playground.errors import HardwareError
+from playground.interpreter import PYTHON
 from playground.runs.provenance import git_state
 
-WORKER = (sys.executable, "-W", "ignore", "-m", "playground.benchmark.worker")
+WORKER = (*PYTHON, "-W", "ignore", "-m", "playground.benchmark.worker")
 GRACE_S = 40.0  # between asking a process to end and ending it: a training run saves first
 CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")
 TAIL = 30  # lines of a failed process that are shown

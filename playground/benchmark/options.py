@@ -58,7 +58,7 @@ class OfTasks(Measuring):
 
   suite: str | None = option(None, "dm_control, locomotion, manipulation or all: the tasks of the paper's tables")
   tasks: tuple[str, ...] = option((), "tasks by name, instead of a suite or on top")
-  agent: str = option("ppo", "ppo or sac")
+  agent: str = option("ppo", "ppo, ppo_paper or sac")
   seconds: float = option(4.0, "how long to time each number, at least one update")
 
   sets_devices = True  # whether a device's number is the command's to say
@@ -83,7 +83,7 @@ class OfTasks(Measuring):
   def with_envs(self, task: str, count: int) -> list[str]:
     """Overrides for so many environments; PPO's batch grows where each would give less than a trajectory."""
     setting = [f"agent.num_envs={count}"]
-    if self.agent == "ppo":  # every environment gives a whole number of trajectories, no fewer than tuned
+    if self.agent.startswith("ppo"):  # every environment gives a whole number of trajectories, no fewer than tuned
       agent = self.configured(task).agent
       batch = agent.batch_size * max(1, -(-count // (agent.batch_size * agent.num_minibatches)))
       setting += [f"agent.batch_size={batch}"] * (batch != agent.batch_size)

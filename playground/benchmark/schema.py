@@ -13,7 +13,7 @@ from playground.errors import ConfigError
 COLUMNS = {
   "benchmark": "the command: throughput, startup, scaling, breakdown, pixels, topology, chain, compare, learning",
   "task": "the task's name, of a chain the experiment's",
-  "agent": "ppo or sac",
+  "agent": "ppo, ppo_paper or sac",
   "who": "ours, or the peer's name and version",
   "setting": "what differs from the task's own configuration, as overrides, and what the benchmark varies",
   "seed": "of the training; empty where a number belongs to all seeds",

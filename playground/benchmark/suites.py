@@ -9,7 +9,7 @@ from playground.config.files import shipped, task_names
 from playground.errors import ConfigError, UnknownNameError, nearest
 
 SUITES = ("dm_control", "locomotion", "manipulation")
-AGENTS = ("ppo", "sac")
+AGENTS = ("ppo", "ppo_paper", "sac")
 
 
 def paper_folder() -> Path:
@@ -55,6 +55,6 @@ def choose_tasks(suite: str | None, tasks: Sequence[str]) -> list[str]:
 
 
 def check_agent(agent: str) -> None:
-  """Raises UnknownNameError for an algorithm that the paper's tables do not have."""
+  """Raises UnknownNameError for an agent that is not measured."""
   if agent not in AGENTS:
     raise UnknownNameError(f"agent={agent} does not exist: choose from {', '.join(AGENTS)}.{nearest(agent, AGENTS)}")

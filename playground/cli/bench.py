@@ -5,8 +5,9 @@ import signal
 import sys
 from collections.abc import Sequence
 
+from playground import __version__
 from playground.benchmark.arguments import help_of, parse
-from playground.errors import PlaygroundError, UnknownNameError, nearest
+from playground.errors import PlaygroundError, UnknownNameError, nearest, one_sentence
 
 # What measures is one module's; the others are a module each, with `Options` and `run(options) -> exit code`.
 OTHERS = {"report": "playground.benchmark.report", "gate": "playground.benchmark.gate"}
@@ -17,8 +18,8 @@ def main() -> None:
   signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that what was started is ended
   try:
     code = _main(sys.argv[1:])
-  except PlaygroundError as error:
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+  except (PlaygroundError, OSError) as error:
+    print(one_sentence(error), file=sys.stderr)
     code = 2
   except KeyboardInterrupt:
     code = 130
@@ -32,6 +33,9 @@ def _main(argv: Sequence[str]) -> int:
   known = [*COMMANDS, *OTHERS]
   if name in ("-h", "--help", "help"):
     _print_help()
+    return 0
+  if name == "--version":
+    print(f"playground-run {__version__}")
     return 0
   if name not in known:
     raise UnknownNameError(f"playground-bench has no command {name}: it has {', '.join(known)}.{nearest(name, known)}")

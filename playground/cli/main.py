@@ -2,18 +2,23 @@
 
 import argparse
 import sys
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from playground import registry
-from playground.config import RunConfig, compose, format_value
-from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
+from playground import __version__, registry
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest, one_sentence
+from playground.limits import SEED, count
 from playground.rendering.gl import withhold_gl
+from playground.trust import trust
 
-if TYPE_CHECKING:
-  from rich.console import RenderableType
-
-  from playground.envs.base import Env
+# Of all commands' options.
+_NUMBERS = {
+  "seed": SEED,
+  "episodes": count(1, 100_000),
+  "num_views": count(1, 1024),
+  "envs": count(1),
+  "steps": count(1),
+  "port": count(0, 65535),
+}
 
 
 def main() -> None:
@@ -21,15 +26,17 @@ def main() -> None:
   withhold_gl()
   args = _arguments()
   try:
+    trust(*args.trust)
+    _check_numbers(args)
     code = args.command(args)
-  except PlaygroundError as error:
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-    code = 2
   except KeyboardInterrupt:
     code = 130  # as a shell counts it
   except BrokenPipeError:  # `playground list | head`
     sys.stderr.close()
     code = 0
+  except (PlaygroundError, OSError) as error:
+    print(one_sentence(error), file=sys.stderr)
+    code = 2
   sys.exit(code)
 
 
@@ -45,13 +52,21 @@ def _arguments() -> argparse.Namespace:
   return args
 
 
+def _check_numbers(args: argparse.Namespace) -> None:
+  for name, limit in _NUMBERS.items():
+    value = getattr(args, name, None)
+    if value is not None and not limit.allows(value):
+      raise ConfigError(f"--{name.replace('_', '-')}={value} must be {limit}.")
+
+
 def _parser() -> argparse.ArgumentParser:
   parser = argparse.ArgumentParser(prog="playground", description="Robot learning tasks; train with playground-run.")
+  parser.add_argument("--version", action="version", version=f"playground-run {__version__}")
   commands = parser.add_subparsers(required=True, metavar="command")
 
   def add(name: str, command: Any, what: str) -> argparse.ArgumentParser:
     sub = commands.add_parser(name, help=what, description=what)
-    sub.set_defaults(command=command)
+    sub.set_defaults(command=command, trust=[])
     return sub
 
   add("list", _list, "List tasks.").add_argument("word", nargs="?", help="only tasks whose name contains it")
@@ -91,9 +106,13 @@ def _parser() -> argparse.ArgumentParser:
   tune.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or agent.num_envs=4096")
   tune.add_argument("--run", help="a run or checkpoint whose policy acts, beside random actions")
   tune.add_argument("--envs", type=int, default=256)
-  tune.add_argument("--steps", type=int, default=500, help="decisions in each environment")
+  tune.add_argument("--steps", type=int, default=500, help="policy steps in each environment")
   replay = add("replay", _replay, "Replay the step that was not finite.")
   replay.add_argument("dump", help="a run's nan_dump/step_*.npz")
+  for builds_tasks in (show, evaluate, export, play, sweep, tune, replay):
+    builds_tasks.add_argument(
+      "--trust", action="append", metavar="PACKAGE", help="let the configuration name task classes of this package, too"
+    )
   return parser
 
 
@@ -152,7 +171,9 @@ def _sweep(args: argparse.Namespace) -> int:
 
   if args.overrides and args.action != "retry":
     raise ConfigError(f"{args.overrides[0]}: only `playground sweep retry` takes overrides.")
-  return getattr(sweep, args.action)(args.folder, *args.overrides)
+  if args.action == "retry":
+    return sweep.retry(args.folder, *args.overrides, trust=args.trust)
+  return getattr(sweep, args.action)(args.folder)
 
 
 def _tune_buffers(args: argparse.Namespace) -> int:
@@ -168,94 +189,9 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _show(args: argparse.Namespace) -> int:
-  from rich.console import Console
+  from playground.cli.show import show
 
-  console = Console()
-  if args.task.startswith("randomization=") and not args.overrides:
-    if args.views:
-      raise ConfigError("--views shows a task: playground show <task> randomization=<name> --views <file>.")
-    console.print(describe_randomization(compose([args.task])))
-    return 0
-  config = compose([args.task if "=" in args.task else f"env={args.task}", *args.overrides])
-  env = registry.build(config.env)
-  if args.views:
-    from playground.rendering.views import save_views
-
-    terms = config.resolved["randomization"]["terms"]
-    console.print(f"wrote {save_views(env, terms, args.views, args.num_views, config.seed)}")
-    return 0
-  for part in describe(config, env):
-    console.print(part)
-  return 0
-
-
-def describe(config: RunConfig, env: "Env") -> "Iterable[RenderableType]":
-  """Tables about a task: facts, observation, reward terms, randomisation, hyperparameters."""
-  import jax
-
-  from playground.randomization import Randomizer
-
-  section, choices = config.resolved["env"], config.choices
-  Randomizer(env.mj_model, config.resolved["randomization"]["terms"])  # a term without a target is said before anything
-  state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-  ctrl = [f"[{low:g}, {high:g}]" for low, high in dict.fromkeys(map(tuple, env.mj_model.actuator_ctrlrange))]
-  renders = section.get("vision", {}).get("enable")
-  auto = "auto: warp, to render" if renders else f"auto: jax on CPU, {section['cuda_impl']} on an NVIDIA GPU"
-  facts = {
-    "class": section["task"],
-    "robot": choices.get("robot") or "its own",
-    "action": f"{env.action_size} in [-1, 1]",
-    "actuators": f"{env.mj_model.nu}, ctrl in {', '.join(ctrl)}",
-    "control": f"{1 / env.dt:g} Hz ({env.dt:g} s), each action applied {env.action_repeat} x",
-    "physics": f"{1 / env.sim_dt:g} Hz ({env.sim_dt:g} s), {env.n_substeps} per control step",
-    "episode": f"{env.episode_length} control steps ({env.episode_length * env.dt:g} s)",
-    "backend": auto if section["impl"] == "auto" else section["impl"],
-  }
-  yield _table(f"{choices['env']}", facts.items())
-  yield _table("observation", _observation(env, state.obs))
-  scales = section.get("reward", {}).get("scales", {})
-  terms = [name.removeprefix("reward/") for name in state.metrics if name.startswith("reward/")]
-  yield _table("reward terms and weights", ((t, scales.get(t, "")) for t in dict.fromkeys([*scales, *terms])))
-  yield describe_randomization(config)
-  origin = f"tuned/{choices['tuned']}.yaml" if choices.get("tuned") else "defaults, not tuned for this task"
-  yield _table(f"{config.agent.name} ({origin})", _flat(config.resolved["agent"]))
-
-
-def describe_randomization(config: RunConfig) -> "RenderableType":
-  """A table of what is drawn from what."""
-  from playground.randomization import parse_terms
-
-  rows = [term.describe() for term in parse_terms(config.resolved["randomization"]["terms"])]
-  drawn = [(row["field"], f"{row['target']}: {row['operation']} {row['draw']}") for row in rows]
-  return _table(f"randomization: {config.choices['randomization']}", drawn)
-
-
-def _observation(env: "Env", obs: Any) -> Iterable[tuple[str, Any]]:
-  """Rows of the observation: each entry's size, below it its parts with theirs."""
-  parts = env.observation_parts
-  entries = obs if isinstance(obs, Mapping) else {"state": obs}
-  for group in [g for g in parts if g in entries] + [g for g in entries if g not in parts]:
-    yield group, " x ".join(map(str, entries[group].shape))
-    yield from ((f"  {part}", size) for part, size in parts.get(group, {}).items())
-
-
-def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-  for key, value in node.items():
-    if isinstance(value, Mapping):
-      yield from _flat(value, f"{prefix}{key}.")
-    else:
-      yield f"{prefix}{key}", value
-
-
-def _table(title: str, rows: Iterable[tuple[str, Any]]) -> "RenderableType":
-  from rich.console import Group
-  from rich.table import Table
-  from rich.text import Text
-
-  table = Table(show_header=False, box=None, padding=(0, 2))
-  for key, value in list(rows) or [("none", "")]:
-    table.add_row(Text(key, style="cyan"), Text(format_value(value)))
-  return Group(Text(title, style="bold"), table)
+  return show(args.task, args.overrides, views=args.views, num_views=args.num_views)
 
 
 if __name__ == "__main__":

@@ -4,29 +4,38 @@ Our check comes first, so that a mistake is one sentence; the rest is a Hydra ap
 `--help`, `--info`). `-m` is ours: a sweep of jobs, each a process of its own (`playground.sweep`).
 """
 
+import argparse
 import os
+import re
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser  # Hydra has no public name for its own flags
 from hydra.errors import HydraException
 
+from playground import __version__
 from playground.collector import uncollected
 from playground.config import (
   RunConfig,
+  command_lines,
   compose,
   config_roots,
   is_hydras,
+  parse_with_hydra,
   search_path_override,
   to_yaml,
   tree,
   with_default_experiment,
 )
-from playground.errors import ConfigError, PlaygroundError
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError, one_sentence
 from playground.rendering.gl import withhold_gl
+from playground.trust import trust
+
+_COMPLETION = re.compile("(install|uninstall|query)=(bash|fish|zsh)")
 
 
 def main() -> None:
@@ -35,11 +44,11 @@ def main() -> None:
   os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is not a PlaygroundError is a bug: show all of it
   try:
     code = _main(sys.argv[1:])
-  except (PlaygroundError, HydraException) as error:
-    code = _report(error)
   except BrokenPipeError:  # `playground-run --help | head`
     sys.stderr.close()
     code = 0
+  except (PlaygroundError, HydraException, OSError) as error:
+    code = _report(error)
   except KeyboardInterrupt:  # before training listens for signals
     code = 128 + signal.SIGINT
   if any(thread.name.startswith(("compiler", "preflight")) for thread in threading.enumerate()):
@@ -51,19 +60,29 @@ def main() -> None:
 
 
 def _main(argv: Sequence[str]) -> int:
-  args, others = get_args_parser().parse_known_args(argv)
+  if "--version" in argv:  # Hydra's option of this name prints Hydra's version
+    print(f"playground-run {__version__}")
+    return 0
+  parser = get_args_parser()
+  parser.error = _refuse
+  args, others = parser.parse_known_args(argv)
   if unknown := [other for other in others if other.startswith("-")]:
     raise ConfigError(f"{unknown[0]} is no option: `playground-run --help` shows them, and the keys.")
   overrides = [*args.overrides, *others]
   flags = [arg for arg in argv if arg not in overrides]
+  _check_flags(args, overrides)
+  overrides, trusted = _trusted(overrides)
+  trust(*trusted)
   config = None
   if args.help:
     overrides = with_default_experiment(overrides)
   elif args.multirun and not (args.hydra_help or args.info or args.shell_completion):
-    return _sweep(overrides, args.cfg)
+    return _sweep(overrides, args.cfg, trusted)
   elif not (args.hydra_help or args.info or args.shell_completion):
     config = compose(overrides)
     overrides = [*config.overrides, *filter(is_hydras, overrides)]
+    if args.cfg == "job" and args.package and not _has(config.resolved, args.package):
+      raise UnknownNameError(f"--package {args.package}: the configuration has no such key.")
     if args.cfg == "job" and config.resume:  # the run's own, which Hydra cannot compose
       print(to_yaml(config))
       return 0
@@ -83,6 +102,30 @@ def _main(argv: Sequence[str]) -> int:
   return next(iter(codes), 0)
 
 
+def _refuse(message: str) -> NoReturn:
+  raise ConfigError(f"{message}: `playground-run --help` shows the options, and the keys.")
+
+
+def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
+  """Raises ConfigError for flags of Hydra's that do nothing here, or not by themselves."""
+  for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
+    if getattr(args, name) is not None:
+      _refuse(f"--{name.replace('_', '-')} is no option")
+  if (args.resolve or args.package) and not (args.cfg or args.help):
+    _refuse(f"--{'resolve' if args.resolve else 'package'} goes with --cfg job")
+  if args.shell_completion and not (len(overrides) == 1 and _COMPLETION.fullmatch(overrides[0])):
+    _refuse("--shell-completion takes install=<shell>, uninstall=<shell> or query=<shell>, of bash, fish and zsh")
+
+
+def _has(resolved: Any, key: str) -> bool:
+  """Whether a nested mapping has a dotted key."""
+  for part in key.split("."):
+    if not isinstance(resolved, Mapping) or part not in resolved:
+      return False
+    resolved = resolved[part]
+  return True
+
+
 def _train(config: RunConfig) -> int:
   from rich.console import Console
 
@@ -96,7 +139,22 @@ def _train(config: RunConfig) -> int:
   return train(config)
 
 
-def _sweep(overrides: Sequence[str], show: str | None) -> int:
+def _trusted(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
+  """The overrides without `trust=<package>` or `trust=[<package>, ...]`, and the packages that those name."""
+  others, packages = [], []
+  for text in overrides:
+    override = parse_with_hydra(text)
+    if override.key_or_group != "trust":
+      others.append(text)
+    elif override.is_sweep_override():
+      raise ConfigError(f"{text}: write trust=[{text.partition('=')[2]}] for several packages.")
+    else:
+      value = override.value()
+      packages += value if isinstance(value, list) else [value]
+  return others, packages
+
+
+def _sweep(overrides: Sequence[str], show: str | None, trusted: Sequence[str]) -> int:
   from playground.sweep.plan import compose_jobs, plan
 
   if show is not None:
@@ -105,13 +163,14 @@ def _sweep(overrides: Sequence[str], show: str | None) -> int:
     print("---\n".join(f"# {' '.join(config.overrides)}\n{to_yaml(config)}" for config in compose_jobs(overrides)))
     return 0
   from playground.sweep.runner import run_sweep
+  from playground.sweep.worker import job_command
 
-  return run_sweep(*plan(overrides))
+  return run_sweep(*plan(overrides), job_command(trusted, command_lines(overrides)))
 
 
 def _report(error: Exception) -> int:
   sys.stdout.flush()
-  print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+  print(one_sentence(error), file=sys.stderr)
   return 2
 
 

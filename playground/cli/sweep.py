@@ -1,12 +1,16 @@
 """`playground sweep status|collect|retry|stop <folder>`: from the files alone, whatever became of who started it."""
 
+from collections.abc import Sequence
+
 from rich.console import Console
 
+from playground.config import is_of_command
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.plan import settings_of
 from playground.sweep.results import write_result
 from playground.sweep.runner import run_sweep
 from playground.sweep.view import status_table
+from playground.sweep.worker import job_command
 
 
 def status(folder: str) -> int:
@@ -22,10 +26,18 @@ def collect(folder: str) -> int:
   return 0
 
 
-def retry(folder: str, *overrides: str) -> int:
-  """Does what is missing, failed jobs included; returns how many failed again."""
+def retry(folder: str, *overrides: str, trust: Sequence[str] = ()) -> int:
+  """Does what is missing, failed jobs included; returns how many failed again.
+
+  Args:
+    folder: the sweep's.
+    overrides: how it is run, where that is to change; jobs' folder of compiled programs (`hardware.cache_dir`).
+    trust: packages whose tasks jobs may name.
+  """
   sweep = SweepDirectory.open(folder)
-  return run_sweep(sweep, settings_of(sweep, overrides))
+  lines = [text for text in overrides if is_of_command(text)]
+  settings = settings_of(sweep, [text for text in overrides if text not in lines])
+  return run_sweep(sweep, settings, job_command(trust, lines))
 
 
 def stop(folder: str) -> int:

@@ -8,6 +8,7 @@ from rich.table import Table
 from playground.config import compose, format_value
 from playground.errors import ConfigError
 from playground.learning.buffers import ROOM, Act, BufferSizes, measure_buffers
+from playground.runs.progress import Progress
 from playground.runs.trained import load_trained
 
 # By key of a task's config: what it bounds, and how much of that was needed.
@@ -27,7 +28,7 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
     run: a run or checkpoint of the task whose policy acts, beside a random one; without overrides the task is as the
       run had it.
     envs: environments.
-    steps: decisions of each.
+    steps: policy steps of each.
 
   Returns:
     The exit code, 0.
@@ -45,11 +46,15 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
       raise ConfigError(f"--run={run} is one of {trained.task}, not of {task}.")
     policies["trained"] = trained.act
     config = config if overrides else trained.config.env
+  found = []
+  with Progress(envs * steps, activity="rollout", console=Console(stderr=True)) as progress:
+    for name, act in policies.items():
+      compiles = lambda sizes, name=name: progress.phase(f"{name} policy: compiling with {sizes}")
+      done = lambda count: progress.update(envs * count)
+      found.append(measure_buffers(config, act, envs, steps, on_try=compiles, on_steps=done))
   console = Console()
-  with console.status(f"{task} on Warp with larger and larger buffers: each compiles anew"):
-    found = [measure_buffers(config, act, envs, steps) for act in policies.values()]
   advice = [sizes.advised() for sizes in found]
-  table = Table(title=f"{task} on Warp, {envs} environments, {steps} decisions")
+  table = Table(title=f"{task} on Warp, {envs} environments, {steps} policy steps")
   table.add_column("most needed", no_wrap=True)
   for column in (*policies, f"advised (x {ROOM:g})", "configured"):
     table.add_column(column, justify="right")

@@ -17,11 +17,34 @@ exist, and what they have fixes each value's type, wherever that value is set.
 """
 
 from playground.config.chains import in_stage, stage_folders
-from playground.config.composition import compose, compose_all, compose_settings, from_saved, override_section
+from playground.config.composition import (
+  compose,
+  compose_all,
+  compose_settings,
+  from_saved,
+  override_section,
+  saved_section,
+)
 from playground.config.files import ENTRY_POINTS, config_roots, options, search_path_override, task_names
-from playground.config.overrides import DEFAULT_EXPERIMENT, is_hydras, is_of_sweep, with_default_experiment
-from playground.config.run_config import RunConfig, Section, from_dict, load, to_yaml, tree
-from playground.config.sweeps import combinations, expand, listed_jobs, split, varying, with_listed
+from playground.config.overrides import (
+  DEFAULT_EXPERIMENT,
+  is_hydras,
+  is_of_command,
+  is_of_sweep,
+  parse_with_hydra,
+  with_default_experiment,
+)
+from playground.config.run_config import RunConfig, Section, config_dict, from_dict, in_order_of, load, to_yaml, tree
+from playground.config.sweeps import (
+  check_saved_job,
+  combinations,
+  command_lines,
+  expand,
+  listed_jobs,
+  split,
+  varying,
+  with_listed,
+)
 from playground.config.text import format_value
 
 __all__ = [
@@ -29,22 +52,29 @@ __all__ = [
   "ENTRY_POINTS",
   "RunConfig",
   "Section",
+  "check_saved_job",
   "combinations",
+  "command_lines",
   "compose",
   "compose_all",
   "compose_settings",
+  "config_dict",
   "config_roots",
   "expand",
   "format_value",
   "from_dict",
   "from_saved",
+  "in_order_of",
   "in_stage",
   "is_hydras",
+  "is_of_command",
   "is_of_sweep",
   "listed_jobs",
   "load",
   "options",
   "override_section",
+  "parse_with_hydra",
+  "saved_section",
   "search_path_override",
   "split",
   "stage_folders",

@@ -5,7 +5,7 @@ stages:
   flat:
     num_timesteps: 100_000_000   # null is the task's own budget
     overrides:                   # as on the command line; they hold for the later stages, too
-      - env.command.max=[1.5, 0.8, 1.2]
+      - env.commands.velocity.params.max=[1.5, 0.8, 1.2]
   rough: {num_timesteps: 100_000_000, overrides: [terrain=rough]}
 ```
 
@@ -30,11 +30,24 @@ SINGLE_RUN = {"scale": 1.0, "start_at": None, "stages": {}}  # curriculum=none
 
 
 def stage_folders(curriculum: Mapping[str, Any]) -> dict[str, str]:
-  """The stages that a chain runs, from `start_at` on, and each one's folder in the chain's."""
+  """The stages that a chain runs, from `start_at` on, and each one's folder in the chain's.
+
+  Raises:
+    UnknownNameError: `start_at` is no stage.
+  """
   names = list(curriculum["stages"])
   start_at = curriculum.get("start_at")
+  _need_stage(start_at, names)
   first = 0 if start_at is None else names.index(start_at)
   return {name: f"{number}_{name}" for number, name in enumerate(names[first:], first + 1)}
+
+
+def _need_stage(start_at: str | None, names: list[str]) -> None:
+  if start_at is not None and start_at not in names:
+    near = nearest(str(start_at), names)
+    raise UnknownNameError(
+      f"curriculum.start_at={start_at} does not exist: choose from {', '.join(names) or 'none'}.{near}"
+    )
 
 
 def check_chain(resolved: Mapping[str, Any], parsed: Sequence[Override], roots: Sequence[Path]) -> None:
@@ -56,10 +69,7 @@ def check_chain(resolved: Mapping[str, Any], parsed: Sequence[Override], roots: 
     return
   for name, stage in stages.items():
     _check_stage(f"curriculum.stages.{name}", name, stage)
-  if start_at is not None and start_at not in stages:
-    near = nearest(str(start_at), stages)
-    known = ", ".join(stages)
-    raise UnknownNameError(f"curriculum.start_at={start_at} does not exist: choose from {known}.{near}")
+  _need_stage(start_at, list(stages))
   if start_at not in (None, next(iter(stages))) and resolved["init_from"] is None:
     what = "is not the first stage, so it needs weights to start from"
     raise ConfigError(f"curriculum.start_at={start_at} {what}: add init_from=<run or checkpoint>.")

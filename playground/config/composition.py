@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import functools
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -26,7 +27,7 @@ from playground.config.chains import (
   stage_folders,
   stage_overrides,
 )
-from playground.config.files import DELTAS, config_roots, groups, options, search_path_override
+from playground.config.files import DELTAS, config_roots, groups, lineage, options, search_path_override
 from playground.config.limits import check_limits, check_vision
 from playground.config.overrides import (
   Override,
@@ -38,13 +39,15 @@ from playground.config.overrides import (
   with_default_experiment,
 )
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, Section, from_dict, load
-from playground.config.schema import check_key, fit
-from playground.config.text import first_line
+from playground.config.schema import check_key, fit, is_terms
+from playground.config.text import first_line, join
 from playground.errors import ConfigError, PlaygroundError, nearest
+from playground.mdp.options import OPTIONS
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that say which keys a run has, in this order
-_BY_NAME = ("scales", "functions", "obs", "history", "termination")  # mappings whose keys are a task's choice
+_BY_NAME = tuple(OPTIONS)  # mappings whose keys are a task's choice
+_CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
 
@@ -101,6 +104,7 @@ def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Se
   given = {o.key: o.value for o in parsed}
   for key in ("resume", "init_from"):
     if given.get(key) is not None:
+      given[key] = _resolve(given[key])
       _check_path(key, given[key])
   if given.get("resume") is not None:
     return _compose_resumed(Path(given["resume"]), parsed, roots)
@@ -112,10 +116,10 @@ def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Se
 
 
 def override_section(section: str, default: Section, overrides: Mapping[str, Any]) -> dict[str, Any]:
-  """Returns a section, e.g. env, with dotted keys such as `reward.scales.energy` replaced, checked as in `compose`."""
+  """Returns a section, e.g. env, with values replaced by dotted key (`action_scale`), checked as in `compose`."""
   schema = {section: _plain(default)}
   parsed = [Override(f"{section}.{key}", value, False, "") for key, value in overrides.items()]
-  resolved = _apply(OmegaConf.create(schema), parsed, schema)
+  resolved = _apply(_literal(schema), parsed, schema)
   check_limits(resolved)
   return resolved[section]
 
@@ -123,10 +127,11 @@ def override_section(section: str, default: Section, overrides: Mapping[str, Any
 def from_saved(resolved: Mapping[str, Any], config_dir: Path | None = None) -> RunConfig:
   """Rebuilds the configuration of a run that an earlier version may have saved: keys it lacks get today's defaults.
 
-  What a task chooses by name (reward terms, observations, noise) stays what it was.
+  What a task chooses by name (reward terms, observations, noise) stays what it was. What only a command line can say
+  of the machine is today's default.
 
   Raises:
-    ConfigError: a part is missing, so this is not a run's configuration.
+    ConfigError: a part is missing, has another type than its default or cannot work.
   """
   saved = from_dict(resolved)
   roots = config_roots(config_dir)
@@ -136,8 +141,33 @@ def from_saved(resolved: Mapping[str, Any], config_dir: Path | None = None) -> R
     if saved.choices.get(group) in options(group, roots)  # an option that is gone has no defaults
   ]
   today = _plain(_hydra(chosen, roots)[0])
-  filled = {section: _fill(saved.resolved[section], today[section]) for section in SECTIONS}
+  filled = {
+    section: _fit_known(_fill(saved.resolved[section], today[section]), today[section], section) for section in SECTIONS
+  }
+  check_limits(filled)
+  hardware = filled["hardware"]  # what only a command line says, see `is_of_command`
+  hardware["cache_dir"] = today["hardware"]["cache_dir"]
+  hardware["distributed"] = {**hardware["distributed"], "coordinator": today["hardware"]["distributed"]["coordinator"]}
   return from_dict({**saved.resolved, **filled}, saved.overrides)
+
+
+def saved_section(section: str, saved: Mapping[str, Any], default: Mapping[str, Any]) -> dict[str, Any]:
+  """A section that a file has saved, e.g. env: keys that it lacks get today's defaults, those that it has are checked.
+
+  Raises:
+    ConfigError: a value of another type than its default, or one that cannot work.
+  """
+  fitted = _fit_known(_fill(saved, default), default, section)
+  check_limits({section: fitted})
+  return fitted
+
+
+def _fit_known(value: Any, default: Any, key: str) -> Any:
+  """As `fit`, but keys that the default lacks are left as they are."""
+  if not (isinstance(default, Mapping) and default and isinstance(value, Mapping)) or is_terms(key):
+    return fit(value, default, key)
+  known = {name: _fit_known(value[name], default[name], join(key, name)) for name in default if name in value}
+  return {**value, **known}
 
 
 def _fill(saved: Mapping[str, Any], default: Mapping[str, Any]) -> dict[str, Any]:
@@ -162,10 +192,11 @@ class _Files(NamedTuple):
 def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
   """Composes the files."""
   (config, choices), added = _hydra(groups, roots), ()
-  sets = [f"{agent}/{choices['env']}" for agent in (choices["agent"], config.agent.name)]
+  agents, tasks = (lineage(group, str(choices[group]), roots) for group in ("agent", "env"))
+  sets = [f"{agent}/{task}" for agent in agents for task in tasks]
   named = any(text.lstrip("~").partition("=")[0] == "tuned" for text in groups)
   if not named and choices["tuned"] is None and (there := [name for name in sets if name in options("tuned", roots)]):
-    added = (parse(f"tuned={there[0]}", roots),)  # a variant such as ppo_v020 without a set of its own has ppo's
+    added = (parse(f"tuned={there[0]}", roots),)  # ppo_v020 without a set of its own takes ppo_paper's, then ppo's
     config, choices = _hydra([*groups, *group_overrides(added)], roots)
   schema, _ = _hydra([f"{g}={c}" for g, c in choices.items() if c and g not in DELTAS] + _NO_DELTAS, roots)
   _check_robot(config, choices, roots)
@@ -229,7 +260,13 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Mapping[st
   try:
     for override in overrides:
       check_key(override.key, schema)
-      OmegaConf.update(config, override.key, override.value, merge=isinstance(override.value, Mapping))
+      if override.key in _CHOSEN_BY_GROUP:
+        group = override.key.partition(".")[0]
+        raise ConfigError(f"{override.text} cannot be set: {group}=<name> chooses it, with the keys that it has.")
+      try:
+        OmegaConf.update(config, override.key, override.value, merge=isinstance(override.value, Mapping))
+      except OmegaConfBaseException as error:
+        raise ConfigError(f"{override.text}: {first_line(error)}.") from None
     if missing := OmegaConf.missing_keys(config):
       raise ConfigError(f"{min(missing)} has no value: set {min(missing)}=<value>.")
     return fit(OmegaConf.to_container(config, resolve=True), schema)
@@ -238,9 +275,22 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Mapping[st
 
 
 def _plain(config: Any) -> Any:
-  """Plain dicts and lists, interpolations resolved."""
-  config = config.to_dict() if isinstance(config, ConfigDict) else config
-  return OmegaConf.to_container(config if isinstance(config, DictConfig) else OmegaConf.create(config), resolve=True)
+  """Plain dicts and lists, the interpolations of our files resolved."""
+  return OmegaConf.to_container(config if isinstance(config, DictConfig) else _literal(config), resolve=True)
+
+
+def _literal(values: Any) -> DictConfig:
+  """Values as they are: what a file has saved is resolved, and `${oc.env:HOME}` in it asks for nothing."""
+
+  def escape(node: Any) -> Any:
+    if isinstance(node, Mapping):
+      return {key: escape(value) for key, value in node.items()}
+    if isinstance(node, list | tuple):
+      return [escape(value) for value in node]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", node) if isinstance(node, str) else node
+
+  plain: dict[str, Any] = escape(values.to_dict() if isinstance(values, ConfigDict) else values)
+  return OmegaConf.create(plain)
 
 
 def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path]) -> RunConfig:
@@ -252,7 +302,7 @@ def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path
   chosen = {o.key for o in parsed if o.is_group}
   sections = {s: schema[s] if s in chosen else saved[s] for s in _RESUMABLE}
   values = [o for o in parsed if not o.is_group and o.key != "resume"]
-  changed = _apply(OmegaConf.create(sections), values, {s: schema[s] for s in sections})
+  changed = _apply(_literal(sections), values, {s: schema[s] for s in sections})
   resolved = {**saved, **changed, "resume": str(run), "run_dir": str(run), "init_from": None}
   resolved["choices"] = {**saved["choices"], **{group: choices[group] for group in chosen}}
   check_limits(resolved)
@@ -270,6 +320,14 @@ def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:
       what = f"which continues exactly that run and takes only {', '.join(_RESUMABLE)}"
       instead = f"init_from={run} starts a new run from its weights"
       raise ConfigError(f"{override.text} cannot be given with resume, {what}; {instead}.")
+
+
+def _resolve(value: Any) -> Any:
+  """A value with its interpolations resolved, such as ${oc.env:SCRATCH}, and those that are escaped as text."""
+  try:
+    return OmegaConf.create({"value": value}).value
+  except OmegaConfBaseException as error:
+    raise ConfigError(f"{first_line(error)}.") from None
 
 
 def _check_path(key: str, value: Any) -> None:

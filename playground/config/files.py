@@ -6,6 +6,8 @@ import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import yaml
+
 from playground.config.text import first_line
 
 ENTRY_POINTS = "playground.tasks"
@@ -36,6 +38,15 @@ def options(group: str, roots: Iterable[Path] | None = None) -> list[str]:
   return sorted({path.relative_to(folder).with_suffix("").as_posix() for path, folder in files})
 
 
+def lineage(group: str, option: str, roots: Iterable[Path]) -> list[str]:
+  """The option and the options its file is built on (the first of its defaults list, and so on), nearest first."""
+  file = next((path for root in roots if (path := root / group / f"{option}.yaml").is_file()), None)
+  defaults = (yaml.safe_load(file.read_text()) or {}).get("defaults", []) if file else []
+  named = [entry.removeprefix(f"/{group}/").partition("@")[0] for entry in defaults if isinstance(entry, str)]
+  bases = [name for name in named if name != "_self_"]
+  return [option, *(lineage(group, bases[0], roots) if bases else [])]
+
+
 def task_names(roots: Iterable[Path] | None = None) -> list[str]:
   """Options of env that are tasks, in CamelCase; the others need a robot to become one."""
   return [name for name in options("env", roots) if name[0].isupper()]
@@ -62,8 +73,8 @@ def _outside_roots() -> tuple[Path, ...]:
       root = Path(str(target() if callable(target) else target))
       if root.suffix == ".yaml":  # <root>/env/<Task>.yaml
         root = root.parent.parent
-      if not any((root / "env").glob("*.yaml")):
-        raise FileNotFoundError(f"{root} holds no env/<TaskName>.yaml")
+      if not any(root.glob("*/**/*.yaml")):
+        raise FileNotFoundError(f"{root} holds no file such as env/<TaskName>.yaml or robot/<name>.yaml")
       roots.append(root.resolve())
     except Exception as error:  # whatever an outside package does wrong, ours go on working
       warnings.warn(f"Entry point {point.name!r} of {ENTRY_POINTS} is skipped: {first_line(error)}", stacklevel=2)

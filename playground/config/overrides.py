@@ -11,8 +11,9 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from playground.config.files import DELTAS, config_roots, groups, listed_options, options
-from playground.config.text import format_value
+from playground.config.text import format_value, quoted
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.mdp.options import OPTIONS
 
 DEFAULT_EXPERIMENT = "quickstart"
 # Any of these on the command line, and it is not the default run that is meant.
@@ -20,6 +21,9 @@ _CHOOSES_A_RUN = {"experiment", "env", "agent", "robot", "curriculum", "resume"}
 _SHORT = {"terrain": "env.scene.terrain", "visuals": "video.visuals"}  # keys that may be written without their section
 
 _OF_SWEEPS = {"sweep", "sweep_dir", "on_error", "launcher", "search"}
+
+_PATHS = ("run_dir", "resume", "init_from", "sweep_dir")
+_OF_COMMANDS = ("trust", "hardware.cache_dir", "hardware.distributed")
 
 
 class Override(NamedTuple):
@@ -48,10 +52,30 @@ def is_of_sweep(key: str) -> bool:
   return key.split(".")[0] in _OF_SWEEPS
 
 
+def is_of_command(text: str) -> bool:
+  """Whether an override holds only for the command that it stands on: what a run or a sweep has saved cannot set it.
+
+  These are Hydra's own keys, which name Python objects; packages to trust; the folder of compiled programs, which are
+  run as they are; and the machine to ask for the others of a training.
+  """
+  key = parse_with_hydra(text).key_or_group
+  return is_hydras(text) or any(f"{key}.".startswith(f"{own}.") for own in _OF_COMMANDS)
+
+
 def parse_with_hydra(text: str) -> HydraOverride:
-  """Reads one override as Hydra does; raises ConfigError if it is none."""
+  """Reads one override as Hydra does; raises ConfigError if it is none.
+
+  What names a folder is text, whatever characters it has: what Hydra cannot read, or takes for a list, is quoted first.
+  """
+  key, _, value = text.partition("=")
   try:
-    return OverridesParser.create().parse_override(text)
+    parsed = OverridesParser.create().parse_override(text)
+    if key not in _PATHS or parsed.is_sweep_override() or not isinstance(parsed.value(), list | dict):
+      return parsed
+  except HydraException:
+    pass
+  try:
+    return OverridesParser.create().parse_override(f"{key}={quoted(value)}" if key in _PATHS else text)
   except HydraException:
     example = "such as env=CartpoleBalance or agent.num_envs=1024 (quote a value with special characters)"
     raise ConfigError(f"{text!r} is not an override: write key=value, {example}.") from None
@@ -67,7 +91,7 @@ def parse(text: str, roots: Sequence[Path]) -> Override:
   name, equals, value = text.partition("=")
   text = _SHORT.get(name, name) + equals + value
   parsed = parse_with_hydra(text)
-  key = parsed.key_or_group
+  text, key = parsed.input_line or text, parsed.key_or_group
   if parsed.is_sweep_override():
     raise ConfigError(f"{text} names several values, which is a sweep: add -m, or quote the value.")
   is_group = key in groups(roots) and parsed.package is None
@@ -92,13 +116,20 @@ def canonical(overrides: Iterable[Override], resolved: Mapping[str, Any]) -> lis
   config = OmegaConf.create(dict(resolved))
   lines = []
   for override in overrides:
+    adds = "++" if is_of_terms(override.key) else ""  # Hydra refuses a term that the files do not have
     if override.is_group:
       lines += group_overrides([override])
     elif isinstance(override.value, int | float):
-      lines.append(f"{override.key}={format_value(OmegaConf.select(config, override.key))}")
+      lines.append(f"{adds}{override.key}={format_value(OmegaConf.select(config, override.key))}")
     else:
-      lines.append(override.text)
+      lines.append(f"{adds}{override.text.lstrip('+')}")
   return lines
+
+
+def is_of_terms(key: str) -> bool:
+  """Whether a dotted key is in a mapping of terms (`env.rewards`, ...), which may have entries of any name."""
+  parts = key.split(".")
+  return len(parts) > 2 and parts[0] == "env" and parts[1] in OPTIONS
 
 
 def _check_option(group: str, option: Any, roots: Sequence[Path]) -> None:

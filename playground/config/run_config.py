@@ -17,7 +17,7 @@ if TYPE_CHECKING:
   from rich.tree import Tree
 
 SECTIONS = (
-  *("env", "agent", "randomization", "curriculum", "hardware", "tracking"),
+  *("env", "agent", "curriculum", "hardware", "tracking"),
   *("video", "checkpoint", "on_nonfinite", "profile"),
 )
 SCALARS = ("seed", "run_dir", "resume", "init_from")
@@ -42,7 +42,6 @@ class RunConfig:
   name: str
   env: Section
   agent: Section
-  randomization: Section
   curriculum: Section
   hardware: Section
   tracking: Section
@@ -60,18 +59,44 @@ class RunConfig:
   stages: tuple["RunConfig", ...] = ()
 
 
+def config_dict(values: Any) -> ConfigDict:
+  """Returns a ConfigDict whose keys keep their order, in which terms apply; ConfigDict itself sorts them."""
+  config = ConfigDict(sort_keys=False)
+  for key, value in values.items():
+    config[key] = config_dict(value) if isinstance(value, Mapping | ConfigDict) else value
+  return config
+
+
+def in_order_of(first: Any, values: Any) -> Any:
+  """`values` with the keys of `first` first, in their order there; mappings within likewise."""
+  if not isinstance(values, Mapping | ConfigDict) or not isinstance(first, Mapping | ConfigDict):
+    return values
+  names = [*(name for name in first if name in values), *(name for name in values if name not in first)]
+  return {name: in_order_of(first.get(name), values[name]) for name in names}
+
+
 def from_dict(resolved: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunConfig:
   """Rebuilds a configuration from its `resolved` dict, e.g. a run directory's config.yaml.
 
   Raises:
-    ConfigError: a part is missing, so this is not a run's configuration.
+    ConfigError: a part is missing or no such part, so this is not a run's configuration.
   """
   resolved = dict(resolved)
+  if "randomization" in resolved:
+    raise ConfigError(
+      "This configuration is of version 0.1, whose tasks had env.reward and randomization.terms: use that version, or "
+      "train anew."
+    )
   if missing := [key for key in ("name", "choices", *SECTIONS, *SCALARS) if key not in resolved]:
     raise ConfigError(f"This is not the configuration of a run: it lacks {', '.join(missing)}.")
+  kinds = {"name": str, **dict.fromkeys(("choices", *SECTIONS), Mapping)}
+  wrong = [key for key, kind in kinds.items() if not isinstance(resolved[key], kind)]
+  wrong += [] if wrong or isinstance(resolved["choices"].get("env"), str) else ["choices.env"]
+  if wrong:
+    raise ConfigError(f"This is not the configuration of a run: its {wrong[0]} has the wrong type.")
   return RunConfig(
     name=resolved["name"],
-    **{key: ConfigDict(resolved[key]) for key in SECTIONS},
+    **{key: config_dict(resolved[key]) for key in SECTIONS},
     **{key: resolved[key] for key in SCALARS},
     choices=dict(resolved["choices"]),
     overrides=tuple(overrides),

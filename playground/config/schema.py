@@ -1,17 +1,23 @@
 """Keys that exist and the types of their values. The schema is a nested dict of default values."""
 
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from playground.config.files import DELTAS
+from playground.config.moved import check_not_moved
 from playground.config.text import format_value, join, nearest_in
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.mdp.options import OPTIONS, keys
 
+_MAY_BE_NULL = ("env.robot.pd", "env.reward_clip")  # mappings and lists that null switches off
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", list: "a list"}
 
 
 def check_key(key: str, schema: Mapping[str, Any]) -> None:
   """Raises UnknownNameError, with what is there instead, if the schema has no such dotted key."""
+  if is_open(key.split("."), schema):
+    return
   node: Any = schema
   parts = key.split(".")
   for i, part in enumerate(parts):
@@ -20,7 +26,29 @@ def check_key(key: str, schema: Mapping[str, Any]) -> None:
     elif isinstance(node, Mapping) and part in node:
       node = node[part]
     else:
+      check_not_moved(key)
       raise _unknown_key(key, ".".join(parts[:i]), part, node, schema)
+
+
+def is_open(parts: Sequence[str], schema: Mapping[str, Any]) -> bool:
+  """Whether a key is in a mapping of terms (`env.rewards`, ...), which may have entries of any name.
+
+  Raises:
+    UnknownNameError: a term has no such key.
+  """
+  if len(parts) < 3 or parts[0] != "env" or parts[1] not in OPTIONS or parts[1] not in schema.get("env", {}):
+    return False
+  name = 3 if parts[1] == "observations" else 2  # observations are in groups
+  if len(parts) > name + 1 and parts[name + 1] not in keys(parts[1]):
+    near = nearest(parts[name + 1], keys(parts[1]))
+    has = f"a term of env.{parts[1]} has {', '.join(keys(parts[1]))}"
+    raise UnknownNameError(f"{'.'.join(parts)} does not exist: {has}.{near}")
+  return True
+
+
+def is_terms(key: str) -> bool:
+  """Whether a key is that of a mapping of terms: `env.rewards`, ..."""
+  return key.startswith("env.") and key[4:] in OPTIONS
 
 
 def fit(value: Any, default: Any, key: str = "") -> Any:
@@ -36,6 +64,10 @@ def fit(value: Any, default: Any, key: str = "") -> Any:
     ConfigError: it has another type.
     UnknownNameError: it has a key that the default has not.
   """
+  if is_terms(key):
+    return _fit_terms(value, key)
+  if value is None and key in _MAY_BE_NULL:
+    return None
   if isinstance(default, Mapping) and default:
     return _fit_mapping(value, default, key)
   if isinstance(default, list) and isinstance(value, list):
@@ -45,9 +77,10 @@ def fit(value: Any, default: Any, key: str = "") -> Any:
       raise wrong_type(key, value, "a single value, a list or null")
     return value
   if not _fits(value, default):
-    kind = _KINDS.get(type(default), "a mapping")
-    raise wrong_type(key, value, f"{kind}, as its default {format_value(default)} is")
-  return type(default)(value) if isinstance(default, int | float) else value
+    allowed = _KINDS.get(type(default), "a mapping")
+    raise wrong_type(key, value, f"{allowed}, as its default {format_value(default)} is")
+  kind: Any = type(default)
+  return kind(value) if isinstance(default, int | float) else value
 
 
 def wrong_type(key: str, value: Any, allowed: str) -> ConfigError:
@@ -60,7 +93,31 @@ def _fits(value: Any, default: Any) -> bool:
     return isinstance(value, type(default))
   if not isinstance(value, int | float) or isinstance(value, bool) or value != value:  # NaN fits nothing
     return False
-  return isinstance(default, float) or float(value).is_integer()
+  if isinstance(value, int):
+    return abs(value) <= sys.float_info.max
+  return isinstance(default, float) or value.is_integer()
+
+
+def _fit_terms(value: Any, key: str) -> Any:
+  """A mapping of terms as it is: what its entries need, the task checks when it binds them."""
+  if not isinstance(value, Mapping):
+    raise wrong_type(key, value, "a mapping of terms by name")
+  for name, entry in value.items():
+    if entry is not None and not isinstance(entry, Mapping):
+      group = key == "env.observations"
+      raise wrong_type(join(key, name), entry, "a mapping of terms by name" if group else "a mapping or null")
+    if key == "env.observations":
+      _fit_terms(entry or {}, join(key, name))
+    else:
+      _check_mappings(entry or {}, join(key, name))
+  return dict(value)
+
+
+def _check_mappings(entry: Mapping[str, Any], key: str) -> None:
+  """Raises ConfigError where a field of a term that holds keys is something else."""
+  for name in ("params", "when", "noise"):
+    if entry.get(name) is not None and not isinstance(entry[name], Mapping):
+      raise wrong_type(join(key, name), entry[name], "a mapping or null")
 
 
 def _fit_mapping(value: Any, default: Mapping[str, Any], key: str) -> dict[str, Any]:

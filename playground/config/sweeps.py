@@ -33,7 +33,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from playground.config.files import config_roots, groups, listed_options, shipped
-from playground.config.overrides import is_hydras, is_of_sweep, parse, parse_with_hydra
+from playground.config.overrides import is_hydras, is_of_command, is_of_sweep, parse, parse_with_hydra
 from playground.config.text import first_line, format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
 
@@ -74,8 +74,8 @@ def listed_jobs(overrides: Sequence[str], config_dir: Path | None = None) -> lis
     for text in _read(str(override.value()))[1]:
       parsed = [parse_with_hydra(part) for part in shlex.split(text)]
       lines = _checked([o for o in parsed if o.key_or_group not in keys], config_roots(config_dir))
-      if settings := split(lines)[0]:
-        raise ConfigError(f"{override.input_line}: {settings[0]} in its job {text!r} is of the whole sweep.")
+      if whole := [*split(lines)[0], *filter(is_of_command, lines)]:
+        raise ConfigError(f"{override.input_line}: {whole[0]} in its job {text!r} is of the whole sweep.")
       found.append(lines)
   return found
 
@@ -106,6 +106,30 @@ def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
       raise ConfigError(f"{line}: -m does not use Hydra's launchers and sweepers, launcher=<name> is ours.")
     (settings if is_of_sweep(key) else ours).append(line)
   return settings, ours
+
+
+def command_lines(overrides: Sequence[str], config_dir: Path | None = None) -> list[str]:
+  """What `-m` is given that each job's command gets and the sweep's folder does not keep (`is_of_command`).
+
+  Raises:
+    ConfigError: as `expand`, and for several values.
+  """
+  lines = [line for line in expand(overrides, config_dir) if is_of_command(line)]
+  for line in lines:
+    if parse_with_hydra(line).is_sweep_override():
+      raise ConfigError(f"{line}: all jobs of a sweep have the same one.")
+  return lines
+
+
+def check_saved_job(name: str, overrides: Iterable[str]) -> None:
+  """Checks a job that was read from a sweep's folder, which may be somebody else's, before it is run.
+
+  Raises:
+    ConfigError: an override that says where the job writes, or that only a command line can say.
+  """
+  for text in overrides:
+    if is_of_command(text) or split([text])[0]:
+      raise ConfigError(f"Job {name} in sweep.yaml says {text}, which only a command line can: start the sweep anew.")
 
 
 def combinations(*sets: Sequence[str]) -> list[list[str]]:

@@ -1,5 +1,6 @@
 """Values and errors in the words of the command line."""
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -13,6 +14,15 @@ def format_value(value: Any) -> str:
   if isinstance(value, Mapping):
     return "{" + ", ".join(f"{k}: {format_value(v)}" for k, v in value.items()) + "}"
   return f"[{', '.join(map(format_value, value))}]" if isinstance(value, list | tuple) else str(value)
+
+
+def quoted(value: object) -> str:
+  """A value for Hydra's command line, whatever characters it has.
+
+  Hydra takes a backslash for one unless a quote follows; an interpolation has to be escaped even inside quotes.
+  """
+  text = re.sub(r"(\\*)('|$)", lambda match: match[1] * 2 + match[2].replace("'", "\\'"), str(value))
+  return "'" + text.replace("${", "\\${") + "'"
 
 
 def first_line(error: Exception) -> str:

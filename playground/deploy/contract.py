@@ -1,18 +1,21 @@
 """What a controller must know to run a policy: `policy.yaml`."""
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from playground.config import format_value
 from playground.deploy.graph import OUTPUT, input_names
-from playground.deploy.parts import describe_part
 from playground.envs.base import PIXELS, Env, State
+from playground.errors import CheckpointError
+from playground.mdp.options import OPTIONS
 from playground.runs.files import plain
 
-FORMAT = "playground-policy/2"
+FORMAT = "playground-policy/3"
 
 _VALUES = {
   "rgb": "red, green and blue, 0 to 255",
@@ -20,7 +23,6 @@ _VALUES = {
   "depth": "255 * min(1, distance / {farthest} m) along the optical axis, 0 where nothing is",
   "segmentation": "the number of the geom that is seen, counted from 1 in the order of the model, 0 where nothing is",
 }
-_HISTORY = "_history"
 _CONSTANT_BASES = ("default_pose", "home", "zero")
 _FAR = 1e6  # an action beyond all limits
 
@@ -68,35 +70,120 @@ def describe_policy(
       "actions": "the mode of the trained distribution, in [-1, 1]",
     },
     "rate_hz": 1 / decision,
-    "observation": [part for entry in vectors for part in _observation(env, env_config, entry)],
+    "observation": [term for entry in vectors for term in _observation(env, entry)],
     "cameras": [_camera(env, entry) for entry in pictures if entry == f"{PIXELS}{env.config.vision.camera}"],
-    "frames": env_config.get("frames", 1),
-    "history": env_config.get("history", {}),
+    "frames": env_config.get("observation_frames", 1),
     "delays": dict(_delays(env_config)),
     "action": _action(env, env_config, state),
     "actuators": _actuators(env.mj_model, _home(env.mj_model, env_config)),
     "joints": [env.mj_model.joint(i).name or "(free)" for i in range(env.mj_model.njnt)],
-    **{key: env_config[key] for key in ("command", "gait") if key in env_config},
+    **_commands(env_config),
     "env": env_config,
   }
   return plain(contract)
 
 
-def _observation(env: Env, config: Mapping[str, Any], entry: str) -> list[dict[str, Any]]:
-  """Each part in its order: where it begins, its length, the factor and the noise on it, what it is, in which frame."""
-  slips = config.get("parity_obs", {}) if config["parity"] else {}
-  noise, scales = config.get("noise", {}), config.get("obs_scales", {})
-  parts, start = [], 0
-  for name, size in env.observation_parts.get(entry, {}).items():
-    base = name.removesuffix(_HISTORY)
-    part: dict[str, Any] = {"part": name, "start": start, "size": size, "scale": scales.get(base, 1.0)}
-    if base in noise.get("scales", {}):
-      part["noise"] = (noise["level"] * np.asarray(noise["scales"][base])).tolist()
-    if said := describe_part(env, slips.get(base, base)):
-      part["what"] = said
-    parts.append(part)
+def check_contract(contract: Any) -> None:
+  """Checks what is read of a contract, which anybody may have written or changed: the types and what they must hold.
+
+  Raises:
+    CheckpointError: an entry that is missing or cannot be.
+  """
+  _check(contract, "task", lambda x: isinstance(x, str), "a task's name")
+  _check(contract, "env", lambda x: isinstance(x, Mapping) and _names(x), "a mapping")
+  _check(contract, "origin.steps", _counts, "a whole number")
+  scores = lambda x: isinstance(x, Mapping) and _names(x) and (not x or _counts(x.get("steps")))
+  _check(
+    contract, "origin.evaluation", lambda x: scores(x) and all(map(_is_number, x.values())), "{} or steps and scores"
+  )
+  _check(contract, "origin.impl", lambda x: x is None or isinstance(x, str), "text or null", optional=True)
+  _check(contract, "policy.sha256", lambda x: isinstance(x, str), "text", optional=True)
+  _check(contract, "policy.output", lambda x: isinstance(x, str), "text")
+  _check(contract, "policy.action_size", lambda x: _counts(x) and x > 0, "a whole number above 0")
+  _check(contract, "policy.inputs", lambda x: isinstance(x, list) and x, "a list")
+  for i, row in enumerate(contract["policy"]["inputs"]):
+    at = lambda key, holds, what: _check(row, key, holds, what, f"policy.inputs[{i}].")  # noqa: B023
+    at("name", lambda x: isinstance(x, str), "text")
+    at("entry", lambda x: isinstance(x, str), "text")
+    at("type", lambda x: x in ("float32", "uint8"), "float32 or uint8")
+    at("shape", lambda x: isinstance(x, list) and len(x) > 1 and all(map(_counts, x)) and x[0] == 1, "a shape [1, ...]")
+  ends = lambda x: isinstance(x, list) and len(x) == 3 and all(map(_is_number, x))
+  told = contract.get("command")
+  if told is not None:
+    _check(contract, "command.max", ends, "three numbers")
+    _check(contract, "command.min", lambda x: x is None or ends(x), "three numbers or null", optional=True)
+    if any(low > high for low, high in zip(told.get("min") or [], told["max"], strict=False)) or min(told["max"]) <= 0:
+      raise CheckpointError(f"command={format_value(told)} must have its minimum below its maximum.")
+
+
+def _check(node: Any, key: str, holds: Callable[[Any], Any], what: str, at: str = "", optional: bool = False) -> None:
+  """Raises CheckpointError unless the value of a dotted key is as it must be."""
+  parent, name = None, ""
+  for name in key.split("."):
+    parent, node = node, node.get(name) if isinstance(node, Mapping) else None
+  if optional and isinstance(parent, Mapping) and name not in parent:
+    return
+  if not isinstance(parent, Mapping) or name not in parent or not holds(node):
+    raise CheckpointError(f"{at}{key}={format_value(node)} must be {what}.")
+
+
+def _names(node: Mapping[Any, Any]) -> bool:
+  return all(isinstance(name, str) for name in node)
+
+
+def _counts(value: Any) -> bool:
+  return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+
+
+def _is_number(value: Any) -> bool:
+  return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _observation(env: Env, group: str) -> list[dict[str, Any]]:
+  """Each term of an observation group in its order: name, where it begins, its length, and what a controller must know.
+
+  `scale` multiplies the term; `noise` (with the noise level in it), `delay` and `history` are there where the task has
+  them; `what` is the first line of the docstring of the term's function.
+  """
+  observations = getattr(env.unwrapped, "observations", None)
+  bound = {term.name: term for term in observations.groups.get(group, ())} if observations else {}
+  rows, start = [], 0
+  for name, size in env.observation_parts.get(group, {}).items():
+    row: dict[str, Any] = {"name": name, "start": start, "size": size, "scale": 1.0}
+    if name in bound:
+      row |= _options(bound[name].options, env.config.noise_level)
+      row["what"] = first_docstring_line(bound[name].func)
+    elif bound:
+      row["what"] = "All terms above in the steps before, newest first."
+    rows.append({key: value for key, value in row.items() if value is not None})
     start += size
-  return parts
+  return rows
+
+
+def _options(options: Any, noise_level: float) -> dict[str, Any]:
+  """Scale, clip, noise, delay and history of an observation term; None where it has none."""
+  noise = options.noise and dict(options.noise)
+  for kind in {"uniform", "gaussian"} & set(noise or ()):
+    noise[kind] = (noise_level * np.asarray(noise[kind])).tolist()
+  return {
+    "scale": 1.0 if options.scale is None else options.scale,
+    "clip": options.clip,
+    "noise": noise,
+    "delay": options.delay,
+    "history": options.history if options.history > 1 else None,
+  }
+
+
+def first_docstring_line(func: Callable[..., Any]) -> str:
+  """The first line of a function's docstring; "" if it has none."""
+  return next(iter((func.__doc__ or "").strip().splitlines()), "")
+
+
+def _commands(config: Mapping[str, Any]) -> dict[str, Any]:
+  """Parameters of the commands `velocity` (as `command`) and `gait`, where the task has them."""
+  terms = config.get("commands") or {}
+  found = {key: (terms.get(name) or {}).get("params") for key, name in (("command", "velocity"), ("gait", "gait"))}
+  return {key: params for key, params in found.items() if params}
 
 
 def _camera(env: Env, entry: str) -> dict[str, Any]:
@@ -120,6 +207,8 @@ def _camera(env: Env, entry: str) -> dict[str, Any]:
 def _delays(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
   """The delays that the task simulates, by dotted key."""
   for key, value in config.items():
+    if key in OPTIONS:  # an observation term's delay is in its row
+      continue
     if isinstance(value, Mapping):
       yield from _delays(value, f"{prefix}{key}.")
     elif "delay" in f"{prefix}{key}":
@@ -127,10 +216,10 @@ def _delays(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _action(env: Env, config: Mapping[str, Any], state: State) -> dict[str, Any]:
-  """How an action becomes `ctrl`: base + scale * action, where the task's own `control` agrees that this is the law."""
+  """How an action becomes `ctrl`: base + scale * action, where the task's own `action_to_ctrl` agrees."""
   base = config.get("action_base", "last_target" if "action_scale" in config else "zero")
   scale = np.asarray(config.get("action_scale", 1.0))
-  control = lambda action: np.asarray(env.control(state, jnp.asarray(action)))
+  control = lambda action: np.asarray(env.action_to_ctrl(state, jnp.asarray(action)))
   held, size = control(np.zeros(env.action_size)), env.action_size
   low, high = (control(np.full(size, sign * _FAR)) for sign in (-1, 1))
   tried = np.linspace(-0.2, 0.3, size)

@@ -1,5 +1,6 @@
 """`playground export <run>`: writes `policy.onnx` and `policy.yaml`, if they compute what was trained."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   """
   console = console or Console()
   need("deploy", "onnx", "onnxruntime")
-  folder = Path(out).expanduser() if out else None
+  folder = Path(os.path.expanduser(out)) if out else None
   if folder:
     need_folder(folder, f"--out={out}")
   trained = load_exact(path)

@@ -8,7 +8,7 @@ from playground.learning.checkpoints import BEST, find_checkpoints, find_stages
 from playground.runs.trained import Trained
 
 # Keys of a run's config that give meaning to what an actor reads and gives; how many numbers that is, its arrays tell.
-_ENV = ("task", "robot", "hand", "obs", "obs_scales", "history", "frames", "vision", "parity", "parity_obs")
+_ENV = ("task", "robot", "observations", "observation_order", "observation_frames", "vision")
 _CONTROL = ("ctrl_dt", "action_repeat", "action_base", "action_scale", "clip_targets")
 _MEANING = {"env": (*_ENV, *_CONTROL), "agent": ("name", "network", "normalize_observations")}
 

@@ -10,12 +10,14 @@ from rich.console import Console
 from rich.table import Table
 
 from playground import config as configs
+from playground import registry
+from playground.config.text import first_line
 from playground.deploy.menu import Menu
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
-from playground.errors import ConfigError
+from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.extras import need
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
@@ -74,7 +76,7 @@ def play(
     need_display()
   if web:
     need("web", "viser", "mjviser")
-    from playground.deploy.web.server import need_port
+    from playground.deploy.web.gate import need_port
 
     need_port(host, port)
   opened = open_policy(path)
@@ -139,13 +141,44 @@ def open_policy(path: str) -> Opened:
   """
   if Path(path).suffix == ".onnx":
     exported = ExportedPolicy.load(path)
-    task = exported.contract["task"]
-    setup(this_machine(configs.compose([f"env={task}", "hardware=cpu"]).hardware))
-    return Opened(exported, load_on_c_physics(task, exported.contract["env"]), Path(path).expanduser().parent)
+    setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
+    return Opened(exported, _task_of(exported, path), Path(path).expanduser().parent)
   trained = load_exact(path)
   folder = trained.run_dir.path / "export"
   folder.mkdir(exist_ok=True)
   return Opened(export_policy(trained), trained.env, folder, trained)
+
+
+def _task_of(exported: ExportedPolicy, path: str) -> Env:
+  """The task that a policy's contract describes, on C MuJoCo, traced so that whatever cannot be comes out here.
+
+  Raises:
+    PlaygroundError: a value that cannot be, or a task that the policy does not fit.
+  """
+  contract = exported.contract
+  task, config, facts = contract["task"], contract["env"], contract["policy"]
+  if task in registry.names():  # another has no defaults without its robot
+    default = registry.config(task).to_dict()
+    default.pop("robot", None)  # another robot's description may hold other types
+    config = configs.saved_section("env", config, default)
+  try:
+    env = load_on_c_physics(task, config)
+    obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
+    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    theirs = {row["entry"]: (tuple(row["shape"][1:]), row["type"]) for row in facts["inputs"]}
+    ours = {name: (entry.shape, entry.dtype.name) for name, entry in entries.items() if name in theirs}
+    if theirs != ours or facts["action_size"] != env.action_size:
+      raise CheckpointError(
+        f"{path} does not fit the task that its contract describes: the policy reads {theirs} and gives "
+        f"{facts['action_size']} actions, the task has {ours} and takes {env.action_size}."
+      )
+    jax.eval_shape(make_evaluator(env, exported.act, 1, make_mesh(1)), {}, jax.random.PRNGKey(0), {})
+  except PlaygroundError:
+    raise
+  except Exception as error:  # of any kind: the file may say anything
+    reason = f"{type(error).__name__}: {first_line(error)}"
+    raise CheckpointError(f"{path}: the `env` of its contract makes no task ({reason}).") from error
+  return env
 
 
 def _menu(given: Path, trained: Trained, console: Console) -> Menu:

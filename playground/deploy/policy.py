@@ -10,12 +10,10 @@ import jax
 import numpy as np
 import yaml
 
-from playground.deploy.contract import FORMAT
+from playground.deploy.contract import FORMAT, check_contract
 from playground.envs.base import Observation
 from playground.errors import CheckpointError
 from playground.extras import need
-
-_READ = {"task", "origin", "policy", "env"}  # keys of the contract that are read here and by `playground play`
 
 
 class ExportedPolicy:
@@ -31,6 +29,7 @@ class ExportedPolicy:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # what is wrong with a model is said below
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
       self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
@@ -61,10 +60,14 @@ class ExportedPolicy:
     model = path.read_bytes()  # before its contract, which is written first: an export meanwhile is noticed
     try:
       contract = yaml.safe_load(path.with_suffix(".yaml").read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError):
+    except (yaml.YAMLError, ValueError, RecursionError):  # a date that is none, say
       contract = None
-    if not isinstance(contract, dict) or contract.get("format") != FORMAT or not set(contract) >= _READ:
+    if not isinstance(contract, dict) or contract.get("format") != FORMAT:
       raise CheckpointError(f"{path.with_suffix('.yaml')} is not a policy's contract ({FORMAT}): export the run again.")
+    try:
+      check_contract(contract)
+    except CheckpointError as error:
+      raise CheckpointError(f"{path.with_suffix('.yaml')} is not a policy's contract: {error}") from None
     try:
       return cls(model, contract)
     except CheckpointError as error:

@@ -3,10 +3,12 @@
 import queue
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from playground.config import config_dict
 from playground.deploy.menu import Menu
 from playground.deploy.player import Player
 from playground.deploy.policy import ExportedPolicy
@@ -15,6 +17,7 @@ from playground.envs.base import Env
 from playground.learning.checkpoints import BEST
 
 LATEST = "latest"
+_MOST_REQUESTS = 100  # that wait: whoever asks faster than the session acts is not heard
 
 
 class Session:
@@ -48,12 +51,13 @@ class Session:
     self.previous_qpos = np.asarray(self.player.state.data.qpos)
 
   def ask(self, request: Callable[[], None]) -> None:
-    """Has something done between two decisions."""
-    self._requests.put(request)
+    """Has something done between two decisions, unless many requests wait already."""
+    if self._requests.qsize() < _MOST_REQUESTS:
+      self._requests.put(request)
 
   def carry_out(self) -> None:
-    """Does what was asked for, up to the first that fails; raises PlaygroundError for that."""
-    while not self._requests.empty():
+    """Does what was asked for by now, up to the first that fails; raises PlaygroundError for that."""
+    for _ in range(self._requests.qsize()):
       self._requests.get()()
 
   def advance(self, seconds: float) -> None:
@@ -85,12 +89,20 @@ class Session:
   @property
   def terrain(self) -> str | None:
     """What the robot stands on, if the task lets that be chosen."""
-    return self.player.env.config.get("scene", {}).get("terrain")
+    scene = self.player.env.config.get("scene")
+    return scene.get("terrain") if hasattr(scene, "get") else None
+
+  @property
+  def push_speed(self) -> float:
+    """The largest `velocity` of the task's interval event whose name begins with push, m/s; 3 without one."""
+    events = self.player.env.config.get("events") or {}
+    pushes = [event for name, event in events.items() if name.startswith("push") and event and event.mode == "interval"]
+    return next((max(event.params.velocity) for event in pushes if "velocity" in (event.get("params") or {})), 3.0)
 
   def choose_terrain(self, name: str) -> None:
     """Builds the task on another terrain, which takes seconds; raises ConfigError if the task has none of it."""
     old = self.player
-    config = old.env.config.copy_and_resolve_references()
+    config: Any = config_dict(old.env.config)
     config.scene.terrain = name
     env = load_on_c_physics(old.exported.contract["task"], config)
     self.player = Player(env, old.exported, self._seed)

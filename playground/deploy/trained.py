@@ -7,10 +7,9 @@ from typing import Any
 
 import jax
 import numpy as np
-import pandas
-from ml_collections import ConfigDict
 
 from playground import registry
+from playground.config import config_dict
 from playground.deploy.contract import describe_policy
 from playground.deploy.graph import policy_graph
 from playground.deploy.policy import ExportedPolicy
@@ -19,6 +18,7 @@ from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_training
 from playground.extras import need
+from playground.runs.csv_tracker import read_metrics
 from playground.runs.trained import Trained, load_trained
 
 _EXACT = "highest"  # precision of matrix products: what the exported policy computes
@@ -81,9 +81,9 @@ def export_policy(trained: Trained, state: State | None = None) -> ExportedPolic
 
 def _newest_evaluation(trained: Trained) -> dict[str, float]:
   """`steps` and the scores of the last evaluation in the training run, {} if there was none."""
-  if not trained.run_dir.metrics_csv.is_file():
+  table = read_metrics(trained.run_dir.metrics_csv)
+  if "eval/episode_reward" not in table:
     return {}
-  table = pandas.read_csv(trained.run_dir.metrics_csv)
   evaluated = table[(table.step <= trained.checkpoint.step) & table["eval/episode_reward"].notna()]
   if not len(evaluated):
     return {}
@@ -98,6 +98,6 @@ def load_on_c_physics(task: str, config: Any) -> Env:
   Raises:
     ConfigError: it sees pictures, and MuJoCo-Warp, which renders them, is not installed.
   """
-  config = ConfigDict(config)
+  config = config_dict(config)
   config.impl = "warp" if sees(config) else "jax"  # whose model is the smallest to build; it is not simulated
   return on_c_physics(registry.load(task, config=config))

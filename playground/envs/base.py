@@ -1,4 +1,4 @@
-"""What a task is: a pure `reset` and `step` for one environment, and the three calls a step is made of."""
+"""What a task is: a pure `reset` and `step` for one environment, and the calls a step is made of."""
 
 import abc
 import copy
@@ -43,16 +43,22 @@ class State(struct.PyTreeNode):
 class Env(abc.ABC):
   """A task. Everything is for one environment; callers vmap (`playground.envs.wrappers`).
 
-  A step is three calls: `control` turns the action into `ctrl`, the physics advances, `evaluate` turns the new physics
-  into observation, reward, termination and bookkeeping. `evaluate` never touches physics, so it can be run on recorded
-  data. A disturbance that acts on the physics (a push) goes into `disturb`, called before them.
+  A step is: `pre_step` (events that act on the physics, pushes say), `action_to_ctrl`, the physics, `post_step`, which
+  turns the new physics into observation, reward, termination and the next `info`. `post_step` does not touch physics,
+  so it can be run on recorded data.
   """
 
   spec: mujoco.MjSpec | None = None  # the scene as it was composed, where a task keeps it: to draw it otherwise
   # How an episode's values of a metric become one number for the log: `sum` (unless named here), `mean`, `max` or
   # `last`. A success in any step is a `max`, one that must hold at the end a `last`, an error in metres a `mean`.
   summaries: ClassVar[Mapping[str, str]] = {}
-  derived: ClassVar[tuple[str, ...]] = DERIVED_FIELDS  # narrow it to what the task reads: what is not kept is not moved
+  # Fields of the physics that terms read, besides the simulator's state; the others are not stored.
+  derived: tuple[str, ...] = DERIVED_FIELDS
+  # Entries of `info` that belong to an episode: `AutoReset` sets them back to their values after reset. The others
+  # (random key, command, gait, times of pushes) outlast an auto-reset.
+  episode_info: ClassVar[tuple[str, ...]] = ()
+  # Whether `redraw` draws anything at the start of an episode that an auto-reset would not.
+  redraws: bool = False
 
   def __init__(self, config: Any, mj_model: mujoco.MjModel):
     """Sets the time step and puts the model on the device.
@@ -60,15 +66,13 @@ class Env(abc.ABC):
     Args:
       config: the task's ConfigDict: `ctrl_dt`, `sim_dt` in seconds, `episode_length` in control steps, `action_repeat`,
         `impl` (auto, jax, warp), `cuda_impl` (what auto means on an NVIDIA GPU), `naconmax_per_env`,
-        `naccdmax_per_env`, `njmax` (Warp's buffer sizes, see `Physics`) and `parity` (reproduce playground 0.2.0,
-        quirks included).
+        `naccdmax_per_env` and `njmax` (Warp's buffer sizes, see `Physics`).
       mj_model: the compiled model.
 
     Raises:
       ConfigError: the control step is not a multiple of the physics step, or the backend is unknown.
     """
     self.config = config
-    self.parity: bool = config.parity
     self.dt: float = config.ctrl_dt
     self.sim_dt: float = config.sim_dt
     self.n_substeps = round(self.dt / self.sim_dt)
@@ -93,23 +97,33 @@ class Env(abc.ABC):
     """Starts an episode from one random key, on `model` if given (a randomised one), else on the task's own."""
 
   @abc.abstractmethod
-  def control(self, state: State, action: jax.Array) -> jax.Array:
+  def action_to_ctrl(self, state: State, action: jax.Array) -> jax.Array:
     """Returns the actuators' `ctrl` (shape [nu]) for an action (shape [action_size])."""
 
   @abc.abstractmethod
-  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     """Returns the state after a step, from the physics after it, the info before it and the action that was applied."""
 
-  def disturb(self, state: State) -> State:
-    """Acts on the physics from outside before the step (kicks, pushes); by default nothing."""
+  def pre_step(self, state: State) -> State:
+    """Acts on the physics from outside before the step (pushes); by default nothing."""
     return state
 
   def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
     """Advances one control step of `dt` seconds."""
-    state = self.disturb(state)
-    ctrl = self.control(state, action)
-    data = self.physics.step(self.mjx_model if model is None else model, state.data, ctrl, self.n_substeps)
-    return self.evaluate(data, state.info, action)
+    state = self.pre_step(state)
+    ctrl = self.action_to_ctrl(state, action)
+    data = self.physics.step(self.model_of(state.info, model), state.data, ctrl, self.n_substeps)
+    return self.post_step(data, state.info, action)
+
+  def model_of(self, info: Mapping[str, Any], model: mjx.Model | None) -> mjx.Model:
+    """Returns the model that a step simulates: `model` if given (a randomised one), else the task's own."""
+    del info
+    return self.mjx_model if model is None else model
+
+  def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
+    """Returns `info` with what a new episode draws, for an auto-reset, which starts it from a stored state."""
+    del key
+    return info
 
   @property
   def mjx_model(self) -> mjx.Model:

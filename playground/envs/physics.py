@@ -129,7 +129,7 @@ class Physics:
     self.impl = impl
     self.derived = derived
     self._forward = mjx.forward if impl == "warp" else jax.jit(mjx.forward)  # most of all tracing: done once
-    self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, impl=impl)
+    self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, _device(), impl=impl)
     self._naconmax_per_env = naconmax_per_env
     self._naccdmax_per_env = naccdmax_per_env
     self._njmax = njmax
@@ -187,11 +187,12 @@ class Physics:
 
   def _template(self) -> mjx.Data:
     if self.impl == "jax":
-      return mjx.make_data(self.mj_model, impl="jax")
+      return mjx.make_data(self.mj_model, _device(), impl="jax")
     worlds = max(_batch_size(), _FEW)
     shared = lambda each: None if each is None else each * worlds
     return mjx.make_data(
       self.mj_model,
+      _device(),
       impl="warp",
       naconmax=shared(self._naconmax_per_env),
       naccdmax=shared(self._naccdmax_per_env),
@@ -205,6 +206,11 @@ class Physics:
     derived = self.derived if derived is None else derived
     kept = {name: getattr(data, name) for name in (*STATE_FIELDS, *derived)}
     return PhysicsData(**kept, buffers=_buffer_use(data) if self.impl == "warp" else None)
+
+
+def _device() -> Any:
+  """The device that MJX puts models and data on: one of this process, for MJX's own default is one of process 0."""
+  return jax.local_devices()[0]
 
 
 def _batch_size() -> int:
@@ -221,7 +227,7 @@ def _put_on_warp(mj_model: mujoco.MjModel) -> mjx.Model:
   are too small are in `PhysicsData.buffers`, which the trainers count.
   """
   quiet_warp()
-  model = mjx.put_model(mj_model, impl="warp")
+  model = mjx.put_model(mj_model, _device(), impl="warp")
   return model.tree_replace({"opt._impl.warn_overflow": 0})  # pyright: ignore[reportReturnType]
 
 

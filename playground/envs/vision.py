@@ -1,4 +1,4 @@
-"""What a camera sees, as an observation of any task."""
+"""Camera images as an observation of any task."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,12 +22,10 @@ class Vision(Wrapper):
   """Adds the observation `pixels/<camera>` to a task's own: uint8 [height, width, channels].
 
   Which of them an agent reads is its own choice (`agent.network.policy_obs_key`). Like the task it is for one
-  environment. A picture shows the state that it comes with. With `frames` above 1 the last ones lie behind each other,
-  the newest last; the past is read out of the last observation, so it begins anew with every episode: before an
-  episode's first picture there were only pictures like it. Brightness, a factor on all pixels, is drawn for every
-  episode; an auto-reset, which brings the first observation back, brings back that one's brightness for this step.
-
-  `env.parity=true` keeps what Playground 0.2.0 lets pass from one episode to the next: frames, and brightness for ever.
+  environment. An image shows the state that it comes with. With `frames` above 1 the last ones lie behind each other,
+  the newest last; the past is read out of the last observation, so an episode's frames are all of that episode: before
+  its first image there were only images like it. Brightness, a factor on all pixels, is drawn for every episode; an
+  auto-reset, which restores the first observation, restores that one's brightness for this step.
   """
 
   jitted, observation_size = Env.jitted, Env.observation_size
@@ -36,7 +34,7 @@ class Vision(Wrapper):
     """`env`: a task whose config has `vision`, see `configs/config.yaml`.
 
     Raises:
-      ConfigError: no camera, one that does not exist, or settings that cannot be.
+      ConfigError: no camera, one that does not exist, or invalid settings.
     """
     super().__init__(env)
     config = env.config.vision
@@ -53,12 +51,15 @@ class Vision(Wrapper):
       raise ConfigError(f"env.vision.brightness={list(brightness)}: geoms have no brightness, leave it [1.0, 1.0].")
     self._image, self._camera, self._farthest = config.image, config.camera, config.farthest
     self._frames, self._brightness = config.frames, brightness
-    self._leaks: bool = env.parity and self._frames > 1
     self._warp_model = env.mjx_model  # to be rendered, wherever the task is simulated later (`c_physics.py`)
     size = {"width": config.width, "height": config.height}
     kind = "rgb" if self._image in ("rgb", "gray") else self._image
     looks = {"shadows": config.shadows, "textures": config.textures}
     self._renderer = BatchRenderer(env.physics, View((config.camera,), kinds=(kind,), **size, **looks))
+
+  @property
+  def episode_info(self) -> tuple[str, ...]:
+    return (*self.env.episode_info, "vision_first_step")
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:
@@ -70,24 +71,20 @@ class Vision(Wrapper):
     info = state.info
     if self._varies:
       key, draw = jax.random.split(jax.random.fold_in(rng, 1))  # leaves the task its own draws
-      info = info | {"vision_rng": key, "brightness": self._draw(draw)}
-    frame, data = self._look(state.data, info, model)
-    frames = jnp.tile(frame, self._frames)
-    if self._leaks:
-      info = info | {"vision_frames": frames}
-    return self._with(state.replace(data=data, info=info), frames)
+      info = info | {"vision_rng": key, "brightness": self._draw(draw), "vision_first_step": jnp.ones((), bool)}
+    frame, data = self._render(state.data, info, model)
+    return self._with(state.replace(data=data, info=info), jnp.tile(frame, self._frames))
 
   def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
-    if self._varies and not self.env.parity:
+    if self._varies:
       key, draw = jax.random.split(state.info["vision_rng"])
-      brightness = jnp.where(state.data.time == 0, self._draw(draw), state.info["brightness"])
-      state = state.replace(info=state.info | {"vision_rng": key, "brightness": brightness})
+      brightness = jnp.where(state.info["vision_first_step"], self._draw(draw), state.info["brightness"])
+      info = {"vision_rng": key, "brightness": brightness, "vision_first_step": jnp.zeros((), bool)}
+      state = state.replace(info=state.info | info)
     after = self.env.step(state, action, model)
-    frame, data = self._look(after.data, after.info, model)
-    past = state.info["vision_frames"] if self._leaks else state.obs[PIXELS + self._camera]
-    frames = jnp.concatenate([past[..., frame.shape[-1] :], frame], axis=-1)
-    info = after.info | ({"vision_frames": frames} if self._leaks else {})
-    return self._with(after.replace(data=data, info=info), frames)
+    frame, data = self._render(after.data, after.info, model)
+    frames = jnp.concatenate([state.obs[PIXELS + self._camera][..., frame.shape[-1] :], frame], axis=-1)
+    return self._with(after.replace(data=data), frames)
 
   @property
   def _varies(self) -> bool:
@@ -96,10 +93,13 @@ class Vision(Wrapper):
   def _draw(self, key: jax.Array) -> jax.Array:
     return jax.random.uniform(key, minval=self._brightness[0], maxval=self._brightness[1])
 
-  def _look(self, data: PhysicsData, info: Mapping[str, Any], model: mjx.Model | None) -> tuple[jax.Array, PhysicsData]:
-    """The picture of now, [height, width, channels] uint8, and the state to go on with."""
-    pictures, data = self._renderer.render(self._warp_model if model is None else model, data)
-    seen = pictures[self._camera]
+  def _render(
+    self, data: PhysicsData, info: Mapping[str, Any], model: mjx.Model | None
+  ) -> tuple[jax.Array, PhysicsData]:
+    """Renders the present image, [height, width, channels] uint8; returns also the state to go on with."""
+    shown: Any = self.env.model_of(info, self._warp_model if model is None else model)
+    images, data = self._renderer.render(shown, data)
+    seen = images[self._camera]
     if self._image == "depth":
       frame = 255 * jnp.minimum(seen["depth"][..., None] / self._farthest, 1.0)
     elif self._image == "segmentation":
@@ -113,6 +113,6 @@ class Vision(Wrapper):
     return (frame if frame.dtype == jnp.uint8 else jnp.round(frame).astype(jnp.uint8)), data
 
   def _with(self, state: State, frames: jax.Array) -> State:
-    """The state with the pictures in its observation."""
+    """The state with the images in its observation."""
     own = state.obs if isinstance(state.obs, Mapping) else {"state": state.obs}
     return state.replace(obs={**own, PIXELS + self._camera: frames})

@@ -26,6 +26,7 @@ import mujoco
 
 from playground.collector import uncollected
 from playground.envs.backend import auto_impl, sees
+from playground.interpreter import PYTHON
 
 LIMIT_S = 900.0  # for a machine with few cores; a process that takes longer hangs
 _NEEDS = ("warp", "mujoco.mjx.warp.ffi", "mujoco.mjx.third_party.mujoco_warp")
@@ -57,7 +58,7 @@ def dismiss() -> None:
 
 
 def _start() -> subprocess.Popen[str]:
-  command = [sys.executable, "-W", "ignore", "-m", __name__]
+  command = [*PYTHON, "-W", "ignore", "-m", __name__]
   pipe = subprocess.PIPE
   return subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe, text=True)
 

@@ -18,6 +18,7 @@ ModelFields = Mapping[str, jax.Array]
 EPISODE_KEYS = ("steps", "truncation", "episode_done", "episode_metrics")
 PREFIX = "AutoResetWrapper_"
 PRESERVE_INFO = PREFIX + "preserve_info"  # what a task puts here survives a full reset (a curriculum's level, say)
+FINAL_OBS = "final_obs"
 MAX_VALUE = 1e10  # MuJoCo's own limit for positions and velocities (mjMAXVAL)
 MAX_VELOCITY = 1e3  # m/s, rad/s: no robot moves so, and one such state among millions ruins a critic and its optimiser
 
@@ -72,21 +73,21 @@ class FiniteGuard(Wrapper):
 
   Such a step gives done = 1, reward 0, the previous observation, metrics 0 and the previous info; `info["nonfinite"]`
   is 1 for it, and `info["nonfinite_state"]` holds the simulator's state as it came out of the step.
+
+  An episode whose reset gave such numbers observes zeros at first (`info["nonfinite_reset"]` is 1), and its first step
+  counts as one of these.
   """
 
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
     state = self.env.reset(rng, model)
-    info = {"nonfinite": jnp.zeros_like(state.done), "nonfinite_state": start_of(state)}
-    return state.replace(info=state.info | info)
+    bad = ~_is_finite(state)
+    info = {"nonfinite": jnp.zeros_like(state.done), "nonfinite_state": start_of(state), "nonfinite_reset": bad}
+    obs = where_done(bad, jax.tree.map(jnp.zeros_like, state.obs), state.obs)
+    return state.replace(obs=obs, info=state.info | info)
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
     after = self.env.step(state, action, model)
-    finite = jnp.ones_like(after.done, bool)
-    for watched, limit in ((after.data.qvel, MAX_VELOCITY), ((after.data.qpos, after.reward, after.obs), MAX_VALUE)):
-      for leaf in jax.tree.leaves(watched):
-        if jnp.issubdtype(leaf.dtype, jnp.floating):
-          finite &= (jnp.abs(leaf) <= limit).all(axis=tuple(range(1, leaf.ndim)))  # false for NaN, too
-    bad = ~finite
+    bad = ~_is_finite(after) | state.info["nonfinite_reset"]
     zeros = jax.tree.map(jnp.zeros_like, (after.reward, after.metrics))
     reward, metrics = where_done(bad, zeros, (after.reward, after.metrics))
     obs, info = where_done(bad, (state.obs, state.info), (after.obs, after.info))
@@ -99,6 +100,16 @@ class FiniteGuard(Wrapper):
       done=jnp.where(bad, 1.0, after.done),
       info=info | {"nonfinite": bad.astype(after.done.dtype), "nonfinite_state": start_of(after)},
     )
+
+
+def _is_finite(state: State) -> jax.Array:
+  """Whether each environment's numbers are finite and within the guard's limits, [N]."""
+  finite = jnp.ones_like(state.done, bool)
+  for watched, limit in ((state.data.qvel, MAX_VELOCITY), ((state.data.qpos, state.reward, state.obs), MAX_VALUE)):
+    for leaf in jax.tree.leaves(watched):
+      if jnp.issubdtype(leaf.dtype, jnp.floating):
+        finite &= (jnp.abs(leaf) <= limit).all(axis=tuple(range(1, leaf.ndim)))  # false for NaN, too
+  return finite
 
 
 # One more value of an episode: (so far, new, how many with it) -> so far.
@@ -114,7 +125,8 @@ class Episode(Wrapper):
   """Ends episodes after `length` control steps and repeats each action.
 
   `info["episode_metrics"]` holds the episode's `sum_reward`, `length` and, of each metric, the sum over its decisions
-  or what the task's `summaries` says; a step that is not finite counts in sums only, with 0.
+  or what the task's `summaries` says; a step that is not finite counts in sums only, with 0. A decision has the metrics
+  of its last repeat, those that are a `max` of all repeats until the episode ends.
 
   A time-out gives done = 1 with `info["truncation"]` = 1, kept apart from the task's own termination. With repeats an
   episode that terminates in an earlier one stays done and earns nothing in the later ones.
@@ -133,11 +145,12 @@ class Episode(Wrapper):
     return state.replace(info=state.info | info)
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    def repeat(carry: tuple[State, jax.Array, jax.Array, BufferUse | None], _: None) -> tuple[Any, None]:
-      state, reward, done, used = carry
+    def repeat(carry: tuple[State, jax.Array, jax.Array, Any, BufferUse | None], _: None) -> tuple[Any, None]:
+      state, reward, done, most, used = carry
       state = self.env.step(state, action, model)
       used = None if used is None else used.join(state.data.buffers)
-      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done), used), None
+      most = {k: jnp.where(done > 0, old, jnp.maximum(old, state.metrics[k])) for k, old in most.items()}
+      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done), most, used), None
 
     was_done = state.info["episode_done"]
     if self.repeat == 1:
@@ -145,9 +158,10 @@ class Episode(Wrapper):
       reward, ended = after.reward, after.done
     else:
       unused = jax.tree.map(jnp.zeros_like, state.data.buffers)
-      start = (state, jnp.zeros_like(state.reward), jnp.zeros_like(state.done), unused)
-      (after, reward, ended, used), _ = jax.lax.scan(repeat, start, None, self.repeat)
-      after = after.replace(data=after.data.replace(buffers=used))
+      least = {k: jnp.full_like(state.metrics[k], -jnp.inf) for k, kind in self.env.summaries.items() if kind == "max"}
+      start = (state, jnp.zeros_like(state.reward), jnp.zeros_like(state.done), least, unused)
+      (after, reward, ended, most, used), _ = jax.lax.scan(repeat, start, None, self.repeat)
+      after = after.replace(data=after.data.replace(buffers=used), metrics=after.metrics | most)
 
     steps = state.info["steps"] + self.repeat
     timed_out = steps >= self.length
@@ -169,15 +183,19 @@ class Episode(Wrapper):
 class AutoReset(Wrapper):
   """Starts the next episode in the step that ends one: done = 1 comes with the next episode's first observation.
 
-  By default an episode starts again from the environment's state of the last outer `reset`, of which only the
-  simulator's state and the observation are kept (not the derived fields, which the next step writes anyway), and the
-  task's `info` goes on. With `full_reset` it starts from a fresh `reset`, `info` included, except what the task put
-  under `info["AutoResetWrapper_preserve_info"]`.
+  By default an episode starts again from the environment's state of the last outer `reset`, of which the simulator's
+  state, the observation and the entries `env.episode_info` of `info` are stored (not the derived fields, which the next
+  step writes anyway); the other entries of `info` go on. With `full_reset` it starts from a new `reset`, `info`
+  included, except what the task put under `info["AutoResetWrapper_preserve_info"]`.
+
+  With `keep_final_obs` `info["final_obs"]` is the observation that the step itself made: where done = 1 the last one of
+  the episode, else `obs`.
   """
 
-  def __init__(self, env: Any, full_reset: bool = False):
+  def __init__(self, env: Any, full_reset: bool = False, keep_final_obs: bool = False):
     super().__init__(env)
     self.full_reset = full_reset
+    self.keep_final_obs = keep_final_obs
 
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
     keys = jax.vmap(jax.random.split)(rng)
@@ -186,23 +204,35 @@ class AutoReset(Wrapper):
     if not self.full_reset:
       own[PREFIX + "first_data"] = start_of(state)
       own[PREFIX + "first_obs"] = state.obs
-    return state.replace(info=state.info | own)
+      own[PREFIX + "first_info"] = {k: state.info[k] for k in self.env.episode_info if k in state.info}
+    final = {FINAL_OBS: state.obs} if self.keep_final_obs else {}
+    return state.replace(info=state.info | own | final)
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
     own = {k: v for k, v in state.info.items() if k.startswith(PREFIX) and k != PRESERVE_INFO}
-    info = {k: v for k, v in state.info.items() if k not in own}
+    info = {k: v for k, v in state.info.items() if k not in own and k != FINAL_OBS}
     info["steps"] = jnp.where(state.done > 0, 0.0, info["steps"])
     after = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action, model)
     own[PREFIX + "done_count"] += after.done.astype(jnp.int32)
-    if self.full_reset:
+    own |= {FINAL_OBS: after.obs} if self.keep_final_obs else {}
+    redraws = self.env.unwrapped.redraws
+    if self.full_reset or redraws:
       keys = jax.vmap(jax.random.split)(own[PREFIX + "rng"])
       own[PREFIX + "rng"] = keys[:, 0]
+    if self.full_reset:
       # A reset costs a forward pass over the whole batch: skip it in the steps in which nobody is done.
       after = jax.lax.cond(after.done.any(), self._restart, lambda s, *_: s, after, keys[:, 1], model)
     else:
       data = after.data.replace(**where_done(after.done, own[PREFIX + "first_data"], start_of(after)))
-      after = after.replace(data=data, obs=where_done(after.done, own[PREFIX + "first_obs"], after.obs))
+      first = own[PREFIX + "first_info"]
+      info = after.info | where_done(after.done, first, {name: after.info[name] for name in first})
+      if redraws:
+        info = jax.lax.cond(after.done.any(), self._redraw, lambda _, info, __: info, after.done, info, keys[:, 1])
+      after = after.replace(data=data, obs=where_done(after.done, own[PREFIX + "first_obs"], after.obs), info=info)
     return after.replace(info=after.info | own)
+
+  def _redraw(self, done: jax.Array, info: dict[str, Any], keys: jax.Array) -> dict[str, Any]:
+    return where_done(done, jax.vmap(self.env.unwrapped.redraw)(info, keys), info)
 
   def _restart(self, after: State, keys: jax.Array, model: ModelFields | None) -> State:
     fresh = self.env.reset(keys, model)

@@ -1,10 +1,15 @@
-"""One training over several machines: how its processes find each other, agree, and prove that they can talk.
+"""One training over several machines: its processes find each other, agree, and end together.
 
 Every machine runs the same command; process 0 writes the run directory, the others only compute.
+
+A process that is lost must end all others, which wait for it in an exchange. JAX aborts them with a stack trace, or
+lets them wait, so a watch of ours comes before it (`_Watch`).
 """
 
+import atexit
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import socket
@@ -12,15 +17,22 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
 
 from playground.errors import ConfigError, HardwareError, PlaygroundError
 
-PREFLIGHT = "preflight"  # name of the thread that may hang
+PREFLIGHT = "preflight"  # name of the threads that may hang
+_STORE = "playground"  # our folder in the coordinator's key-value store
+_WEEK_MS = 7 * 24 * 3600 * 1000  # longer than processes wait for each other; JAX wants a limit
+_PERIOD_S = 1.0  # between two signs of life
+_WATCH = f"{_STORE}/watch"
+_FAILED = f"{_WATCH}/failed"  # why a process ends
+_LEFT = "left"  # the last sign of life of a process that ends well
+_numbers = itertools.count()  # of the barriers and shared texts: the same in all processes
 
 
 def is_main() -> bool:
@@ -39,7 +51,26 @@ def agree(flag: bool) -> bool:
     return flag
   from jax.experimental import multihost_utils
 
+  wait_for_all()  # Gloo waits for half a minute only, and process 0 may still be writing
   return bool(multihost_utils.process_allgather(np.asarray(flag)).any())
+
+
+def wait_for_all() -> None:
+  """Returns when every process has called it, however long that takes."""
+  if _watch is not None:
+    barrier, client = f"{_STORE}/{next(_numbers)}", _watch.client
+    _within(lambda: client.wait_at_barrier(barrier, _WEEK_MS), None, "the other processes did not come")
+
+
+def share(text: str = "") -> str:
+  """Returns process 0's text in all processes. All of them must ask, in the same order."""
+  if _watch is None:
+    return text
+  key, client = f"{_STORE}/shared/{next(_numbers)}", _watch.client
+  if is_main():
+    client.key_value_set(key, text)
+    return text
+  return _within(lambda: client.blocking_key_value_get(key, _WEEK_MS), None, "process 0 did not answer")
 
 
 def join(config: Any) -> None:
@@ -69,33 +100,41 @@ def join(config: Any) -> None:
       "hardware=multi_node finds no cluster here (Slurm, Open MPI, Kubernetes, …): start it with srun, or set "
       "hardware.distributed.coordinator=<host:port>, num_processes and process_id."
     )
-  timeout = config.distributed.timeout
   if explicit:
     _check(**given)
-  if explicit and given["process_id"] > 0:
-    _reach(given["coordinator"], timeout)
+  timeout = config.distributed.timeout
+  coordinator, count, index, local_device_ids = _topology(given, round(timeout))
+  if index > 0:
+    _reach(coordinator, timeout)
   # Its handler of SIGTERM would replace ours, which saves.
   jax.config.update("jax_enable_preemption_service", False)
   # CPUs only: two programs in flight would exchange in an order of their own in each process.
   jax.config.update("jax_cpu_collectives_implementation", "gloo")
   jax.config.update("jax_cpu_enable_async_dispatch", False)
-  where = f"{given['num_processes']} processes at {given['coordinator']}" if explicit else "the cluster's processes"
-  arguments = {"coordinator_address": given["coordinator"]} | {key: given[key] for key in keys[1:]}
+  watch = _Watch(index, count, coordinator, config.distributed.lost_after)
   _within(
     lambda: jax.distributed.initialize(
-      **arguments, local_device_ids=_local_device_ids(), initialization_timeout=round(timeout) + 60
+      coordinator if index == 0 else watch.relay(),
+      count,
+      index,
+      local_device_ids,
+      initialization_timeout=round(timeout) + 60,
+      heartbeat_timeout_seconds=10 * round(watch.lost_after) + 60,
     ),
-    timeout,  # JAX's own is later: it aborts the process
-    f"not all of {where} came within hardware.distributed.timeout={timeout:g} s",
+    timeout,  # JAX's own timeouts are later: it aborts the process
+    f"not all of {count} processes at {coordinator} came within hardware.distributed.timeout={timeout:g} s",
   )
+  if count > 1:
+    watch.start()
 
 
-def preflight(config: Any, fingerprint: Any) -> None:
-  """A first exchange between all processes, which also checks that they train the same.
+def preflight(config: Any, fingerprint: Any, what: str = "configuration") -> None:
+  """Checks in an exchange between all processes that they train the same.
 
   Args:
     config: `hardware`.
     fingerprint: what must be equal everywhere, such as the resolved configuration.
+    what: its name.
 
   Raises:
     HardwareError: it takes longer than `hardware.distributed.timeout`.
@@ -105,6 +144,7 @@ def preflight(config: Any, fingerprint: Any) -> None:
     return
   from jax.experimental import multihost_utils
 
+  wait_for_all()
   digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True, default=str).encode()).digest()
   ours = np.frombuffer(digest[:8], np.uint32)
   timeout = config.distributed.timeout
@@ -116,29 +156,188 @@ def preflight(config: Any, fingerprint: Any) -> None:
     "open to each other (NCCL_DEBUG=INFO says more, NCCL_SOCKET_IFNAME picks an interface)?",
   )
   if differ := [i for i, theirs in enumerate(all_of_them) if not np.array_equal(theirs, all_of_them[0])]:
-    raise ConfigError(f"Process {differ[0]} has another configuration than process 0: give all the same command.")
+    raise ConfigError(f"Process {differ[0]} has another {what} than process 0: give all the same command and files.")
 
 
 @contextlib.contextmanager
-def leaving_at_once() -> Iterator[None]:
-  """Ends this process where an error ends the block, if there are others.
+def ending_together() -> Iterator[None]:
+  """Ends this process only when all processes of the training have ended the block, or at once if an error ends it.
 
-  They wait in an exchange that this one will not come to, and a normal exit waits for them; so do they end.
+  The others wait in an exchange that this process will not come to, and a normal exit waits for them.
   """
   try:
     yield
+    wait_for_all()
   except BaseException as error:
-    waiting = any(thread.name == PREFLIGHT for thread in threading.enumerate())  # the command leaves at once by itself
-    if waiting or not (jax.distributed.is_initialized() and several()):  # asking JAX while it connects aborts
-      raise
     ours = isinstance(error, PlaygroundError)
-    print(f"error: {error}" if ours else traceback.format_exc(), file=sys.stderr, flush=True)
+    if _watch is not None:
+      print(f"error: {error}" if ours else traceback.format_exc(), file=sys.stderr, flush=True)
+    leave(2 if ours else 1, f"failed: {error if ours else traceback.format_exception_only(error)[-1].strip()}")
+    raise
+
+
+def leave(code: int, why: str) -> None:
+  """Ends this process at once, and the others with a sentence that tells `why`; nothing if there are no others."""
+  if _watch is not None:
+    _watch.tell(f"process {jax.process_index()} on {socket.gethostname()} {why}")
     sys.stdout.flush()
-    os._exit(2 if ours else 1)
+    os._exit(code)
 
 
-def _within(call: Callable[[], Any], seconds: float, otherwise: str) -> Any:
-  """Result of a call that may hang; raises HardwareError if it does, or fails."""
+@contextlib.contextmanager
+def noting_loss(note: Callable[[str], None]) -> Iterator[None]:
+  """While the block runs, calls `note` with a sentence before this process ends because another one is lost."""
+  if _watch is None:
+    yield
+    return
+  _watch.notes.append(note)
+  try:
+    yield
+  except Exception as error:
+    if not any(word in str(error) for word in ("Gloo", "NCCL")):
+      raise
+    time.sleep(_watch.lost_after + 5)  # the exchange broke before the watch knows why, and then the watch ends this
+    raise HardwareError(f"hardware=multi_node: an exchange failed, {_first_line(error)}.") from error
+  finally:
+    _watch.notes.remove(note)
+
+
+class _Watch:
+  """Ends this process in one sentence when another one of the training fails or is lost.
+
+  A process that fails says so in the coordinator's key-value store. One that is killed, or whose machine is gone, no
+  longer counts up its sign of life there. Process 0 is the coordinator: JAX's client aborts when its connection to it
+  closes, so the client's connection leads through a relay of ours, which sees that first.
+
+  Attributes:
+    lost_after: seconds without a sign of life after which a process is lost.
+    notes: called with the sentence before this process ends.
+    client: the coordinator's, once JAX has connected.
+  """
+
+  def __init__(self, index: int, count: int, coordinator: str, lost_after: float):
+    self.lost_after = lost_after
+    self.notes: list[Callable[[str], None]] = []
+    self.client: Any = None
+    self._index, self._count, self._coordinator = index, count, coordinator
+    self._leaving = threading.Event()
+    self._lock = threading.Lock()
+
+  def start(self) -> None:
+    """Watches from here on, until the interpreter ends."""
+    global _watch
+    from jax._src import distributed  # JAX has no public name for the store
+
+    _watch, self.client = self, distributed.global_state.client
+    atexit.register(self._part)  # runs before JAX's own, which was registered earlier
+    self._thread = _start_thread(self._run)
+
+  def relay(self) -> str:
+    """An address of this machine that leads to the coordinator; the coordinator's loss ends this process."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    host, _, port = self._coordinator.rpartition(":")
+
+    def accept() -> None:
+      while True:
+        near, _ = listener.accept()
+        try:
+          far = socket.create_connection((host, int(port)))
+        except OSError:
+          self._lost_coordinator()
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: a machine that is gone closes nothing
+          far.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * self.lost_after))
+        _start_thread(lambda near=near, far=far: self._connect(near, far))
+
+    _start_thread(accept)
+    return f"127.0.0.1:{listener.getsockname()[1]}"
+
+  def tell(self, sentence: str) -> None:
+    """Lets the others end with a sentence; this process ends by itself."""
+    self._leaving.set()
+    with contextlib.suppress(Exception):  # another one was first, or the store is lost with process 0
+      self.client.key_value_set(_FAILED, sentence)
+    if self._index == 0:
+      time.sleep(2 * _PERIOD_S)  # the store ends with this process: the others are to read it first
+
+  def _part(self) -> None:
+    self._leaving.set()
+    self._thread.join()  # a thread that comes back from JAX while Python ends aborts the process
+    with contextlib.suppress(Exception):  # process 0 may have gone
+      self.client.key_value_set(_sign_of(self._index), _LEFT, allow_overwrite=True)
+
+  def _run(self) -> None:
+    signs = dict.fromkeys(range(self._count), "")
+    seen = dict.fromkeys(signs, time.monotonic())
+    for beat in itertools.count():
+      try:
+        store = _within(lambda beat=beat: self._exchange(str(beat)), self.lost_after, "")
+      except HardwareError:  # process 0 does not answer: its sign of life is missing, too
+        store = {}
+      if _FAILED in store:
+        self._lost(store[_FAILED])
+      for i, before in signs.items():
+        signs[i] = store.get(_sign_of(i), before)
+        if signs[i] != before:
+          seen[i] = time.monotonic()
+        if signs[i] != _LEFT and time.monotonic() - seen[i] > self.lost_after:
+          self._lost(f"process {i} has given no sign of life for hardware.distributed.lost_after={self.lost_after:g} s")
+      if self._leaving.wait(_PERIOD_S):
+        return
+
+  def _exchange(self, sign: str) -> dict[str, str]:
+    """Gives a sign of life, and returns what all processes have said."""
+    self.client.key_value_set(_sign_of(self._index), sign, allow_overwrite=True)
+    return dict(self.client.key_value_dir_get(_WATCH))
+
+  def _connect(self, near: socket.socket, far: socket.socket) -> None:
+    """Passes on what goes between JAX's client and the coordinator."""
+    closed = threading.Event()
+
+    def send() -> None:
+      while data := _receive(near):
+        try:
+          far.sendall(data)
+        except OSError:
+          self._lost_coordinator()
+      closed.set()
+      with contextlib.suppress(OSError):  # it may be closed
+        far.shutdown(socket.SHUT_WR)
+
+    _start_thread(send)
+    while data := _receive(far):
+      try:
+        near.sendall(data)
+      except OSError:  # closed by JAX's client
+        return
+    if not closed.is_set():
+      self._lost_coordinator()
+
+  def _lost_coordinator(self) -> NoReturn:
+    self._lost(f"process 0 at {self._coordinator} is lost")
+
+  def _lost(self, sentence: str) -> NoReturn:
+    with self._lock:  # kept: one thread ends the process
+      if self._leaving.is_set():
+        raise SystemExit  # of this thread: the process ends by itself
+      sentence = f"hardware=multi_node: {sentence.removesuffix('.')}."
+      try:
+        for note in self.notes:
+          note(sentence)
+      finally:
+        print(f"error: {sentence}", file=sys.stderr, flush=True)
+        sys.stdout.flush()
+        os._exit(2)
+
+
+def _sign_of(index: int) -> str:
+  return f"{_WATCH}/life/{index}"
+
+
+_watch: _Watch | None = None  # this process's, once it has joined others
+
+
+def _within(call: Callable[[], Any], seconds: float | None, otherwise: str) -> Any:
+  """Result of a call that may hang, which a signal can interrupt; raises HardwareError if it hangs or fails."""
   outcome: list[Any] = []
 
   def run() -> None:
@@ -147,17 +346,33 @@ def _within(call: Callable[[], Any], seconds: float, otherwise: str) -> Any:
     except Exception as error:  # whatever the runtime throws
       outcome.append((False, error))
 
-  thread = threading.Thread(target=run, name=PREFLIGHT, daemon=True)
-  thread.start()
-  thread.join(seconds)
+  _start_thread(run, PREFLIGHT).join(seconds)
   if not outcome:
     raise HardwareError(f"hardware=multi_node: {otherwise}.")
   good, result = outcome[0]
   if good:
     return result
-  said = str(result).strip().splitlines()[0][:200] if str(result).strip() else type(result).__name__
+  said = _first_line(result)
   late = "DEADLINE" in said.upper() or "timed out" in said.lower()
   raise HardwareError(f"hardware=multi_node: {otherwise if late else said}.") from result
+
+
+def _start_thread(target: Callable[[], None], name: str = "watch") -> threading.Thread:
+  thread = threading.Thread(target=target, name=name, daemon=True)
+  thread.start()
+  return thread
+
+
+def _first_line(error: Exception) -> str:
+  return str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
+
+
+def _receive(end: socket.socket) -> bytes:
+  """The next bytes; none when the connection is closed, or broken."""
+  try:
+    return end.recv(1 << 16)
+  except OSError:
+    return b""
 
 
 def _check(coordinator: str, num_processes: int, process_id: int) -> None:
@@ -191,6 +406,15 @@ def _known_cluster() -> bool:
   from jax._src import clusters  # JAX has no public name for it
 
   return any(env.is_env_present() for env in clusters.ClusterEnv._cluster_types if not env.opt_in_only_method)
+
+
+def _topology(given: Mapping[str, Any], timeout: int) -> tuple[str, int, int, list[int] | None]:
+  """The coordinator's address, how many processes there are, which one this is, and its devices if not all."""
+  from jax._src import clusters  # as above
+
+  coordinator, count, index = given.values()
+  detect: Any = clusters.ClusterEnv.auto_detect_unset_distributed_params
+  return detect(coordinator, count, index, _local_device_ids(), None, timeout)
 
 
 def _local_device_ids() -> list[int] | None:

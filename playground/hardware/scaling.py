@@ -3,8 +3,7 @@
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from ml_collections import ConfigDict
-
+from playground.config import config_dict
 from playground.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -44,5 +43,5 @@ def describe_division(agent: Any, devices: int) -> str:
 def _scaled(config: "RunConfig", devices: int) -> "RunConfig":
   agent = {key: size * devices if key in SCALED else size for key, size in config.resolved["agent"].items()}
   resolved = {**config.resolved, "agent": agent, "hardware": {**config.resolved["hardware"], "scale_envs": False}}
-  sections = {key: ConfigDict(resolved[key]) for key in ("agent", "hardware")}
+  sections = {key: config_dict(resolved[key]) for key in ("agent", "hardware")}
   return dataclasses.replace(config, resolved=resolved, **sections)

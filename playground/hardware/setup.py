@@ -73,7 +73,7 @@ def setup(config: Any) -> Hardware:
 def this_machine(hardware: Any) -> Any:
   """A run's `hardware` config for looking at it here: one device of whatever kind there is."""
   hardware = hardware.copy_and_resolve_references()
-  hardware.devices, hardware.kind = 1, None
+  hardware.devices, hardware.kind, hardware.xla_flags = 1, None, ""
   hardware.distributed.enable = False
   hardware.platform = "cpu" if hardware.platform == "cpu" else "auto"
   return hardware

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from ml_collections import ConfigDict
 
 from playground import registry
+from playground.config import config_dict
 from playground.envs.base import Env
 from playground.envs.physics import BufferUse
 from playground.envs.wrappers import wrap_for_training
@@ -16,6 +17,7 @@ from playground.errors import ConfigError
 
 ROOM = 1.25  # buffers are advised to be so much larger than what was needed
 _TRIES = 12
+_REPORTS = 50  # of the progress of a rollout, which takes minutes on a CPU
 _CCD = 1 << 4  # mujoco_warp's OverflowType.CCD
 
 Act = Callable[[Any, jax.Array], jax.Array]  # (observation [N, ...], key) -> actions [N, action_size]
@@ -43,15 +45,25 @@ class BufferSizes:
     return {"njmax": _round_up(self.constraints * ROOM, 4), "naconmax_per_env": pairs, "naccdmax_per_env": convex}
 
 
-def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_steps: int, seed: int = 0) -> BufferSizes:
+def measure_buffers(
+  config: ConfigDict,
+  act: Act | None,
+  num_envs: int,
+  num_steps: int,
+  seed: int = 0,
+  on_try: Callable[[str], None] = lambda sizes: None,
+  on_steps: Callable[[int], None] = lambda steps: None,
+) -> BufferSizes:
   """Rolls a task out on Warp and returns the most that any step needed.
 
   Args:
     config: the task's configuration; its own sizes are where the search for sufficient ones begins.
     act: the policy; uniformly random actions if None.
     num_envs: environments.
-    num_steps: decisions; episodes that end begin anew.
+    num_steps: policy steps; episodes that end are reset.
     seed: of starts and actions.
+    on_try: is called with the sizes of the buffers before each rollout compiles.
+    on_steps: is called with the number of policy steps that the rollout has done.
 
   Raises:
     ConfigError: Warp is not installed, or some buffer that cannot be set overflowed.
@@ -60,8 +72,9 @@ def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_step
   rows, pairs, convex = max(configured or 0, 32), 32, 1
   for _ in range(_TRIES):
     sizes = {"impl": "warp", "njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": convex}
-    env = registry.build(ConfigDict(config.to_dict() | sizes))
-    use = _roll(env, act, num_envs, num_steps, seed)
+    env = registry.build(config_dict({**config.to_dict(), **sizes}))
+    on_try(" ".join(f"{key}={size}" for key, size in sizes.items() if key != "impl"))
+    use = _roll(env, act, num_envs, num_steps, seed, on_steps)
     if not use.overflow:
       return BufferSizes(int(use.constraints), int(use.contacts) / num_envs, convex)
     grew = False
@@ -80,26 +93,38 @@ def measure_buffers(config: ConfigDict, act: Act | None, num_envs: int, num_step
   )
 
 
-def _roll(env: Env, act: Act | None, num_envs: int, num_steps: int, seed: int) -> BufferUse:
+def _roll(
+  env: Env, act: Act | None, num_envs: int, num_steps: int, seed: int, on_steps: Callable[[int], None]
+) -> BufferUse:
   wrapped = wrap_for_training(env)
   reset_key, act_key = jax.random.split(jax.random.PRNGKey(seed))
   uniform = lambda obs, key: jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
 
+  keys = jax.random.split(act_key, num_steps)
+
   @jax.jit
-  def roll() -> BufferUse:
-    def step(carry: tuple[Any, BufferUse], key: jax.Array) -> tuple[tuple[Any, BufferUse], None]:
-      state, most = carry
-      state = wrapped.step(state, (act or uniform)(state.obs, key), {})
-      assert state.data.buffers is not None, "the task is on Warp"
-      return (state, most.join(state.data.buffers)), None
-
+  def start() -> tuple[Any, BufferUse]:
     state = wrapped.reset(jax.random.split(reset_key, num_envs), {})
-    most = jax.tree.map(jnp.zeros_like, state.data.buffers)
-    (_, most), _ = jax.lax.scan(step, (state, most), jax.random.split(act_key, num_steps))
-    overflow = jax.lax.reduce_or(most.overflow, (0,))
-    return BufferUse(most.constraints.max(), most.contacts.max(), overflow)
+    return state, jax.tree.map(jnp.zeros_like, state.data.buffers)
 
-  return jax.device_get(roll())
+  @jax.jit
+  def advance(carry: tuple[Any, BufferUse], first: int, end: int) -> tuple[Any, BufferUse]:
+    def step(index: jax.Array, carry: tuple[Any, BufferUse]) -> tuple[Any, BufferUse]:
+      state, most = carry
+      state = wrapped.step(state, (act or uniform)(state.obs, keys[index]), {})
+      assert state.data.buffers is not None, "the task is on Warp"
+      return state, most.join(state.data.buffers)
+
+    return jax.lax.fori_loop(first, end, step, carry)
+
+  carry = start()
+  stride = max(1, num_steps // _REPORTS)
+  for first in range(0, num_steps, stride):
+    end = min(first + stride, num_steps)
+    carry = jax.block_until_ready(advance(carry, first, end))
+    on_steps(end)
+  most = carry[1]
+  return jax.device_get(BufferUse(most.constraints.max(), most.contacts.max(), jax.lax.reduce_or(most.overflow, (0,))))
 
 
 def _overflow_names(bits: int) -> str:

@@ -1,19 +1,30 @@
 """Checkpoints: the whole training state, written atomically by Orbax and verified when read.
 
 A checkpoint has three items: `policy` (normaliser and networks: what evaluation, export and `init_from` need), `state`
-(the rest of what training goes on from) and `meta` (step, return, task, config, name and shape of every array, a
-checksum). The newest may have a fourth, `replay`: experience, which is too large to keep more than once.
+(the rest of what training goes on from) and `meta` (step, return, task, config, name and shape of every array, and
+checksums of all items, itself included). The newest may have a fourth, `replay`: experience, which is too large to keep
+more than once.
 
 Beside the newest, a run keeps the checkpoint with the highest return; `checkpoints/best` is a link to it.
+
+Reading deletes nothing. A checkpoint is damaged only if its bytes can be read and are not those that were saved: a
+resumed run moves it to `checkpoints/damaged_<step>`. Errors of the operating system are tried again and then raised.
 """
 
+import contextlib
 import errno
 import hashlib
+import json
 import logging
 import math
 import os
+import re
 import shutil
-from collections.abc import Callable, Mapping
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -26,11 +37,56 @@ from playground.errors import CheckpointError
 
 FORMAT = "playground-run/1"
 BEST = "best"
+_META_TYPES: dict[str, type | tuple[type, ...]] = {
+  "step": int,
+  "update": int,
+  "wall_clock_s": (int, float),
+  "env": str,
+  "config": dict,
+  "leaves": dict,
+  "sha256": dict,
+}
+_ABOUT_FILES = (None, errno.ENOENT, errno.ENOTDIR, errno.EISDIR)  # errors that say how the files are; others may pass
+_TRANSIENT = ("RESOURCE_EXHAUSTED", "UNAVAILABLE", "PERMISSION_DENIED", "DEADLINE_EXCEEDED", "ABORTED", "CANCELLED")
+_RETRY_AFTER_S = (0.1, 0.5, 2.0)
+_PLAIN_PATH = re.compile(r"[\w/.,+=@ -]*")
 _NO_BEST = (-math.inf, -1)  # return and step
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)  # what file systems say that have none
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax warns of its own defaults at every save and read
+logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax warns of its own defaults, and raises what are errors
 Arrays = list[np.ndarray]
 Fetch = Callable[[], np.ndarray | None]
+
+
+class NoCheckpointError(CheckpointError):
+  """A run that has no checkpoint yet."""
+
+
+class DamagedCheckpointError(CheckpointError):
+  """A checkpoint whose bytes can be read and are not those that were saved, or that holds NaN or infinite values."""
+
+
+@contextlib.contextmanager
+def _quiet_threads() -> Iterator[None]:
+  """Lets Orbax's threads print nothing, since Orbax raises their first error, and end before that error is seen."""
+  before, hook = set(threading.enumerate()), threading.excepthook
+  threading.excepthook = lambda args: hook(args) if args.thread in before else None
+  try:
+    yield
+  except Exception:
+    for thread in set(threading.enumerate()) - before:
+      thread.join(10)
+    raise
+  finally:
+    threading.excepthook = hook
+
+
+def _ignore_late_results() -> None:
+  """Lets TensorStore's threads print nothing of reads that had not ended when another one failed, whenever that is."""
+  hook = sys.unraisablehook
+  sys.unraisablehook = lambda args: None if str(args.exc_value) == "Event loop is closed" else hook(args)
+
+
+_ignore_late_results()
 
 
 class CheckpointStore:
@@ -42,18 +98,22 @@ class CheckpointStore:
     Args:
       folder: where to.
       keep: how many are kept, the newest; the one with the highest return (of several, the newest) is kept besides.
-      continued: the step that the run goes on from. Checkpoints after it are removed: they were found damaged, and the
-        run is about to make them again.
+      continued: the step that the run goes on from. Checkpoints after it were found damaged, and the run is about to
+        make them again: they are moved to `damaged_<step>`.
+
+    Raises:
+      CheckpointError: a checkpoint there cannot be read, though it is not damaged.
     """
     self._folder, self._keep = Path(folder).absolute(), keep
     self._folder.mkdir(parents=True, exist_ok=True)  # Orbax does not where it is told to work alone
     there = _by_step(self._folder)
-    gone = {step for step in there if continued is not None and step > continued}
-    returns = {step: _return_of(path) for step, path in there.items() if step not in gone}
+    damaged = {step for step in there if continued is not None and step > continued}
+    returns = {step: _return_of(path) for step, path in there.items() if step not in damaged}
     self._best = max(((value, step) for step, value in returns.items() if value is not None), default=_NO_BEST)
-    self._link_best()  # before others are removed: what it points to is always whole
-    for step in gone:
-      shutil.rmtree(there[step])
+    self._link_best()  # before others are moved: what it points to is always whole
+    for step in damaged:
+      _set_aside(there[step])
+    self._alias = _Alias(self._folder)
     options = ocp.CheckpointManagerOptions(
       create=False,
       step_format_fixed_length=12,
@@ -61,7 +121,7 @@ class CheckpointStore:
       cleanup_tmp_directories=True,
       multiprocessing_options=_alone(),
     )
-    self._manager = ocp.CheckpointManager(self._folder, options=options)
+    self._manager = ocp.CheckpointManager(self._alias.path, options=options)
     self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
     self._pending: Future[None] | None = None
 
@@ -98,6 +158,7 @@ class CheckpointStore:
     self.wait()
     self._thread.shutdown()
     self._manager.close()
+    self._alias.remove()
 
   def _write(self, step: int, policy: Any, state: Any, meta: dict[str, Any], replay: Fetch | None) -> None:
     trees = {"policy": policy, "state": state}
@@ -110,8 +171,19 @@ class CheckpointStore:
       "leaves": {name: describe(tree) for name, tree in trees.items()},
       "sha256": {name: checksum(values) for name, values in arrays.items()},
     }
+    if any(_first_nonfinite(meta["leaves"][name], values) is not None for name, values in arrays.items()):
+      meta["return"] = None  # it is never the best
+    meta["meta_sha256"] = _meta_checksum(meta)
     items = {name: ocp.args.StandardSave(_numbered(values)) for name, values in arrays.items()}  # pyright: ignore[reportCallIssue]
-    self._manager.save(step, args=ocp.args.Composite(**items, meta=ocp.args.JsonSave(meta)), force=True)  # pyright: ignore[reportCallIssue]
+    try:
+      self._save(step, ocp.args.Composite(**items, meta=ocp.args.JsonSave(meta)))  # pyright: ignore[reportCallIssue]
+    except Exception as error:
+      for half in self._folder.glob(f"{step:012d}.*"):  # it has the space that the run's last words need
+        shutil.rmtree(half, ignore_errors=True)
+      reason = _not_about_files(error) or (str(error) if isinstance(error, OSError) else "")
+      if not reason:
+        raise
+      raise CheckpointError(f"{self._folder} cannot be written: {reason}.") from error
     if meta["return"] is not None:
       self._best = max(self._best, (meta["return"], step))
     # Orbax's own policies would remove the old best before the link has gone over to the new one.
@@ -122,6 +194,12 @@ class CheckpointStore:
     for other, path in _by_step(self._folder).items():
       if other != step and (path / "replay").is_dir():
         shutil.rmtree(path / "replay")
+
+  def _save(self, step: int, items: Any) -> None:
+    if not self._folder.is_dir():  # Orbax would make it again, with nothing else in it
+      raise FileNotFoundError("it was removed")
+    with _quiet_threads():
+      self._manager.save(step, args=items, force=True)
 
   def _link_best(self) -> None:
     """Lets `best` point to the best checkpoint, in one go; without one, or without links, there is no `best`."""
@@ -145,20 +223,16 @@ class Checkpoint:
   """One checkpoint on disk, checked to be whole and ours."""
 
   def __init__(self, folder: str | Path):
-    """Reads what the checkpoint says of itself.
+    """Reads and checks the meta data.
 
     Raises:
-      CheckpointError: no checkpoint there, or not one of ours.
+      DamagedCheckpointError: they are not as they were saved.
+      CheckpointError: no checkpoint there, not one of ours, one of a newer version, or one that cannot be read now.
     """
     self.path = Path(folder).absolute()
     if not self.path.is_dir():
       raise CheckpointError(f"No checkpoint at {folder}: there is no such folder.")
-    try:
-      self.meta: dict[str, Any] = self._read("meta", ocp.args.JsonRestore())  # pyright: ignore[reportCallIssue]
-    except Exception as error:
-      raise CheckpointError(f"{folder} is not a checkpoint of playground-run, or its meta data is damaged.") from error
-    if not isinstance(self.meta, dict) or self.meta.get("format") != FORMAT:
-      raise CheckpointError(f"{folder} is not a checkpoint of playground-run ({FORMAT}).")
+    self.meta: dict[str, Any] = self._read_meta()
 
   @property
   def step(self) -> int:
@@ -176,31 +250,82 @@ class Checkpoint:
       template: a tree with the expected structure, shapes and dtypes (`jax.eval_shape`'s result will do).
 
     Raises:
-      CheckpointError: damaged, or made for other shapes (another task, network or number of environments).
+      DamagedCheckpointError: its bytes are not those that were saved, or hold NaN or infinite values.
+      CheckpointError: it cannot be read now, or was made for other shapes (another task, network or number of
+        environments).
     """
-    expected, found = describe(template), self.meta["leaves"][item]
+    found = self.meta["leaves"].get(item)
+    if found is None:
+      raise DamagedCheckpointError(f"{self.path} is damaged: its meta data describe no {item!r}.")
+    expected = describe(template)
     if expected != found:
       raise CheckpointError(f"{self.path} does not fit this run: {_first_difference(expected, found)}.")
-    try:
-      numbered = self._read(item, ocp.args.StandardRestore())  # pyright: ignore[reportCallIssue]
-      shapes = [(tuple(shape), dtype) for _, shape, dtype in found]
-      leaves = [np.asarray(numbered.get(_number(i), np.zeros(*spec))) for i, spec in enumerate(shapes)]
-      whole = checksum(leaves) == self.meta["sha256"][item]
-    except Exception as error:
-      raise CheckpointError(f"{self.path} is damaged: its {item!r} cannot be read.") from error
-    if not whole:
-      raise CheckpointError(f"{self.path} is damaged: the checksum of its {item!r} does not match.")
+    numbered = self._read(item, lambda: self._arrays(item))
+    leaves = [np.asarray(numbered.get(_number(i), np.zeros(shape, dtype))) for i, (_, shape, dtype) in enumerate(found)]
+    if checksum(leaves) != self.meta["sha256"].get(item):
+      raise DamagedCheckpointError(f"{self.path} is damaged: the checksum of its {item!r} does not match.")
+    if (broken := _first_nonfinite(found, leaves)) is not None:
+      raise DamagedCheckpointError(f"{self.path} cannot be used: its {item}{broken} holds NaN or infinite values.")
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
-  def _read(self, item: str, args: Any) -> Any:
+  def _read(self, item: str, read: Callable[[], Any]) -> Any:
+    """Result of reading an item; tells damage from an operating system that does not let us read."""
+    for pause in (*_RETRY_AFTER_S, None):
+      try:
+        return read()
+      except Exception as error:
+        reason = _not_about_files(error) or self._unreadable(item)
+        if reason is None:
+          raise DamagedCheckpointError(f"{self.path} is damaged: its {item!r} cannot be read.") from error
+        if pause is None:
+          raise CheckpointError(f"{self.path} cannot be read now, which need not be damage: {reason}.") from error
+        time.sleep(pause)
+
+  def _unreadable(self, item: str) -> str | None:
+    """Why the files of an item cannot be read at all; None if all can be."""
+    try:
+      for folder, _, names in os.walk(self.path / item, onerror=_raise):
+        for name in names:
+          with open(os.path.join(folder, name), "rb") as file:
+            while file.read(1 << 24):
+              pass
+    except OSError as error:
+      return _not_about_files(error)
+    return None
+
+  @_quiet_threads()
+  def _arrays(self, item: str) -> Any:
     options = ocp.CheckpointManagerOptions(
       read_only=True, step_format_fixed_length=12, multiprocessing_options=_alone()
     )
-    manager = ocp.CheckpointManager(self.path.parent, options=options)
+    alias = _Alias(self.path.parent)
+    manager = ocp.CheckpointManager(alias.path, options=options)
+    args = ocp.args.Composite(**{item: ocp.args.StandardRestore()})  # pyright: ignore[reportCallIssue]
     try:
-      return manager.restore(int(self.path.name), args=ocp.args.Composite(**{item: args}))[item]
+      return manager.restore(int(self.path.name), args=args)[item]
     finally:
       manager.close()
+      alias.remove()
+
+  def _read_meta(self) -> dict[str, Any]:
+    # As Orbax writes it; read without Orbax, whose errors do not say whose fault they are.
+    file = self.path / "meta" / "metadata"
+    if not file.exists() and not any((self.path / item).is_dir() for item in ("meta", "policy", "state")):
+      raise CheckpointError(f"{self.path} is not a checkpoint of playground-run.")
+    meta = self._read("meta", lambda: json.loads(file.read_bytes()))
+    written_as = meta.get("format") if isinstance(meta, dict) else None
+    if _version(written_as) > _version(FORMAT):
+      raise CheckpointError(
+        f"{self.path} was written by a newer version of playground-run (its format is {written_as}, this version reads "
+        f"{FORMAT}): update playground-run."
+      )
+    if isinstance(meta, dict) and written_as != FORMAT:
+      raise CheckpointError(f"{self.path} is not a checkpoint of playground-run ({FORMAT}).")
+    if why := _meta_damage(meta):
+      raise DamagedCheckpointError(f"{self.path} is damaged: its meta data {why}.")
+    if meta["step"] != int(self.path.name):
+      raise CheckpointError(f"{self.path} holds step {meta['step']}: rename the folder to {meta['step']:012d}.")
+    return meta
 
 
 def find_checkpoints(path: str | Path) -> list[Path]:
@@ -211,32 +336,46 @@ def find_checkpoints(path: str | Path) -> list[Path]:
   Raises:
     CheckpointError: there is none.
   """
-  path = Path(path).expanduser()
+  path = Path(os.path.expanduser(path))
   if path.name == BEST and path.parent.name == "checkpoints" and path.parent.is_dir():
     return [_linked(path)]
   if not path.exists():
     raise CheckpointError(f"{path} does not exist: give a run directory or one of its checkpoints.")
-  if path.name.isdigit() and path.parent.name == "checkpoints":
+  if path.name.isdecimal() and path.parent.name == "checkpoints":
     return [path]
   folder = path if path.name == "checkpoints" else path / "checkpoints"
   if not folder.is_dir() and (stages := find_stages(path)):
     folder = stages[-1] / "checkpoints"
   found = _by_step(folder)
   if not found:
-    raise CheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
+    raise NoCheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
   return [found[step] for step in sorted(found, reverse=True)]
 
 
 def find_stages(chain: Path) -> list[Path]:
   """The stages in a chain's directory that have a checkpoint, the last one last."""
   number = lambda stage: stage.name.partition("_")[0]
-  stages = [stage for stage in chain.glob("*_*/") if number(stage).isdigit() and _by_step(stage / "checkpoints")]
+  stages = [stage for stage in chain.glob("*_*/") if number(stage).isdecimal() and _by_step(stage / "checkpoints")]
   return sorted(stages, key=lambda stage: int(number(stage)))
 
 
 def _by_step(folder: Path) -> dict[int, Path]:
-  """The checkpoints in a folder, by what their names say."""
-  return {int(path.name): path for path in folder.glob("*") if path.name.isdigit() and path.is_dir()}
+  """The checkpoints in a folder, by step; raises CheckpointError if the folder cannot be listed."""
+  try:
+    return {int(path.name): path for path in folder.iterdir() if path.name.isdecimal() and path.is_dir()}
+  except (FileNotFoundError, NotADirectoryError):
+    return {}
+  except OSError as error:
+    raise CheckpointError(f"{folder} cannot be read: {error.strerror}.") from error
+
+
+def _set_aside(folder: Path) -> Path:
+  """Renames a damaged checkpoint to `damaged_<step>`, numbered if an earlier one has the name."""
+  aside, number = folder.with_name(f"damaged_{folder.name}"), 1
+  while aside.exists():
+    number += 1
+    aside = folder.with_name(f"damaged_{folder.name}_{number}")
+  return folder.rename(aside)
 
 
 def _linked(best: Path) -> Path:
@@ -252,10 +391,10 @@ def _linked(best: Path) -> Path:
 
 
 def _return_of(folder: Path) -> float | None:
-  """The return that a checkpoint notes; one that is damaged has none."""
+  """The return of a checkpoint; one that is damaged has none."""
   try:
     return Checkpoint(folder).meta.get("return")
-  except CheckpointError:
+  except DamagedCheckpointError:
     return None
 
 
@@ -271,6 +410,86 @@ def checksum(leaves: Arrays) -> str:
   for leaf in leaves:
     digest.update(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8).data)
   return digest.hexdigest()
+
+
+def _first_nonfinite(described: list[list[Any]], leaves: Arrays) -> str | None:
+  """The name of the first leaf with a NaN or infinite value, of what learning and acting go on from.
+
+  An environment may hold such values (`info["nonfinite_state"]`): the guard keeps them from what learns.
+  """
+  for (name, *_), leaf in zip(described, leaves, strict=True):
+    floating = jax.numpy.issubdtype(leaf.dtype, np.floating)  # NumPy alone does not count bfloat16
+    if floating and not name.startswith(".env_state") and not np.isfinite(leaf).all():
+      return name
+  return None
+
+
+def _meta_checksum(meta: Mapping[str, Any]) -> str:
+  """SHA-256 of the meta data as JSON holds them, but for this checksum itself."""
+  rest = {key: value for key, value in meta.items() if key != "meta_sha256"}
+  return hashlib.sha256(json.dumps(json.loads(json.dumps(rest)), sort_keys=True).encode()).hexdigest()
+
+
+def _meta_damage(meta: Any) -> str:
+  """What is wrong with meta data of our format, '' if nothing is. Earlier versions wrote no checksum of them."""
+  if not isinstance(meta, dict):
+    return "are no mapping"
+  for key, kind in _META_TYPES.items():
+    if not isinstance(meta.get(key), kind):
+      return f"have no valid {key!r}"
+  if not isinstance(meta.get("return"), int | float | None):
+    return "have no valid 'return'"
+  described = [leaf for leaves in meta["leaves"].values() for leaf in (leaves if isinstance(leaves, list) else [None])]
+  if not all(isinstance(leaf, list) and list(map(type, leaf)) == [str, list, str] for leaf in described):
+    return "have no valid 'leaves'"
+  if "meta_sha256" in meta and _meta_checksum(meta) != meta["meta_sha256"]:
+    return "do not match their checksum"
+  return ""
+
+
+def _version(written_as: Any) -> int:
+  """The number of one of our formats, 0 for any other."""
+  match = re.fullmatch(r"playground-run/(\d+)", str(written_as))
+  return int(match[1]) if match else 0
+
+
+def _not_about_files(error: BaseException | None) -> str | None:
+  """What keeps us from reading (too many open files, no permission, a disk that fails); None if the files do."""
+  while error is not None:
+    text = str(error)
+    number = re.search(r"os_error_code='(\d+)'", text)  # of TensorStore, which raises ValueError for all
+    if isinstance(error, OSError) and error.errno not in _ABOUT_FILES:
+      return error.strerror
+    if number and int(number[1]) not in _ABOUT_FILES:
+      return os.strerror(int(number[1]))
+    no_resource = isinstance(error, MemoryError | RuntimeError) and not isinstance(error, RecursionError)
+    if no_resource or text.startswith(_TRANSIENT):
+      return text.splitlines()[0] if text else type(error).__name__
+    error = error.__cause__ or error.__context__
+  return None
+
+
+def _raise(error: OSError) -> None:
+  raise error
+
+
+class _Alias:
+  """A path to a folder that Orbax can use.
+
+  Orbax and TensorStore take `[`, `*` and `?` in a folder's path for patterns, a backslash for `/` and `:/` for a
+  protocol. Where a path has such characters, they get a link to it in the system's temporary folder.
+  """
+
+  def __init__(self, folder: Path):
+    self.path, self._temporary = folder, None
+    if not _PLAIN_PATH.fullmatch(str(folder)):
+      self._temporary = tempfile.TemporaryDirectory(prefix="playground_", ignore_cleanup_errors=True)
+      self.path = Path(self._temporary.name) / "checkpoints"
+      self.path.symlink_to(folder, target_is_directory=True)
+
+  def remove(self) -> None:
+    if self._temporary:
+      self._temporary.cleanup()
 
 
 def _alone() -> ocp.options.MultiprocessingOptions:

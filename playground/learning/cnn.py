@@ -1,6 +1,5 @@
 """Convolutional networks for observations that are pictures."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ from flax import linen
 
 from playground.envs.base import PIXELS
 from playground.errors import ConfigError, nearest
+from playground.learning.hyperparameters import CNNConfig
 
 ESTIMATOR = "estimator"  # a layer beside those that act
 NORM_EPSILON = 1e-6 * 255**2  # added to the variance of a picture's channel
@@ -22,27 +22,16 @@ _POOLS: dict[str, Callable[[jax.Array], jax.Array]] = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class CNNConfig:
-  """Layers of a CNN, and what is done before and after them (paper, appendix C.6; Mnih et al., 2015)."""
-
-  channels: Sequence[int] = (16, 32)
-  kernels: Sequence[int] = (5, 3)  # pixels, square
-  strides: Sequence[int] = (2, 2)
-  activation: str = "elu"
-  max_pool: bool = True  # the largest of 2 x 2 pixels after each layer
-  global_pool: str = "none"  # of the last layer: none (all of it), avg, max, spatial_softmax
-  normalize_channels: bool = False  # each channel of a picture to mean 0 and deviation 1
-
-  def check(self, activations: Mapping[str, Any]) -> None:
-    """Raises ConfigError for what cannot be."""
-    lengths = {len(self.channels), len(self.kernels), len(self.strides)}
-    if len(lengths) != 1 or not lengths.isdisjoint({0}):
-      raise ConfigError("agent.network.cnn.channels, kernels and strides must have one entry for each layer.")
-    for name, value, known in (("activation", self.activation, activations), ("global_pool", self.global_pool, _POOLS)):
-      if value not in known:
-        near = nearest(value, known)
-        raise ConfigError(f"agent.network.cnn.{name}={value!r} must be one of {', '.join(known)}.{near}")
+def check_cnn(config: CNNConfig, activations: Mapping[str, Any]) -> None:
+  """Raises ConfigError for layers that do not go together, and for names that do not exist."""
+  lengths = {len(config.channels), len(config.kernels), len(config.strides)}
+  if len(lengths) != 1 or not lengths.isdisjoint({0}):
+    raise ConfigError("agent.network.cnn.channels, kernels and strides must have one entry for each layer.")
+  choices = (("activation", config.activation, activations), ("global_pool", config.global_pool, _POOLS))
+  for name, value, known in choices:
+    if value not in known:
+      near = nearest(value, known)
+      raise ConfigError(f"agent.network.cnn.{name}={value!r} must be one of {', '.join(known)}.{near}")
 
 
 class CNN(linen.Module):

@@ -15,11 +15,9 @@ from jax.sharding import PartitionSpec as P
 
 from playground.envs.base import Env, Observation, State
 from playground.envs.wrappers import PRESERVE_INFO, ModelFields, wrap_for_training
-from playground.errors import ConfigError
 from playground.hardware.distributed import several
 from playground.hardware.mesh import AXIS, gather_on_mesh, jit_on_mesh, put
 from playground.learning.checkpoints import Checkpoint
-from playground.learning.cnn import CNNConfig
 from playground.learning.networks import Actor, Normalizer
 from playground.learning.rollout import NonfiniteCapture
 
@@ -99,8 +97,8 @@ class Learner(abc.ABC):
 
     Returns:
       The state after it and float32 scalars, the same on all devices: sums over what ended (`episodes`, `episode_*`),
-      counts (`nonfinite`, `nonfinite_updates`), and means. `learned` is 1, or 0 where there was nothing to learn from
-      yet; the means are 0 then.
+      counts (`nonfinite`, `gradient_steps`, and `nonfinite_updates`, those of them that were left out), and means.
+      `learned` is 1, or 0 where there was nothing to learn from yet; the means are 0 then.
     """
 
   def notices(self) -> list[str]:
@@ -212,24 +210,7 @@ class Learner(abc.ABC):
     return state, report(unravel(total))
 
 
-def check_divisible(config: Any, num_devices: int) -> None:
-  """Raises ConfigError where environments or batch cannot be divided evenly over the devices."""
-  for name in ("num_envs", "num_eval_envs", "batch_size"):
-    size = getattr(config, name)
-    if size % num_devices:
-      raise ConfigError(f"agent.{name}={size} must be a multiple of the number of devices, {num_devices}.")
-
-
-def from_config(config_class: Callable[..., Any], network_class: Callable[..., Any], config: Any) -> Any:
-  """Builds hyperparameters from the `agent` config (a mapping); `name` is not one of them."""
-  values = {k: v for k, v in dict(config).items() if k not in ("name", "network")}
-  network = dict(config["network"])
-  if "cnn" in network:
-    network["cnn"] = CNNConfig(**dict(network["cnn"]))
-  return config_class(**values, network=network_class(**network))
-
-
-_COUNTS = ("episodes", "nonfinite", "nonfinite_updates", "overflows")
+_COUNTS = ("episodes", "nonfinite", "gradient_steps", "nonfinite_updates", "overflows")
 
 
 def report(total: Metrics) -> Metrics:

@@ -104,6 +104,23 @@ def ppo_loss(
   return loss, dict(zip(LOSSES, parts, strict=True)) | estimation
 
 
+def pay_time_outs(batch: Batch, final_value: jax.Array, discounting: float, reward_scaling: float) -> Batch:
+  """Ends episodes that time cut as if they had earned there what the critic expects of the rest.
+
+  Args:
+    batch: trajectories.
+    final_value: the critic's value, of scaled rewards, of an episode's last observation where time cut it, else 0,
+      [T, B].
+    discounting: discount factor of one step.
+    reward_scaling: factor on rewards, which those of the batch still lack.
+  """
+  return batch.replace(
+    reward=batch.reward + discounting * final_value / reward_scaling,
+    termination=jnp.maximum(batch.termination, batch.truncation),
+    truncation=jnp.zeros_like(batch.truncation),
+  )
+
+
 def gae(
   batch: Batch, values: jax.Array, reward_scaling: float, discounting: float, gae_lambda: float
 ) -> tuple[jax.Array, jax.Array]:

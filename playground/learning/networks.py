@@ -1,6 +1,5 @@
 """Actors and critics on Brax's networks and distributions, with observation normalisation."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -15,7 +14,8 @@ from flax import linen, struct
 
 from playground.envs.base import PIXELS, Observation
 from playground.errors import ConfigError, nearest
-from playground.learning.cnn import ESTIMATOR, CNNConfig, PixelNetwork
+from playground.learning.cnn import ESTIMATOR, PixelNetwork, check_cnn
+from playground.learning.hyperparameters import CNNConfig, NetworkConfig, SoftNetworkConfig
 
 ACTIVATIONS = {"swish": linen.swish, "relu": linen.relu, "elu": linen.elu, "tanh": linen.tanh, "gelu": linen.gelu}
 
@@ -41,7 +41,7 @@ class Actor:
     obs_size: ObservationSize,
     action_size: int,
     hidden_layer_sizes: Sequence[int],
-    config: "NetworkConfig | SoftNetworkConfig",
+    config: NetworkConfig | SoftNetworkConfig,
     precision: str | None = None,
     layer_norm: bool = False,
   ):
@@ -160,7 +160,7 @@ class Actor:
     return self.pixel_sizes | ({key: self.obs_sizes[key]} if key else {})
 
   def _on_pixels(self, cnn: CNNConfig, sizes: Sequence[int], output_size: int, **how: Any) -> PixelNetwork:
-    cnn.check(ACTIVATIONS)
+    check_cnn(cnn, ACTIVATIONS)
     return PixelNetwork(cnn, ACTIVATIONS[cnn.activation], tuple(sizes), self.activation, output_size, **how)
 
   def _seen(self, obs: Mapping[str, jax.Array], key: str) -> tuple[dict[str, jax.Array], jax.Array | None]:
@@ -175,20 +175,6 @@ class Actor:
   def at_precision(self) -> AbstractContextManager[Any]:
     """A context in which matrix products have the networks' precision."""
     return jax.default_matmul_precision(self.precision or jax.config.jax_default_matmul_precision)
-
-
-@dataclasses.dataclass(frozen=True)
-class NetworkConfig:
-  """Sizes and inputs of actor and critic, two separate MLPs (Brax's names and defaults)."""
-
-  policy_hidden_layer_sizes: Sequence[int] = (32, 32, 32, 32)
-  value_hidden_layer_sizes: Sequence[int] = (256, 256, 256, 256, 256)
-  activation: str = "swish"
-  policy_obs_key: str = "state"  # entry of a dict observation that the actor sees; "" is none, beside pictures
-  value_obs_key: str = "state"  # entry that the critic sees, "privileged_state" for an asymmetric pair
-  estimated_obs_key: str = ""  # entry that the actor learns to estimate from pictures, "" is none
-  value_dtype: str = "auto"  # of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere
-  cnn: CNNConfig = dataclasses.field(default_factory=CNNConfig)  # for pictures, if the observation has any
 
 
 class ActorCriticParams(struct.PyTreeNode):
@@ -250,18 +236,6 @@ class ActorCritic(Actor):
       if self.pixel_sizes:
         return self._critic.apply(value_params, *self._seen(obs, self.value_obs_key))[..., 0]  # pyright: ignore
       return self._critic.apply(value_params, obs[self.value_obs_key])  # pyright: ignore[reportReturnType]
-
-
-@dataclasses.dataclass(frozen=True)
-class SoftNetworkConfig:
-  """Sizes and inputs of SAC's actor and twin critics (Brax's names and defaults)."""
-
-  hidden_layer_sizes: Sequence[int] = (256, 256)  # of the actor and of each critic
-  activation: str = "relu"
-  policy_network_layer_norm: bool = False
-  q_network_layer_norm: bool = False
-  policy_obs_key: str = "state"  # entry of a dict observation that the actor sees
-  value_obs_key: str = "state"  # entry that the critics see, "privileged_state" for an asymmetric pair
 
 
 class SoftActorCriticParams(struct.PyTreeNode):

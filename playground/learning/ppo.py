@@ -4,7 +4,6 @@ Names, meaning and defaults of the hyperparameters are Brax's (paper, Appendix E
 `batch_size * num_minibatches` trajectories of `unroll_length` steps and passes over them `num_updates_per_batch` times.
 """
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -21,60 +20,11 @@ from playground.envs.wrappers import ModelFields
 from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
 from playground.learning.cnn import random_shift
-from playground.learning.learner import SPEC, Learner, Metrics, TrainState, check_divisible, from_config
-from playground.learning.losses import ESTIMATION, LOSSES, Batch, ppo_loss
-from playground.learning.networks import ActorCritic, ActorCriticParams, NetworkConfig, Normalizer, normalize
+from playground.learning.hyperparameters import PPOConfig
+from playground.learning.learner import SPEC, Learner, Metrics, TrainState
+from playground.learning.losses import ESTIMATION, LOSSES, Batch, pay_time_outs, ppo_loss
+from playground.learning.networks import ActorCritic, ActorCriticParams, Normalizer, normalize
 from playground.learning.rollout import NonfiniteCapture, repeat_unroll, unroll
-
-
-@dataclasses.dataclass(frozen=True)
-class PPOConfig:
-  """Hyperparameters of PPO."""
-
-  num_timesteps: int  # total budget in control steps (action repeats counted), met to within one batch
-  num_evals: int = 10  # evaluations, the one before training and the one at the end included
-  num_resets_per_eval: int = 0  # fresh starts of all environments between two evaluations
-  num_envs: int = 2048
-  num_eval_envs: int = 128
-  unroll_length: int = 10  # control steps (decisions) of one trajectory
-  batch_size: int = 32  # trajectories of one minibatch
-  num_minibatches: int = 16
-  num_updates_per_batch: int = 2  # passes over the collected trajectories
-  learning_rate: float = 1e-4  # Adam's
-  max_grad_norm: float | None = None  # gradients are scaled down to this global norm
-  discounting: float = 0.9
-  gae_lambda: float = 0.95
-  entropy_cost: float = 1e-4
-  clipping_epsilon: float = 0.3
-  clipping_epsilon_value: float | None = None  # clips the value loss too, if set
-  vf_loss_coefficient: float = 0.5
-  estimation_coefficient: float = 1.0  # of the actor's error in estimating `network.estimated_obs_key`
-  reward_scaling: float = 1.0
-  normalize_observations: bool = False
-  normalize_advantage: bool = True
-  bootstrap_on_timeout: bool = False  # a time-out pays the discounted value of its state instead of being masked out
-  deterministic_eval: bool = False
-  init_at_random_ep_len: bool = False  # environments start as old as their draw says, so a batch holds all ages
-  augment_pixels: int = 0  # largest random shift of a trajectory's pictures in an update, pixels
-  network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
-
-  @classmethod
-  def from_config(cls, config: Any) -> "PPOConfig":
-    """Builds it from the `agent` config (a mapping)."""
-    return from_config(cls, NetworkConfig, config)
-
-  def steps_per_update(self, action_repeat: int) -> int:
-    """Control steps of one training step, over all devices."""
-    return self.batch_size * self.num_minibatches * self.unroll_length * action_repeat
-
-  def check(self, num_devices: int) -> None:
-    """Raises ConfigError where the sizes do not divide."""
-    if (self.batch_size * self.num_minibatches) % self.num_envs:
-      raise ConfigError(
-        f"agent.batch_size * agent.num_minibatches = {self.batch_size * self.num_minibatches} must be a multiple of "
-        f"agent.num_envs={self.num_envs}, so that every environment gives the same number of trajectories."
-      )
-    check_divisible(self, num_devices)
 
 
 class PPO(Learner):
@@ -145,8 +95,10 @@ class PPO(Learner):
 
     # Collect: every environment gives the same number of trajectories.
     normalizer: Normalizer | None = state.normalizer if config.normalize_observations else None
+    critic = state.params.value if config.bootstrap_on_timeout else None
+    actor = (self.networks, state.params.policy, normalizer)
     one = lambda env_state, capture, key: unroll(
-      self.env, env_state, capture, model, self.networks, state.params.policy, normalizer, key, config.unroll_length
+      self.env, env_state, capture, model, *actor, key, config.unroll_length, critic
     )
     keys = jax.random.split(rollout_key, config.batch_size * config.num_minibatches // config.num_envs)
     env_state, capture, data, last_obs, episodes = repeat_unroll(one, state.env_state, state.capture, keys)
@@ -157,8 +109,10 @@ class PPO(Learner):
     obs, last_obs = normalize(data.obs, normalizer), normalize(self.networks.select(last_obs), normalizer)
 
     batch = Batch(obs, last_obs, data.raw_action, data.log_prob, data.reward, data.termination, data.truncation)
-    if config.bootstrap_on_timeout or config.clipping_epsilon_value is not None:
-      batch = self._with_values(batch, state.params, normalize(data.obs, state.normalizer))
+    if config.clipping_epsilon_value is not None:
+      batch = batch.replace(value=self.networks.value(state.params.value, normalize(data.obs, state.normalizer)))
+    if data.final_value is not None:
+      batch = pay_time_outs(batch, data.final_value, config.discounting, config.reward_scaling)
 
     # Learn: several passes, each over its own shuffle of the trajectories. Parameters, Adam's moments and the log are a
     # vector each: of their forty arrays each would cost a kernel or two in every step.
@@ -177,7 +131,8 @@ class PPO(Learner):
     names = (*self.losses, "grad_norm", "nonfinite_updates")
     means = dict(zip(names, jax.lax.pmean(log.mean((0, 1)), AXIS), strict=True))
     metrics = means | jax.lax.psum(episodes, AXIS)
-    metrics["nonfinite_updates"] *= config.num_updates_per_batch * config.num_minibatches
+    metrics["gradient_steps"] = jnp.float32(config.num_updates_per_batch * config.num_minibatches)
+    metrics["nonfinite_updates"] *= metrics["gradient_steps"]
     metrics["learned"] = jnp.ones(())
     if vectors := jax.tree.leaves(self.networks.vectors(obs)):
       farthest = jnp.stack([jnp.abs(entry).max() for entry in vectors]).max()
@@ -219,19 +174,6 @@ class PPO(Learner):
     carry = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, carry)
     log = jnp.stack([*(parts[name] for name in self.losses), norm])
     return carry, jnp.append(jnp.where(finite, log, 0.0), 1.0 - finite)
-
-  def _with_values(self, batch: Batch, params: ActorCriticParams, obs: dict[str, jax.Array]) -> Batch:
-    """Adds the critic's values at acting time, and pays time-outs with them if they are to be bootstrapped."""
-    value = self.networks.value(params.value, obs)
-    if not self.config.bootstrap_on_timeout:
-      return batch.replace(value=value)
-    return batch.replace(
-      value=value,
-      # Values are of scaled rewards, rewards here are not scaled yet.
-      reward=batch.reward + self.config.discounting * batch.truncation * value / self.config.reward_scaling,
-      termination=jnp.maximum(batch.termination, batch.truncation),
-      truncation=jnp.zeros_like(batch.truncation),
-    )
 
   def _mean_std(self, params: ActorCriticParams, obs: dict[str, jax.Array]) -> jax.Array:
     """Mean standard deviation of the actor, before squashing, on the first step of the data."""

@@ -8,13 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from playground.envs.base import State
-from playground.envs.wrappers import ModelFields, Wrapper
+from playground.envs.base import Observation, State
+from playground.envs.wrappers import FINAL_OBS, AutoReset, ModelFields
 from playground.learning.networks import ActorCritic, Normalizer, normalize
 
 
 class Transitions(struct.PyTreeNode):
-  """Steps of N environments, each array [T, N, ...]; see `losses.Batch` for the fields. Observations are raw."""
+  """Steps of N environments, each array [T, N, ...]; see `losses.Batch` for the fields. Observations are raw.
+
+  `final_value` is the critic's value of an episode's last observation where time cut it, else 0; None if not asked for.
+  """
 
   obs: dict[str, jax.Array]
   raw_action: jax.Array
@@ -22,6 +25,7 @@ class Transitions(struct.PyTreeNode):
   reward: jax.Array
   termination: jax.Array
   truncation: jax.Array
+  final_value: jax.Array | None = None
 
 
 class Step(struct.PyTreeNode):
@@ -118,8 +122,16 @@ def episode_sums(state: State) -> EpisodeSums:
   return sums if buffers is None else sums | {"overflows": (buffers.overflow != 0).sum().astype(ended.dtype)}
 
 
+def step_and_see(env: AutoReset, state: State, action: jax.Array, model: ModelFields) -> tuple[State, Observation]:
+  """A step of a batch, and the observation that it made itself: where an episode ended the last one of that episode."""
+  after = AutoReset(env.env, env.full_reset, keep_final_obs=True).step(state, action, model)
+  info = dict(after.info)
+  final_obs = info.pop(FINAL_OBS)  # not carried to the next step
+  return after.replace(info=info), final_obs
+
+
 def unroll(
-  env: Wrapper,
+  env: AutoReset,
   state: State,
   capture: NonfiniteCapture,
   model: ModelFields,
@@ -128,8 +140,12 @@ def unroll(
   normalizer: Normalizer | None,
   key: jax.Array,
   length: int,
+  value_params: Any = None,
 ) -> tuple[State, NonfiniteCapture, Transitions, EpisodeSums]:
   """Steps the environments `length` times with sampled actions.
+
+  With the critic's parameters it values the last observation of every episode that time cuts, in the steps in which it
+  cuts any.
 
   Returns:
     The last state, the capture, the transitions and the sums over all steps of what ended.
@@ -141,8 +157,12 @@ def unroll(
     logits = networks.logits(policy_params, normalize(obs, normalizer))
     raw_action = networks.distribution.sample_no_postprocessing(logits, key)
     action = networks.distribution.postprocess(raw_action)
-    after = env.step(state, action, model)
+    after, final_obs = step_and_see(env, state, action, model)
     truncation = after.info["truncation"]
+    final_value = None
+    if value_params is not None:
+      value = lambda obs: networks.value(value_params, normalize(networks.select(obs), normalizer)) * truncation
+      final_value = jax.lax.cond(truncation.any(), value, lambda _: jnp.zeros_like(truncation), final_obs)
     transitions = Transitions(
       obs=obs,
       raw_action=raw_action,
@@ -150,6 +170,7 @@ def unroll(
       reward=after.reward,
       termination=after.done * (1 - truncation),
       truncation=truncation,
+      final_value=final_value,
     )
     capture = capture.look(state, action, model, after)
     return (after, capture), (transitions, episode_sums(after))

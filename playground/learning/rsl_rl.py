@@ -20,65 +20,15 @@ from jax.sharding import PartitionSpec as P
 from playground.envs.base import PIXELS, Env, Observation, State
 from playground.envs.wrappers import ModelFields
 from playground.errors import ConfigError, nearest
-from playground.extras import need
 from playground.hardware.mesh import AXIS, jit_on_mesh
-from playground.learning.learner import SPEC, Learner, Metrics, TrainState, from_config, report
+from playground.learning.hyperparameters import RslRlNetworkConfig, RslRlPPOConfig
+from playground.learning.learner import SPEC, Learner, Metrics, TrainState, report
 from playground.learning.networks import Actor, ActorCriticParams, ObservationSize
 from playground.learning.rollout import EpisodeSums, NonfiniteCapture, episode_sums
 
 _ACTIVATIONS = ("elu", "relu", "swish", "tanh")  # the same function here and there under the same name
 _EPSILON = 1e-2  # that RSL-RL adds to an observation's deviation
 _SMALLEST_STD = 1e-6  # of an action, in RSL-RL
-
-
-@dataclasses.dataclass(frozen=True)
-class RslRlNetworkConfig:
-  """Sizes and inputs of actor and critic, two separate MLPs."""
-
-  policy_hidden_layer_sizes: Sequence[int] = (512, 256, 128)
-  value_hidden_layer_sizes: Sequence[int] = (512, 256, 128)
-  activation: str = "elu"
-  init_noise_std: float = 1.0  # of the actions at first; learned, the same for every observation
-  policy_obs_key: str = "state"  # entry of a dict observation that the actor sees
-  value_obs_key: str | None = None  # that the critic sees; None is privileged_state where there is one, else state
-
-
-@dataclasses.dataclass(frozen=True)
-class RslRlPPOConfig:
-  """Hyperparameters; configs/agent/rsl_rl_ppo.yaml has RSL-RL's names for them."""
-
-  num_timesteps: int
-  num_evals: int = 10
-  num_resets_per_eval: int = 0
-  num_envs: int = 4096
-  num_eval_envs: int = 128
-  unroll_length: int = 24
-  num_minibatches: int = 4
-  num_updates_per_batch: int = 5
-  learning_rate: float = 3e-4
-  schedule: str = "fixed"  # or adaptive: the learning rate follows `desired_kl`
-  desired_kl: float = 0.01
-  max_grad_norm: float | None = 1.0
-  discounting: float = 0.99
-  gae_lambda: float = 0.95
-  entropy_cost: float = 1e-3
-  vf_loss_coefficient: float = 1.0
-  clipping_epsilon: float = 0.2
-  clip_value_loss: bool = True
-  normalize_observations: bool = True
-  deterministic_eval: bool = False
-  network: RslRlNetworkConfig = dataclasses.field(default_factory=RslRlNetworkConfig)
-
-  @classmethod
-  def from_config(cls, config: Any) -> Self:
-    """Builds it from the `agent` config (a mapping)."""
-    return from_config(cls, RslRlNetworkConfig, config)
-
-  def check(self, num_devices: int) -> None:
-    """Raises ConfigError where RSL-RL is not installed, or cannot train on so many devices."""
-    need("rsl-rl", "torch", "rsl_rl")
-    if num_devices > 1:
-      raise ConfigError(f"agent=rsl_rl_ppo trains on one device and not on {num_devices}: give hardware.devices=1.")
 
 
 class GaussianActorCritic(Actor):

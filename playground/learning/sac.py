@@ -4,8 +4,6 @@ Names, meaning and defaults of the hyperparameters are Brax's (paper, Appendix E
 every environment and then `grad_updates_per_step` gradient steps on transitions drawn from the replay buffer.
 """
 
-import dataclasses
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
@@ -24,57 +22,12 @@ from playground.errors import ConfigError
 from playground.hardware.distributed import several
 from playground.hardware.mesh import AXIS, device_memory
 from playground.learning.checkpoints import Checkpoint
-from playground.learning.learner import SPEC, Learner, Metrics, Policy, TrainState, check_divisible, from_config
-from playground.learning.networks import SoftActorCritic, SoftActorCriticParams, SoftNetworkConfig, normalize
+from playground.learning.hyperparameters import SACConfig
+from playground.learning.learner import SPEC, Learner, Metrics, Policy, TrainState
+from playground.learning.networks import SoftActorCritic, SoftActorCriticParams, normalize
 from playground.learning.replay import REPLAY_SPEC, Replay, ReplayBuffer
-from playground.learning.rollout import NonfiniteCapture, episode_sums
+from playground.learning.rollout import NonfiniteCapture, episode_sums, step_and_see
 from playground.learning.sac_losses import PARTS, Transition, sac_loss
-
-_MOST = 2**31 - 1  # transitions on a device: they are drawn by int32
-
-
-@dataclasses.dataclass(frozen=True)
-class SACConfig:
-  """Hyperparameters of SAC."""
-
-  num_timesteps: int  # total budget in control steps (action repeats and the first, unlearned from, counted)
-  num_evals: int = 10  # evaluations, the one before training and the one at the end included
-  num_resets_per_eval: int = 0  # fresh starts of all environments between two evaluations
-  num_envs: int = 128
-  num_eval_envs: int = 128
-  batch_size: int = 256  # transitions of one gradient step
-  grad_updates_per_step: int = 1  # gradient steps for each step of all environments
-  min_replay_size: int = 0  # transitions collected before the first gradient step
-  max_replay_size: int = 1_048_576  # transitions kept, the newest
-  learning_rate: float = 1e-4  # Adam's, for actor and critics
-  alpha_learning_rate: float = 3e-4  # Adam's, for the temperature
-  discounting: float = 0.9
-  tau: float = 0.005  # how far the target critics move towards the critics after each gradient step
-  reward_scaling: float = 1.0
-  normalize_observations: bool = False
-  deterministic_eval: bool = False
-  checkpoint_replay: bool = True  # whether checkpoints hold the replay buffer; if not, a resumed run refills it
-  network: SoftNetworkConfig = dataclasses.field(default_factory=SoftNetworkConfig)
-
-  @classmethod
-  def from_config(cls, config: Any) -> "SACConfig":
-    """Builds it from the `agent` config (a mapping)."""
-    return from_config(cls, SoftNetworkConfig, config)
-
-  @property
-  def prefill_updates(self) -> int:
-    """Training steps that only collect."""
-    return math.ceil(self.min_replay_size / self.num_envs)
-
-  def check(self, num_devices: int) -> None:
-    """Raises ConfigError where the sizes do not go together."""
-    check_divisible(self, num_devices)
-    for name in ("num_envs", "min_replay_size"):
-      if getattr(self, name) > self.max_replay_size:
-        size = getattr(self, name)
-        raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must not be below agent.{name}={size}.")
-    if self.max_replay_size // num_devices > _MOST:
-      raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must be at most {_MOST} for each device.")
 
 
 class SACState(TrainState):
@@ -114,7 +67,7 @@ class SAC(Learner):
     )
     obs = {key: jax.ShapeDtypeStruct(size, jnp.float32) for key, size in networks.obs_sizes.items()}
     scalar, action = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
-    example = Transition(obs, obs, action, reward=scalar, discount=scalar, truncation=scalar)  # pyright: ignore
+    example = Transition(obs, obs, action, reward=scalar, discount=scalar, nonfinite=scalar)  # pyright: ignore
     self.buffer = ReplayBuffer(config.max_replay_size, config.num_envs, example)
     if not config.checkpoint_replay:
       self.copy = self._make_copy(lambda state: state.replace(replay=state.replay.replace(data=None)))
@@ -162,7 +115,8 @@ class SAC(Learner):
 
     report = dict(zip((*PARTS, "grad_norm", "nonfinite_updates"), jax.lax.pmean(parts, AXIS), strict=True))
     metrics = report | jax.lax.psum(episode_sums(env_state), AXIS) | {"learned": ready.astype(jnp.float32)}
-    metrics["nonfinite_updates"] *= config.grad_updates_per_step
+    metrics["gradient_steps"] = metrics["learned"] * config.grad_updates_per_step
+    metrics["nonfinite_updates"] *= metrics["gradient_steps"]
     after = SACState(
       params=params,
       opt_state=opt_state,
@@ -179,14 +133,14 @@ class SAC(Learner):
     """Steps this device's environments once with sampled actions."""
     before = state.env_state
     action = self.act(self.policy(state), before.obs, key, deterministic=False)
-    after = self.env.step(before, action, model)
+    after, final_obs = step_and_see(self.env, before, action, model)
     transition = Transition(
       obs=self.networks.select(before.obs),
-      next_obs=self.networks.select(after.obs),
+      next_obs=self.networks.select(final_obs),
       action=action,
       reward=after.reward,
-      discount=1 - after.done,
-      truncation=jnp.maximum(after.info["truncation"], after.info["nonfinite"]),
+      discount=1 - after.done * (1 - after.info["truncation"]),
+      nonfinite=after.info["nonfinite"],
     )
     return after, state.capture.look(before, action, model, after), transition
 

@@ -14,11 +14,11 @@ class Transition(struct.PyTreeNode):
 
   Attributes:
     obs: observations the actions were taken on, each [B, ...].
-    next_obs: observations after them, each [B, ...]; where an episode ended, the next one's first.
+    next_obs: observations after them, each [B, ...]; where an episode ended, its own last one.
     action: in [-1, 1], [B, action_size].
     reward: [B], unscaled.
-    discount: 0 where the episode ended, else 1, [B].
-    truncation: 1 where the time limit (or a number that is not finite) cut it, [B]; the critics learn nothing there.
+    discount: 0 where the task ended the episode, else 1 (after a time-out, too), [B].
+    nonfinite: 1 where a number that is not finite cut it, [B]; the critics learn nothing there.
   """
 
   obs: dict[str, jax.Array]
@@ -26,7 +26,7 @@ class Transition(struct.PyTreeNode):
   action: jax.Array
   reward: jax.Array
   discount: jax.Array
-  truncation: jax.Array
+  nonfinite: jax.Array
 
 
 def sac_loss(
@@ -72,7 +72,7 @@ def sac_loss(
 
   next_value = next_q.min(axis=0) - alpha * next_log_prob
   target = fixed(batch.reward * reward_scaling + batch.discount * discounting * next_value)
-  critic_loss = 0.5 * jnp.square((q - target) * (1 - batch.truncation)).mean()
+  critic_loss = 0.5 * jnp.square((q - target) * (1 - batch.nonfinite)).mean()
   entropy = -log_prob.mean()
   actor_loss = -fixed(alpha) * entropy - actor_q.min(axis=0).mean()
   alpha_loss = alpha * fixed(entropy - target_entropy)

@@ -1,163 +1,193 @@
-"""What a joystick asks for: samplers of (forward m/s, left m/s, turn rad/s), and timers of how long a command lasts."""
+"""Command terms: what a policy is asked to do, and gaits.
+
+A command is a class whose fields are the term's `params`. `bind(env)` looks names up once; `reset(key)` returns the
+entries of `info` that an episode starts with, `step(c, key)` those for the next step. They outlast an auto-reset: an
+episode that ends starts the time of its command over, but keeps the command.
+"""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from playground.mdp.lookup import lookup
+from playground.errors import ConfigError
+from playground.limits import AtLeast0, Positive, Share, Span, Vector
+from playground.mdp.context import StepContext
 
 Info = dict[str, Any]
-
-
-class CommandSampler(Protocol):
-  """Draws commands, shape [3]."""
-
-  def first(self, key: jax.Array) -> jax.Array:
-    """Draws the command that an episode starts with."""
-    ...
-
-  def next(self, key: jax.Array, command: jax.Array) -> jax.Array:
-    """Draws the command that follows `command`."""
-    ...
+_AT_REST = np.pi  # the phase of a foot that stays on the floor
 
 
 @dataclasses.dataclass(frozen=True)
-class Walk:
-  """Changes some components at a time and often sets them to zero, so that moving on one axis alone is practised.
-
-  First: c ~ U(min, max). Next, for each component: with probability `change_probability` it becomes U(min, max), or 0
-  with probability 1 - `nonzero_probability`; else it stays. (Playground 0.2.0, Go1 and Apollo joystick.)
+class _VelocityCommand:
+  """Writes `command` [3] (forward m/s, left m/s, turn rad/s) and `command_steps_left`.
 
   Attributes:
-    min: smallest command of each component (m/s, m/s, rad/s).
-    max: largest (paper, appendix "Locomotion": 1.5, 0.8, 1.2 on Go1).
-    nonzero_probability: of each component, when it changes.
-    change_probability: of any component, when a new command is due.
+    max: largest command of each component.
+    min: smallest; None is -max.
+    resample_s: how long a command lasts, s.
+    exponential: the time is drawn for each command, `resample_s` is its mean.
   """
 
-  min: Sequence[float]
-  max: Sequence[float]
-  nonzero_probability: Sequence[float]
-  change_probability: float
+  max: Vector
+  min: Vector | None = None
+  resample_s: Positive = 5.0
+  exponential: bool = False
 
-  def first(self, key: jax.Array) -> jax.Array:
-    return jax.random.uniform(key, (3,), minval=jnp.array(self.min), maxval=jnp.array(self.max))
+  def bind(self, env: Any) -> None:
+    low = [-high for high in self.max] if self.min is None else self.min
+    if any(a > b for a, b in zip(low, self.max, strict=True)):
+      key = "env.commands.velocity.params"
+      raise ConfigError(f"{key}.min={list(low)} must not be above {key}.max={list(self.max)}.")
+    object.__setattr__(self, "_range", (jnp.array(low, jnp.float32), jnp.array(self.max, jnp.float32)))
+    object.__setattr__(self, "_dt", env.dt)
 
-  def next(self, key: jax.Array, command: jax.Array) -> jax.Array:
-    _, value_key, change_key, nonzero_key = jax.random.split(key, 4)
-    nonzero = jax.random.bernoulli(nonzero_key, jnp.array(self.nonzero_probability), (3,))
-    change = jax.random.bernoulli(change_key, self.change_probability, (3,))
-    return jnp.where(change, self.first(value_key) * nonzero, command)
+  def reset(self, key: jax.Array) -> Info:
+    key, time_key = jax.random.split(key)
+    return {"command": self._first(key), "command_steps_left": self._steps(time_key)}
+
+  def step(self, c: StepContext, key: jax.Array) -> Info:
+    key, time_key = jax.random.split(key)
+    left = c.info["command_steps_left"] - 1
+    due = left <= 0
+    return {
+      "command": jnp.where(due, self._next(key, c.info["command"]), c.info["command"]),
+      "command_steps_left": jnp.where(due | c.terminated, self._steps(time_key), left),
+    }
+
+  def _steps(self, key: jax.Array) -> jax.Array:
+    seconds = self.resample_s * (jax.random.exponential(key) if self.exponential else jnp.ones(()))
+    return jnp.round(seconds / self._dt).astype(jnp.int32)  # pyright: ignore[reportAttributeAccessIssue]
+
+  def _uniform(self, key: jax.Array) -> jax.Array:
+    low, high = self._range  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.random.uniform(key, (3,), minval=low, maxval=high)
+
+  def _first(self, key: jax.Array) -> jax.Array:
+    return self._uniform(key)
+
+  def _next(self, key: jax.Array, command: jax.Array) -> jax.Array:
+    raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True)
-class Box:
-  """Draws all components anew: c ~ U(min, max), with probability `zero_probability` all 0.
+class UniformVelocity(_VelocityCommand):
+  """Draws all components anew, uniformly; some commands are to stand still.
 
   Attributes:
-    min: smallest command of each component (m/s, m/s, rad/s).
-    max: largest.
     zero_probability: of standing still.
     deadband: a component whose size is below becomes 0.
-    unused_keys: how many random keys are split off and left unused first. (Playground 0.2.0's order of draws.)
   """
 
-  min: Sequence[float]
-  max: Sequence[float]
-  zero_probability: float
-  deadband: float
-  unused_keys: int = 0
+  zero_probability: Share = 0.0
+  deadband: AtLeast0 = 0.0
 
-  def first(self, key: jax.Array) -> jax.Array:
-    *keys, zero_key = jax.random.split(key, 4 + self.unused_keys)[self.unused_keys :]
-    bounds = zip(keys, self.min, self.max, strict=True)
-    command = jnp.stack([jax.random.uniform(k, minval=low, maxval=high) for k, low, high in bounds])
-    command = jnp.where(jax.random.bernoulli(zero_key, self.zero_probability), 0.0, command)
+  def _first(self, key: jax.Array) -> jax.Array:
+    key, zero_key = jax.random.split(key)
+    command = jnp.where(jax.random.bernoulli(zero_key, self.zero_probability), 0.0, self._uniform(key))
     return jnp.where(jnp.abs(command) < self.deadband, 0.0, command)
 
-  def next(self, key: jax.Array, command: jax.Array) -> jax.Array:
+  def _next(self, key: jax.Array, command: jax.Array) -> jax.Array:
     del command
-    return self.first(key)
+    return self._first(key)
 
 
-def make_sampler(config: Any) -> CommandSampler:
-  """Builds the sampler that `env.command.sampler` names; `min: null` is the opposite of `max`."""
-  high = tuple(config.max)
-  low = tuple(-x for x in high) if config.min is None else tuple(config.min)
-  samplers: dict[str, CommandSampler] = {
-    "walk": Walk(low, high, tuple(config.nonzero_probability), config.change_probability),
-    "box": Box(low, high, config.zero_probability, config.deadband, config.unused_keys),
-  }
-  return lookup(samplers, config.sampler, "env.command.sampler")
+@dataclasses.dataclass(frozen=True)
+class VelocityWalk(_VelocityCommand):
+  """Changes some components at a time and often sets them to zero, so that moving on one axis alone is practised.
 
-
-class Timer(Protocol):
-  """Says when a command is due.
+  (Playground 0.2.0, joysticks of Go1 and Apollo.)
 
   Attributes:
-    keys: names of the random keys that `start` and `advance` need.
+    change_probability: of each component, when a new command is due.
+    nonzero_probability: of each component, when it changes: else it becomes 0.
   """
 
-  keys: ClassVar[tuple[str, ...]]
+  change_probability: float = 0.5
+  nonzero_probability: Sequence[float] = (0.9, 0.25, 0.5)
 
-  def start(self, keys: Mapping[str, jax.Array]) -> Info:
-    """Returns the entries of `info` that an episode starts with."""
-    ...
+  def bind(self, env: Any) -> None:
+    super().bind(env)
+    if len(self.nonzero_probability) != 3 or not all(
+      0 <= p <= 1 for p in (self.change_probability, *self.nonzero_probability)
+    ):
+      raise ConfigError(
+        "env.commands: change_probability and the three of nonzero_probability must be between 0 and 1."
+      )
 
-  def advance(self, info: Mapping[str, Any], done: jax.Array, keys: Mapping[str, jax.Array]) -> tuple[jax.Array, Info]:
-    """Counts a step; an episode that ends starts the count anew, but keeps its command.
-
-    Returns:
-      Whether a new command is due, bool, and the entries of `info` that changed.
-    """
-    ...
-
-
-@dataclasses.dataclass(frozen=True)
-class ExponentialTimer:
-  """A command lasts an exponentially distributed time of mean `duration` (s), in control steps of `dt` (s)."""
-
-  keys: ClassVar[tuple[str, ...]] = ("command_timer",)
-  duration: float
-  dt: float
-
-  def start(self, keys: Mapping[str, jax.Array]) -> Info:
-    return {"steps_until_next_cmd": exponential_steps(keys["command_timer"], self.duration, self.dt)}
-
-  def advance(self, info: Mapping[str, Any], done: jax.Array, keys: Mapping[str, jax.Array]) -> tuple[jax.Array, Info]:
-    steps = info["steps_until_next_cmd"] - 1
-    due = steps <= 0
-    return due, {"steps_until_next_cmd": jnp.where(due | done, self.start(keys)["steps_until_next_cmd"], steps)}
+  def _next(self, key: jax.Array, command: jax.Array) -> jax.Array:
+    value_key, change_key, nonzero_key = jax.random.split(key, 3)
+    nonzero = jax.random.bernoulli(nonzero_key, jnp.array(self.nonzero_probability), (3,))
+    change = jax.random.bernoulli(change_key, self.change_probability, (3,))
+    return jnp.where(change, self._uniform(value_key) * nonzero, command)
 
 
 @dataclasses.dataclass(frozen=True)
-class FixedTimer:
-  """A command lasts `duration` (s), in control steps of `dt` (s)."""
+class Gait:
+  """When each foot is to be in the air, and how high.
 
-  keys: ClassVar[tuple[str, ...]] = ()
-  duration: float
-  dt: float
+  A foot's phase runs from -pi, where it leaves the floor, over 0, where it is highest, to pi, where it is back. Writes
+  `phase` (rad [feet]), `phase_dt` (rad in a control step), `gait` (index of the mode), `gait_freq` (Hz) and, if it is
+  drawn, `foot_height` (m).
 
-  def start(self, keys: Mapping[str, jax.Array]) -> Info:
-    del keys
-    return {"step": jnp.zeros((), jnp.int32)}
+  Attributes:
+    modes: gaits of the robot's YAML, one of which an episode has.
+    frequency: range of the steps' frequency, one value for an episode, Hz.
+    foot_height: range of the highest swing of the feet, one value for an episode, m; None draws none.
+    rest_when_still: all feet stay on the floor while the command is to stand still.
+  """
 
-  def advance(self, info: Mapping[str, Any], done: jax.Array, keys: Mapping[str, jax.Array]) -> tuple[jax.Array, Info]:
-    del keys
-    step = info["step"] + 1
-    due = step >= round(self.duration / self.dt)
-    return due, {"step": jnp.where(due | done, 0, step)}
+  modes: Sequence[str]
+  frequency: Span = (1.25, 1.5)
+  foot_height: Span | None = None
+  rest_when_still: bool = False
+
+  def bind(self, env: Any) -> None:
+    phases = np.array([env.robot.gait(name) for name in self.modes])
+    object.__setattr__(self, "_phases", jnp.array(np.where(phases > np.pi, phases - 2 * np.pi, phases)))
+    object.__setattr__(self, "_dt", env.dt)
+
+  def reset(self, key: jax.Array) -> Info:
+    mode_key, frequency_key, height_key = jax.random.split(key, 3)
+    mode = jax.random.randint(mode_key, (), 0, len(self.modes))
+    low, high = self.frequency
+    frequency = jax.random.uniform(frequency_key, minval=low, maxval=high)
+    info = {
+      "phase": self._phases[mode],  # pyright: ignore[reportAttributeAccessIssue]
+      "phase_dt": 2 * jnp.pi * self._dt * frequency,  # pyright: ignore[reportAttributeAccessIssue]
+      "gait": mode,
+      "gait_freq": frequency,
+    }
+    if self.foot_height is not None:
+      low, high = self.foot_height
+      info["foot_height"] = jax.random.uniform(height_key, minval=low, maxval=high)
+    return info
+
+  def step(self, c: StepContext, key: jax.Array) -> Info:
+    del key
+    phase = c.info["phase"]
+    if self.rest_when_still:
+      phase = jnp.where((phase == _AT_REST).all(), self._phases[c.info["gait"]], phase)  # pyright: ignore[reportAttributeAccessIssue]
+    phase = jnp.fmod(phase + c.info["phase_dt"] + jnp.pi, 2 * jnp.pi) - jnp.pi
+    if self.rest_when_still:
+      phase = jnp.where(is_still(c.command), _AT_REST, phase)
+    return {"phase": phase}
 
 
-def make_timer(config: Any, dt: float) -> Timer:
-  """Builds the timer that `env.command.timer` names."""
-  timers: dict[str, type[ExponentialTimer | FixedTimer]] = {"exponential": ExponentialTimer, "fixed": FixedTimer}
-  return lookup(timers, config.timer, "env.command.timer")(config.duration, dt)
+def is_still(command: jax.Array) -> jax.Array:
+  """Whether a velocity command is to stand still, bool: its norm is at most 0.01."""
+  return jnp.linalg.norm(command) <= 0.01
 
 
-def exponential_steps(key: jax.Array, mean: float, dt: float) -> jax.Array:
-  """Draws a number of control steps, int32: an exponentially distributed time of mean `mean` (s) over `dt` (s)."""
-  return jnp.round(jax.random.exponential(key) * mean / dt).astype(jnp.int32)
+def swing_height(phase: jax.Array, peak: jax.Array | float) -> jax.Array:
+  """Returns how high a foot should be at its phase: `peak` times 3u² - 2u³, u rising to 1 at phase 0 and falling back.
+
+  (Paper, appendix "Locomotion", feet phase. The polynomial goes on beyond +- pi.)
+  """
+  place = (phase + jnp.pi) / (2 * jnp.pi)
+  rise, fall = 2 * place, 2 * place - 1
+  smooth = lambda u: 3 * u**2 - 2 * u**3
+  return peak * jnp.where(place <= 0.5, smooth(rise), 1 - smooth(fall))

@@ -1,7 +1,8 @@
-"""What rewards, observations and terminations of a legged robot are functions of: the robot and the present moment."""
+"""A robot on legs: its constant facts, and what terms read of it in a step."""
 
-import dataclasses
-from collections.abc import Mapping
+import functools
+import re
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -11,13 +12,13 @@ import numpy as np
 
 from playground.envs.physics import PhysicsData, mjx
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.mdp.commands import is_still
+from playground.mdp.context import StepContext
 from playground.mdp.lookup import lookup
-
-STILL = 0.01  # a command whose norm is not above asks to stand still
 
 
 class LeggedRobot:
-  """A robot's fixed facts, found in the compiled model under the names of `configs/robot/<robot>.yaml`.
+  """A robot's constant facts, found in the compiled model under the names of its YAML (`configs/robot/`).
 
   The first joint is the free one of the base; actuators stand in the order of the other joints.
 
@@ -29,26 +30,30 @@ class LeggedRobot:
     root: id of the body that is pushed.
     base_site: id of the site that carries the inertial sensors.
     feet: ids of the foot sites, shape [feet].
-    misreads_contact: whether tasks should read `misread_contact` in their steps.
+    foot_names: names of the foot sites.
+    joint_names: of the joints but the root's.
+    qpos, qvel: where the joints are in `qpos` and `qvel`.
     pose_weights: how much each joint's distance from the default pose counts, shape [nu].
-    torque_limits: of the joints, N m, shape [nu].
   """
 
-  def __init__(self, mj_model: mujoco.MjModel, config: Any, parity: bool = False):
+  qpos = slice(7, None)
+  qvel = slice(6, None)
+
+  def __init__(self, mj_model: mujoco.MjModel, config: Any):
     """Looks the names up.
 
     Args:
       mj_model: the compiled scene.
       config: `env.robot`.
-      parity: whether its `parity`, if there is one, counts: `sensors` replace others, `misread_contact` is as it says.
 
     Raises:
       UnknownNameError: the model has no object of that name.
-      ConfigError: the model's joints come in another order.
+      ConfigError: the model's joints come in another order, or a list has not one entry for each foot or joint.
     """
     joints = [mujoco.mj_id2name(mj_model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
       raise ConfigError(f"env.robot.joints must name the model's joints in their order: {', '.join(joints)}.")
+    _check_lengths(config)
     self._mj_model = mj_model
     self.init_qpos = self.keyframe(config.keyframe)
     self.default_pose = self.init_qpos[7:]
@@ -57,26 +62,18 @@ class LeggedRobot:
     own = config.get("target_range")
     self.target_range = jnp.array([own.lower, own.upper] if own else mj_model.actuator_ctrlrange.T)
     self.root = _find(mj_model, "body", config.root)
-    replaced = config.parity if parity and "parity" in config else {}
     self.base_site = _find(mj_model, "site", config.base_site)
     self.feet = np.array([_find(mj_model, "site", name) for name in config.feet])
-    self.misreads_contact: bool = replaced.get("misread_contact", False)
-    sensors = {**config.sensors, **replaced.get("sensors", {})}
-    self._sensors = {key: _address(mj_model, name) for key, name in sensors.items()}
+    self.foot_names, self.joint_names = tuple(config.feet), tuple(joints)
+    self._sensors = {key: _address(mj_model, name) for key, name in config.sensors.items()}
     self._foot_linvel = np.array([_address(mj_model, name) for name in config.foot_linvel])
     contact_sensors = [[_find(mj_model, "sensor", name) for name in foot] for foot in config.foot_contact]
     self._foot_contact = [mj_model.sensor_adr[ids] for ids in contact_sensors]
-    self._foot_contact_misread = contact_sensors
     self._foot_pos = np.array([_address(mj_model, name) for name in config.get("foot_pos", ())])
     self._foot_force = np.array([_address(mj_model, name) for name in config.get("foot_force", ())])
     self._subtree = _subtree(mj_model, self.root)
-    self.pose_weights = tuple(config.get("pose_weights", [1.0] * len(joints)))
-    self.torque_limits = jnp.array(_torque_limits(mj_model))
-    order = {name: i for i, name in enumerate(joints)}
-    self._groups = {
-      group: np.array([lookup(order, name, f"env.robot.{group}") for name in config.get(group, ())], int)
-      for group in ("hips", "hip_rolls", "knees")
-    }
+    self.pose_weights = jnp.array(config.get("pose_weights", [1.0] * len(joints)))
+    self._joint_groups = {group: list(config[group]) for group in ("hips", "hip_rolls", "knees") if config.get(group)}
     self._contacts = {
       group: [_address(mj_model, name)[0] for name in config.get(group, ())]
       for group in ("self_contact", "fatal_contact")
@@ -88,12 +85,41 @@ class LeggedRobot:
     return jnp.array(self._mj_model.key_qpos[_find(self._mj_model, "key", name)])
 
   def sensor(self, data: PhysicsData, key: str) -> jax.Array:
-    """Returns the reading of the sensor that the robot's configuration has under `sensors.<key>`."""
+    """Returns the reading of a sensor, by its key in `sensors` of the robot's YAML; raises UnknownNameError."""
     return data.sensordata[lookup(self._sensors, key, "env.robot.sensors")]
 
-  def joints(self, group: str) -> np.ndarray:
-    """Returns the indices of the joints under `hips`, `hip_rolls` or `knees`; raises ConfigError if there are none."""
-    return self._present(group, self._groups[group])
+  def find_joints(self, joints: str | Sequence[str]) -> np.ndarray:
+    """Returns the indices of joints, in the model's order.
+
+    Args:
+      joints: a group of the robot's YAML (`hips`, `hip_rolls`, `knees`), a regular expression that matches whole
+        names, or several of them.
+
+    Raises:
+      UnknownNameError: one that matches no joint.
+    """
+    found: set[int] = set()
+    for name in (joints,) if isinstance(joints, str) else joints:
+      patterns = self._joint_groups.get(name, [name])
+      matches = {i for i, joint in enumerate(self.joint_names) if any(re.fullmatch(p, joint) for p in patterns)}
+      if not matches:
+        known = [*self._joint_groups, *self.joint_names]
+        raise UnknownNameError(f"joints={name!r} matches no joint of the robot.{nearest(name, known)}")
+      found |= matches
+    return np.array(sorted(found))
+
+  def add_joint_group(self, name: str, joints: Sequence[str]) -> None:
+    """Gives joints a name that `find_joints` knows."""
+    self._joint_groups[name] = [re.escape(joint) for joint in joints]
+
+  def add_contact_group(self, name: str, sensors: Sequence[str]) -> None:
+    """Gives contact sensors a name that `touching` knows."""
+    self._contacts[name] = [_address(self._mj_model, sensor)[0] for sensor in sensors]
+
+  def find_feet(self, feet: Sequence[str]) -> np.ndarray:
+    """Returns the indices of feet in `feet` by their names; raises UnknownNameError."""
+    order = {name: i for i, name in enumerate(self.foot_names)}
+    return np.array([lookup(order, name, "feet") for name in feet], int)
 
   def gait(self, name: str) -> list[float]:
     """Returns the feet's phases at the start of a gait, rad; raises UnknownNameError if the robot has none of the name.
@@ -101,7 +127,7 @@ class LeggedRobot:
     Raises:
       ConfigError: it has not one phase for each foot.
     """
-    phases = lookup(self._gaits, name, "env.gait.modes")
+    phases = lookup(self._gaits, name, "env.commands.gait.params.modes")
     if len(phases) != len(self.feet):
       raise ConfigError(f"env.robot.gaits.{name} must hold {len(self.feet)} phases, one for each foot.")
     return list(phases)
@@ -119,7 +145,10 @@ class LeggedRobot:
     return data.sensordata[self._present("foot_force", self._foot_force)]
 
   def touching(self, data: PhysicsData, group: str) -> jax.Array:
-    """Returns which of the contacts under `self_contact` or `fatal_contact` there are, bool, shape [contacts]."""
+    """Returns which contacts of a group there are, bool, shape [contacts].
+
+    Groups are `self_contact` and `fatal_contact` of the robot's YAML, and those of `add_contact_group`.
+    """
     return data.sensordata[np.array(self._present(group, self._contacts[group]))] > 0
 
   def _present(self, key: str, found: Any) -> Any:
@@ -131,89 +160,65 @@ class LeggedRobot:
     """Returns whether each foot touches the floor, bool, shape [feet]: any of its contact sensors is above 0."""
     return jnp.stack([(data.sensordata[address] > 0).any() for address in self._foot_contact])
 
-  def misread_contact(self, data: PhysicsData) -> jax.Array:
-    """As `contact`, but takes the sensors' ids for the addresses of their readings: a slip of Playground 0.2.0's H1.
-
-    What it reads are the base's height and the directions of its axes.
-    """
-    return jnp.stack([(data.sensordata[np.array(ids)] > 0).any() for ids in self._foot_contact_misread])
-
   def mass(self, model: mjx.Model) -> jax.Array:
     """Returns the mass that a push on `root` moves, kg: the root's and that of all it carries."""
     return model.body_mass[self._subtree].sum()
 
 
-@dataclasses.dataclass(frozen=True)
-class Context:
-  """One environment after one control step, before the bookkeeping for the next.
+def _check_lengths(config: Any) -> None:
+  """Raises ConfigError where a list of `env.robot` has not one entry for each foot or for each joint."""
+  if not config.feet:
+    raise ConfigError("env.robot.feet must name one foot or more.")
+  own = config.get("target_range") or {}
+  per_joint = {"pose_weights": config.get("pose_weights"), **{f"target_range.{end}": own[end] for end in own}}
+  per_foot = {"foot_linvel": config.foot_linvel, "foot_contact": config.foot_contact}
+  per_foot |= {key: config.get(key) or None for key in ("foot_pos", "foot_force")}  # some robots have none
+  for what, names, lists in (("joint", config.joints, per_joint), ("foot", config.feet, per_foot)):
+    for key, entries in lists.items():
+      if entries is not None and len(entries) != len(names):
+        raise ConfigError(
+          f"env.robot.{key} has {len(entries)} entries: it must have {len(names)}, one for each {what}."
+        )
 
-  Attributes:
-    robot: the robot's fixed facts.
-    data: the physics.
-    info: what the task carries, as it stood during the step: `last_act`, and as far as the task has them
-      `last_last_act` (the two actions before `action`), `command` (m/s, m/s, rad/s), `last_contact`, `phase` (rad);
-      `feet_air_time` (s, shape [feet]) and `swing_peak` (m, highest z of each foot since it last touched) already
-      count this step.
-    action: the action just applied, shape [nu].
-    contact: which feet touch the floor, bool, shape [feet].
-    first_contact: which of them were in the air before, bool, shape [feet].
-    done: whether the episode ends here, bool.
+
+class LeggedContext(StepContext):
+  """A step of a robot on legs.
+
+  `info` has `feet_air_time` (s), `swing_peak` (m) and `last_contact` (bool), each of shape [feet], as they stood before
+  the step, in tasks that track feet.
   """
 
-  robot: LeggedRobot
-  data: PhysicsData
-  info: Mapping[str, Any]
-  action: jax.Array
-  contact: jax.Array
-  first_contact: jax.Array
-  done: jax.Array
+  robot: "LeggedRobot"
 
-  def sensor(self, key: str) -> jax.Array:
-    return self.robot.sensor(self.data, key)
+  @functools.cached_property
+  def contact(self) -> jax.Array:
+    """Which feet touch the floor, bool, shape [feet]."""
+    return self.robot.contact(self.data)
 
-  def kept(self, name: str) -> jax.Array:
-    """Returns an entry of `info`.
+  @functools.cached_property
+  def feet_air_time(self) -> jax.Array:
+    """How long each foot has been in the air, this step included, s, shape [feet]."""
+    return self.carried("feet_air_time") + self.dt
 
-    Raises:
-      ConfigError: the task keeps none of that name.
-    """
-    if name not in self.info:
-      raise ConfigError(f"Something in env.obs or env.reward needs the {name!r} that this task does not keep.")
-    return self.info[name]
+  @functools.cached_property
+  def swing_peak(self) -> jax.Array:
+    """Highest z of each foot since it last touched, m, shape [feet]."""
+    return jnp.maximum(self.carried("swing_peak"), self.feet_height)
 
   @property
-  def command(self) -> jax.Array:
-    return self.kept("command")
-
-  @property
-  def commanded_speed(self) -> jax.Array:
-    """Norm of the command, its turning included: 0 is to stand still."""
-    return jnp.linalg.norm(self.command)
+  def first_contact(self) -> jax.Array:
+    """Which feet have landed, bool, shape [feet]; one that touched in the step before but left since has, too."""
+    return (self.carried("feet_air_time") > 0) & (self.contact | self.carried("last_contact"))
 
   @property
   def still(self) -> jax.Array:
     """Whether the command is to stand still, bool."""
-    return self.commanded_speed <= STILL
+    return is_still(self.command)
 
   @property
   def phase(self) -> jax.Array:
     """Phases of the feet in the gait, rad, shape [feet]."""
-    return self.kept("phase")
-
-  @property
-  def pose_error(self) -> jax.Array:
-    """Joint positions relative to the default pose, rad, shape [nu]."""
-    return self.joint_pos - self.robot.default_pose
-
-  @property
-  def joint_pos(self) -> jax.Array:
-    """Joint positions, rad, shape [nu]."""
-    return self.data.qpos[7:]
-
-  @property
-  def joint_vel(self) -> jax.Array:
-    """Joint velocities, rad/s, shape [nu]."""
-    return self.data.qvel[6:]
+    return self.carried("phase")
 
   @property
   def gravity(self) -> jax.Array:
@@ -254,20 +259,13 @@ def _find(mj_model: mujoco.MjModel, kind: str, name: str) -> int:
   index = mujoco.mj_name2id(mj_model, obj, name)
   if index < 0:
     names = [mujoco.mj_id2name(mj_model, obj, i) or "" for i in range(getattr(mj_model, count))]
-    raise UnknownNameError(f"env.robot names the {kind} {name!r}, which the model has not.{nearest(name, names)}")
+    raise UnknownNameError(f"env.robot names the {kind} {name!r}, which the model does not have.{nearest(name, names)}")
   return index
 
 
 def _address(mj_model: mujoco.MjModel, sensor: str) -> np.ndarray:
   index = _find(mj_model, "sensor", sensor)
   return mj_model.sensor_adr[index] + np.arange(mj_model.sensor_dim[index])
-
-
-def _torque_limits(mj_model: mujoco.MjModel) -> np.ndarray:
-  """What bounds each torque: the servo's range of forces, or the joint's; infinite where nothing does."""
-  servo = np.where(mj_model.actuator_forcelimited, mj_model.actuator_forcerange[:, 1], np.inf)
-  joint = np.where(mj_model.jnt_actfrclimited[1:], mj_model.jnt_actfrcrange[1:, 1], np.inf)
-  return np.minimum(servo, joint)
 
 
 def _subtree(mj_model: mujoco.MjModel, root: int) -> np.ndarray:

@@ -1,207 +1,335 @@
-"""Reward terms of legged robots, and how they are chosen, weighed and added up.
+"""Reward terms of robots in general and of robots on legs.
 
-A term is a function of a `Context` and of the keys of `env.reward` that its keyword arguments name; a new one is a
-function here (the base's motion), in `joints.py`, `feet.py` or `stances.py`, and a weight in `env.reward.scales`. A
-weight's name is the function's, unless `env.reward.functions` names another: tasks share names such as `orientation`
-(and so what is logged) and mean different things. Formulas are those of Playground 0.2.0, on which the published
-weights were tuned; where the paper (appendix "Locomotion", reward functions) writes another, the term says so.
+Formulas are those of Playground 0.2.0, on which the published weights were tuned; where the paper (appendix
+"Locomotion", reward functions) writes another, the term says so. Sensors, site poses and actuator forces are one
+physics step older than `qpos` and `qvel`, as MuJoCo leaves them. Heights are the world's, on any terrain. Up is the
+base's upward axis in the world frame. A frame is chosen by the sensor that is read: `linvel` and `gyro` are in the
+base's frame, `global_linvel` and `global_angvel` in the world frame.
 """
 
-import inspect
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 
-from playground.errors import ConfigError, nearest
-from playground.mdp.feet import FEET
-from playground.mdp.joints import JOINTS
-from playground.mdp.legged import Context
-from playground.mdp.lookup import lookup
-from playground.mdp.stances import STANCES
+from playground.limits import AtLeast0, Positive, Vector, positive
+from playground.mdp.commands import swing_height
+from playground.mdp.context import StepContext
+from playground.mdp.legged import LeggedContext
 
-Term = Callable[[Any], jax.Array]  # of the present moment: a `Context`, of a robot on legs or of a hand
-
-# The reward from the sums of weighted terms of positive and of negative weight; times the control step.
-TOTALS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
-  "sum": lambda gain, cost: gain + cost,
-  "product": lambda gain, cost: gain * jnp.exp(0.2 * cost),
-}
+# Any robot.
 
 
-def bind(
-  config: Any,
-  functions: Mapping[str, Callable[..., jax.Array]],
-  *,
-  parity: bool = False,
-  facts: Mapping[str, Any] | None = None,
-) -> dict[str, tuple[float, Term]]:
-  """Chooses and parametrises terms.
-
-  Args:
-    config: `env.reward`: `scales` (weight by name), the terms' parameters; where terms are not the functions of their
-      names `functions` and `parity_functions` (function's name by term), and where they do not always count
-      `when_moving` and `when_still` (norm of the command by term: above, or below, it the term counts, else it is 0).
-    functions: the functions to choose from, by name.
-    parity: whether `parity_functions` replace others and their conditions: Playground 0.2.0's slips.
-    facts: parameters that are not in `config`, by name.
-
-  Returns:
-    (weight, term) by name, without those of weight 0.
-
-  Raises:
-    UnknownNameError: a weight for a term that does not exist, or a function that does not.
-    ConfigError: a term's parameter is missing.
-  """
-  facts = facts or {}
-  chosen = {name: name for name in config.scales}
-  for key, counts in (("functions", True), ("parity_functions", parity)):
-    for name, function in dict(config.get(key, {})).items():
-      lookup(chosen, name, f"env.reward.{key}")
-      lookup(functions, function, f"env.reward.{key}.{name}")
-      chosen[name] = function if counts else chosen[name]
-  slips = set(config.get("parity_functions", {})) if parity else set()  # bring conditions of their own
-  gates = {key: dict(config.get(key, {})) for key in ("when_moving", "when_still")}
-  for key, gated in gates.items():
-    for name in gated:
-      lookup(chosen, name, f"env.reward.{key}")
-  bound = {}
-  for name in config.scales:
-    function = lookup(functions, chosen[name], "env.reward.scales")
-    parameters = {}
-    for parameter in list(inspect.signature(function).parameters)[1:]:
-      if parameter not in facts and parameter not in config:
-        raise ConfigError(f"env.reward.{parameter} is missing: term {name!r} needs it.{nearest(parameter, config)}")
-      parameters[parameter] = facts[parameter] if parameter in facts else config[parameter]
-    bounds = (None if name in slips else gates[key].get(name) for key in ("when_moving", "when_still"))
-    bound[name] = (config.scales[name], _term(function, parameters, *bounds))
-  return {name: (weight, term) for name, (weight, term) in bound.items() if weight != 0}
+def is_terminated(c: StepContext) -> jax.Array:
+  """1 in the step that terminates the episode."""
+  return c.terminated.astype(jnp.float32)
 
 
-def _term(
-  function: Callable[..., jax.Array], parameters: dict[str, Any], above: float | None, below: float | None
-) -> Term:
-  def term(c: Context) -> jax.Array:
-    value = function(c, **parameters)
-    value = value if above is None else value * (c.commanded_speed > above)
-    return value if below is None else value * (c.commanded_speed < below)
-
-  return term
+def is_alive(c: StepContext) -> jax.Array:
+  """1 in every step but the one that terminates the episode."""
+  return 1.0 - is_terminated(c)
 
 
-def tracking_lin_vel(c: Context, tracking_sigma: float) -> jax.Array:
-  """exp(-|command_xy - v_xy|² / sigma), v the base's velocity in its own frame."""
-  error = jnp.square(c.command[:2] - c.sensor("linvel")[:2]).sum()
-  return jnp.exp(-error / tracking_sigma)
-
-
-def tracking_ang_vel(c: Context, tracking_sigma: float) -> jax.Array:
-  """exp(-(command_yaw - w_z)² / sigma), w the gyro's reading."""
-  return jnp.exp(-jnp.square(c.command[2] - c.sensor("gyro")[2]) / tracking_sigma)
-
-
-def tracking(c: Context, tracking_sigma: float) -> jax.Array:
-  """`tracking_lin_vel` + 0.5 `tracking_ang_vel`."""
-  return tracking_lin_vel(c, tracking_sigma) + 0.5 * tracking_ang_vel(c, tracking_sigma)
-
-
-def lin_vel_z(c: Context) -> jax.Array:
-  """v_z², v the base's velocity in the world frame."""
-  return jnp.square(c.sensor("global_linvel")[2])
-
-
-def lin_vel_z_local(c: Context) -> jax.Array:
-  """v_z², v the base's velocity in its own frame."""
-  return jnp.square(c.sensor("linvel")[2])
-
-
-def lin_vel_z_with_torso(c: Context) -> jax.Array:
-  """v_z² of the base plus that of the torso, in the world frame."""
-  return lin_vel_z(c) + jnp.square(c.sensor("torso_linvel")[2])
-
-
-def lin_vel_z_in_level_gaits(c: Context, level_gaits: Sequence[str], gait_modes: Sequence[str]) -> jax.Array:
-  """As `lin_vel_z`, in the gaits whose base should stay level; 0 in those in which it flies."""
-  level = jnp.array([mode in level_gaits for mode in gait_modes])
-  return lin_vel_z(c) * level[c.kept("gait")]
-
-
-def lin_vel_z_in_other_gaits(c: Context, level_gaits: Sequence[str], gait_modes: Sequence[str]) -> jax.Array:
-  """As `lin_vel_z`, in the other gaits only: a slip of Playground 0.2.0's Spot."""
-  return lin_vel_z(c) - lin_vel_z_in_level_gaits(c, level_gaits, gait_modes)
-
-
-def lin_vel_xy(c: Context) -> jax.Array:
-  """v_x² + v_y², v the base's velocity in the world frame."""
-  return jnp.square(c.sensor("global_linvel")[:2]).sum()
-
-
-def ang_vel(c: Context) -> jax.Array:
-  """|w|², w the base's angular velocity."""
-  return jnp.square(c.sensor("global_angvel")).sum()
-
-
-def ang_vel_xy(c: Context) -> jax.Array:
-  """w_x² + w_y², w the base's angular velocity in the world frame."""
-  return jnp.square(c.sensor("global_angvel")[:2]).sum()
-
-
-def ang_vel_xy_local(c: Context) -> jax.Array:
-  """w_x² + w_y², w the gyro's reading."""
-  return jnp.square(c.sensor("gyro")[:2]).sum()
-
-
-def ang_vel_xy_of_torso(c: Context) -> jax.Array:
-  """w_x² + w_y², w the torso's angular velocity in the world frame."""
-  return jnp.square(c.sensor("torso_angvel")[:2]).sum()
-
-
-def orientation(c: Context) -> jax.Array:
-  """up_x² + up_y², up the base's upward axis in the world frame."""
-  return jnp.square(c.sensor("upvector")[:2]).sum()
-
-
-def orientation_as(c: Context, upvector_target: Sequence[float]) -> jax.Array:
-  """|up - target|², up the base's upward axis in the world frame. (Paper: `orientation`.)"""
-  return jnp.square(c.sensor("upvector") - jnp.array(upvector_target)).sum()
-
-
-def base_height(c: Context, base_height_target: float) -> jax.Array:
-  """(z - target)², z the root joint's, world frame."""
-  return jnp.square(c.data.qpos[2] - base_height_target)
-
-
-def collision(c: Context) -> jax.Array:
-  """1 while the robot's parts touch each other as its `self_contact` lists."""
-  return c.robot.touching(c.data, "self_contact").any().astype(jnp.float32)
-
-
-def alive(c: Context) -> jax.Array:
+def constant(c: StepContext) -> jax.Array:
   """1 in every step."""
   del c
   return jnp.ones(())
 
 
-def alive_until_done(c: Context) -> jax.Array:
-  """1 in every step but the one that terminates the episode."""
-  return 1.0 - termination(c)
+def action_l2(c: StepContext) -> jax.Array:
+  """|action|²."""
+  return jnp.square(c.action).sum()
 
 
-def termination(c: Context) -> jax.Array:
-  """1 in the step that terminates the episode."""
-  return c.done.astype(jnp.float32)
+def action_rate_l2(c: StepContext) -> jax.Array:
+  """|action - last action|²."""
+  return jnp.square(c.action - c.last_action).sum()
 
 
-def termination_early(c: Context) -> jax.Array:
-  """As `termination`, in the first 500 steps of a command (not of an episode): a slip of 0.2.0's Barkour and OP3."""
-  return termination(c) * (c.kept("step") < 500)
+def action_smoothness_l2(c: StepContext) -> jax.Array:
+  """|a - a1|² + |a - 2 a1 + a2|², a1 and a2 the last action and the one before: first and second difference."""
+  second = c.action - 2 * c.last_action + c.action_before_last
+  return action_rate_l2(c) + jnp.square(second).sum()
 
 
-_BASE = (
-  tracking_lin_vel, tracking_ang_vel, tracking, lin_vel_z, lin_vel_z_local, lin_vel_z_with_torso,
-  lin_vel_z_in_level_gaits, lin_vel_z_in_other_gaits, lin_vel_xy, ang_vel, ang_vel_xy, ang_vel_xy_local,
-  ang_vel_xy_of_torso, orientation, orientation_as, base_height, collision, alive, alive_until_done, termination,
-  termination_early,
-)  # fmt: skip
-REWARDS: dict[str, Callable[..., jax.Array]] = {f.__name__: f for f in _BASE} | JOINTS | FEET | STANCES
+def joint_pos_limits(c: StepContext, soft_limit_factor: Annotated[float, positive(1)]) -> jax.Array:
+  """Sum over joints of how far q lies outside the soft limits: the range shrunk about its centre by the factor."""
+  lower, upper = c.robot.joint_range
+  centre, reach = (lower + upper) / 2, (upper - lower) / 2 * soft_limit_factor
+  return _outside(c.joint_pos, centre - reach, centre + reach)
+
+
+def _outside(x: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
+  return (jnp.maximum(lower - x, 0) + jnp.maximum(x - upper, 0)).sum()
+
+
+def joint_deviation_l1(c: StepContext, joints: str | Sequence[str] = ".*") -> jax.Array:
+  """Sum |q - default| over the joints. (Paper: `stand_still`, k |command_xy|.)
+
+  Args:
+    c: the step.
+    joints: a group of the robot's YAML (`hips`, `knees`), a regular expression of joint names, or several.
+  """
+  return jnp.abs(c.joint_pos_rel[c.robot.find_joints(joints)]).sum()
+
+
+def joint_deviation_l2(c: StepContext, joints: str | Sequence[str] = ".*") -> jax.Array:
+  """Sum (q - default)² over the joints; see `joint_deviation_l1`."""
+  return jnp.square(c.joint_pos_rel[c.robot.find_joints(joints)]).sum()
+
+
+def joint_torques_l1(c: StepContext) -> jax.Array:
+  """|tau|_1, tau the actuators' forces. (Paper: |tau|².)"""
+  return jnp.abs(c.data.actuator_force).sum()
+
+
+def joint_torques_l2(c: StepContext) -> jax.Array:
+  """|tau|², tau the actuators' forces."""
+  return jnp.square(c.data.actuator_force).sum()
+
+
+def joint_torques_norms(c: StepContext) -> jax.Array:
+  """|tau|_2 + |tau|_1, tau the actuators' forces. (Paper: |tau|².)"""
+  return jnp.linalg.norm(c.data.actuator_force) + joint_torques_l1(c)
+
+
+def joint_power_l1(c: StepContext) -> jax.Array:
+  """Sum |qd_j| |tau_j|, W, of a robot that has an actuator for each joint. (Paper: |qd * tau|.)"""
+  return (jnp.abs(c.joint_vel) * jnp.abs(c.data.actuator_force)).sum()
+
+
+def joint_acc_l2(c: StepContext) -> jax.Array:
+  """|qdd|², of the joints."""
+  return jnp.square(c.data.qacc[c.robot.qvel]).sum()
+
+
+def joint_vel_l2(c: StepContext) -> jax.Array:
+  """|qd|², of the joints."""
+  return jnp.square(c.joint_vel).sum()
+
+
+def joint_vel_limits_l2(c: StepContext, limit: AtLeast0) -> jax.Array:
+  """Sum max(|qd_j| - limit, 0)², rad²/s²."""
+  return jnp.square(jnp.maximum(jnp.abs(c.joint_vel) - limit, 0.0)).sum()
+
+
+# Robots on legs: the base.
+
+
+def track_linear_velocity_exp(c: LeggedContext, std: Positive) -> jax.Array:
+  """exp(-|command_xy - v_xy|² / std²), v the base's velocity in its own frame."""
+  error = jnp.square(c.command[:2] - c.sensor("linvel")[:2]).sum()
+  return jnp.exp(-error / std**2)
+
+
+def track_angular_velocity_exp(c: LeggedContext, std: Positive) -> jax.Array:
+  """exp(-(command_yaw - w_z)² / std²), w the gyro's reading."""
+  return jnp.exp(-jnp.square(c.command[2] - c.sensor("gyro")[2]) / std**2)
+
+
+def lin_vel_z_l2(c: LeggedContext, sensors: Sequence[str] = ("global_linvel",)) -> jax.Array:
+  """Sum over the sensors of v_z²."""
+  return sum((jnp.square(c.sensor(name)[2]) for name in sensors), jnp.zeros(()))
+
+
+def lin_vel_z_l2_in_gaits(c: LeggedContext, gaits: Sequence[str]) -> jax.Array:
+  """v_z² in the world frame while the episode's gait is one of those; 0 in the others, in which the base flies."""
+  level = jnp.array([mode in gaits for mode in c.env.config.commands.gait.params.modes])
+  return lin_vel_z_l2(c) * level[c.carried("gait")]
+
+
+def lin_vel_xy_l2(c: LeggedContext) -> jax.Array:
+  """v_x² + v_y² in the world frame."""
+  return jnp.square(c.sensor("global_linvel")[:2]).sum()
+
+
+def ang_vel_l2(c: LeggedContext) -> jax.Array:
+  """|w|², w the base's angular velocity."""
+  return jnp.square(c.sensor("global_angvel")).sum()
+
+
+def ang_vel_xy_l2(c: LeggedContext, sensor: str = "global_angvel") -> jax.Array:
+  """w_x² + w_y² of the sensor's reading."""
+  return jnp.square(c.sensor(sensor)[:2]).sum()
+
+
+def flat_orientation_l2(c: LeggedContext) -> jax.Array:
+  """up_x² + up_y²."""
+  return jnp.square(c.sensor("upvector")[:2]).sum()
+
+
+def orientation_l2(c: LeggedContext, target: Vector) -> jax.Array:
+  """|up - target|². (Paper: `orientation`.)"""
+  return jnp.square(c.sensor("upvector") - jnp.array(target)).sum()
+
+
+def upright_exp(c: LeggedContext) -> jax.Array:
+  """exp(-2 |up - e_z|²)."""
+  return jnp.exp(-2 * _tilt(c))
+
+
+def forward_alignment(c: LeggedContext, target: Vector) -> jax.Array:
+  """((x · target + 1) / 2)², x the base's forward axis in the world frame."""
+  return jnp.square(0.5 * c.forward @ jnp.array(target) + 0.5)
+
+
+def base_height_l2(c: LeggedContext, target: float) -> jax.Array:
+  """(z - target)², z of the root joint, m²."""
+  return jnp.square(c.data.qpos[2] - target)
+
+
+def base_height_exp(c: LeggedContext, target: float) -> jax.Array:
+  """exp(min(h, target) - target), h the height of the base site, m."""
+  return jnp.exp(jnp.minimum(c.base_height, target) - target)
+
+
+def base_height_expm1(c: LeggedContext, target: float) -> jax.Array:
+  """exp(min(h, target)) - 1, h the height of the base site, m."""
+  return jnp.exp(jnp.minimum(c.base_height, target)) - 1
+
+
+def root_height_ratio(c: LeggedContext, target: Positive) -> jax.Array:
+  """z / target of the root joint, within 0 and 1."""
+  return jnp.clip(c.data.qpos[2] / target, 0.0, 1.0)
+
+
+def base_drift_l2(c: LeggedContext) -> jax.Array:
+  """v_x² + v_y² + w_z², the root's velocity in the world frame and its turning about its own z."""
+  return jnp.square(c.data.qvel[jnp.array([0, 1, 5])]).sum()
+
+
+def self_contact(c: LeggedContext) -> jax.Array:
+  """1 while the robot's parts touch each other as `self_contact` of its YAML lists."""
+  return c.robot.touching(c.data, "self_contact").any().astype(jnp.float32)
+
+
+# Robots on legs: the pose.
+
+
+def pose_l2(c: LeggedContext) -> jax.Array:
+  """Sum_j weight_j (q_j - default_j)², the weights `pose_weights` of the robot's YAML. (Paper: without weights.)"""
+  return (jnp.square(c.joint_pos_rel) * c.robot.pose_weights).sum()
+
+
+def pose_exp(c: LeggedContext) -> jax.Array:
+  """exp(-`pose_l2`)."""
+  return jnp.exp(-pose_l2(c))
+
+
+def pose_l2_by_command(c: LeggedContext) -> jax.Array:
+  """As `pose_l2`; all joints weigh 1 while standing still; hip rolls weigh 0.01 above 0.3 m/s sideways, else 1.
+
+  (Playground 0.2.0, Apollo.)
+  """
+  weights = jnp.where(c.still, 1.0, c.robot.pose_weights)
+  rolls = jnp.where(jnp.abs(c.command[1]) > 0.3, 0.01, 1.0)
+  weights = weights.at[c.robot.find_joints("hip_rolls")].set(rolls)
+  return (jnp.square(c.joint_pos_rel) * weights).sum()
+
+
+def pose_exp_when_still(c: LeggedContext, sharpness: Positive) -> jax.Array:
+  """exp(-sharpness |q - default|²) while the command is to stand still, else 1."""
+  return jnp.exp(-sharpness * jnp.square(c.joint_pos_rel).sum() * c.still)
+
+
+def pose_exp_when_upright(c: LeggedContext, tilt: Positive) -> jax.Array:
+  """exp(-|q - default|² / 2) while |up - e_z|² < tilt, else 0."""
+  return jnp.exp(-0.5 * jnp.square(c.joint_pos_rel).sum()) * (_tilt(c) < tilt)
+
+
+def hip_deviation_l1(c: LeggedContext, sideways: AtLeast0 = 0.1) -> jax.Array:
+  """Sum |q - default| over the robot's `hips`; `hip_rolls` are free while |command_y| > sideways, m/s."""
+  rolls = joint_deviation_l1(c, "hip_rolls")
+  return joint_deviation_l1(c, "hips") - rolls * (jnp.abs(c.command[1]) > sideways)
+
+
+def action_exp_when_up(c: LeggedContext, tilt: Positive, height: float) -> jax.Array:
+  """exp(-|action|² / 2) while |up - e_z|² < tilt and the base site is above `height` m, else 0: once up, stay."""
+  return _action_exp(c, c.base_height, tilt, height)
+
+
+def action_exp_when_root_up(c: LeggedContext, tilt: Positive, height: float) -> jax.Array:
+  """As `action_exp_when_up`, of the height of the root joint."""
+  return _action_exp(c, c.data.qpos[2], tilt, height)
+
+
+def _action_exp(c: LeggedContext, z: jax.Array, tilt: Positive, height: float) -> jax.Array:
+  return jnp.exp(-0.5 * jnp.square(c.action).sum()) * ((_tilt(c) < tilt) & (z > height))
+
+
+def _tilt(c: LeggedContext) -> jax.Array:
+  """|up - e_z|², from 0 (upright) to 4 (upside down)."""
+  return jnp.square(c.sensor("upvector") - jnp.array([0.0, 0.0, 1.0])).sum()
+
+
+# Robots on legs: the feet.
+
+
+def feet_clearance(c: LeggedContext, target: Positive) -> jax.Array:
+  """Sum over feet of |z - target| sqrt(|v_xy|): a moving foot should be at swing height. (Paper: (z - target)².)"""
+  speed = jnp.linalg.norm(c.feet_velocity[:, :2], axis=-1)
+  return (jnp.abs(c.feet_height - target) * jnp.sqrt(speed)).sum()
+
+
+def feet_swing_height_l2(c: LeggedContext, target: Positive) -> jax.Array:
+  """Sum over feet that touch down of (peak / target - 1)², peak the highest z of the swing."""
+  return (jnp.square(c.swing_peak / target - 1) * c.first_contact).sum()
+
+
+def feet_slip_l2(c: LeggedContext) -> jax.Array:
+  """Sum over feet in contact of |v_xy|²."""
+  return (jnp.square(c.feet_velocity[:, :2]).sum(axis=-1) * c.contact).sum()
+
+
+def base_speed_times_contacts(c: LeggedContext) -> jax.Array:
+  """Number of feet in contact times |v_xy| of the base, world frame. (Paper: `feet_slip`.)"""
+  return jnp.linalg.norm(c.sensor("global_linvel")[:2]) * c.contact.sum()
+
+
+def feet_air_time(c: LeggedContext, threshold: AtLeast0, limit: AtLeast0 | None = None) -> jax.Array:
+  """Sum over feet that touch down of air time - threshold, s, with a limit at most limit - threshold.
+
+  (Paper: not below 0 either.)
+  """
+  time = (c.feet_air_time - threshold) * c.first_contact
+  return (time if limit is None else jnp.minimum(time, limit - threshold)).sum()
+
+
+def feet_phase_exp(c: LeggedContext, std: Positive, peak: Positive | None = None) -> jax.Array:
+  """exp(-sum (z - swing height)² / std²), the swing height that of the foot's phase in the gait.
+
+  Args:
+    c: the step.
+    std: m.
+    peak: highest swing, m; None is the `foot_height` that the gait command draws for an episode.
+  """
+  peaks = c.carried("foot_height") if peak is None else peak
+  error = jnp.square(c.feet_height - swing_height(c.phase, peaks)).sum()
+  return jnp.exp(-error / std**2)
+
+
+def feet_phase_exp_unless_at_rest(c: LeggedContext, std: Positive, peak: Positive) -> jax.Array:
+  """As `feet_phase_exp`; 0 when asked to stand still, unless the base moves or turns at more than 0.1 m/s or rad/s."""
+  linvel, angvel = c.sensor("global_linvel"), c.sensor("global_angvel")
+  moving = (jnp.linalg.norm(linvel[:2]) > 0.1) | (jnp.abs(angvel[2]) > 0.1) | ~c.still
+  return feet_phase_exp(c, std, peak) * moving
+
+
+def feet_distance(c: LeggedContext, minimum: AtLeast0) -> jax.Array:
+  """minimum - d, m, within 0 and 0.1: d is how far the first two feet are apart sideways, seen along the heading."""
+  apart = c.data.site_xpos[c.robot.feet[0]] - c.data.site_xpos[c.robot.feet[1]]
+  heading = jnp.arctan2(c.forward[1], c.forward[0])
+  sideways = jnp.abs(jnp.cos(heading) * apart[1] - jnp.sin(heading) * apart[0])
+  return jnp.clip(minimum - sideways, 0.0, 0.1)
+
+
+def feet_contact_force(c: LeggedContext, limit: AtLeast0) -> jax.Array:
+  """Sum over feet of max(|F_z| - limit, 0), N, F the force between the foot and its leg."""
+  vertical = jnp.abs(c.robot.feet_force(c.data)[:, 2])
+  return jnp.maximum(vertical - limit, 0.0).sum()
+
+
+def feet_contact(c: LeggedContext, feet: Sequence[str]) -> jax.Array:
+  """1 while any of the feet touches the floor."""
+  return c.contact[c.robot.find_feet(feet)].any().astype(jnp.float32)

@@ -1,53 +1,56 @@
-"""Reasons to end an episode. A new one is a function here and its name and threshold in `env.termination`.
-
-A threshold of null switches the reason off.
-"""
-
-from collections.abc import Callable
+"""Termination terms: reasons to end an episode, each a bool of shape []."""
 
 import jax
 import jax.numpy as jnp
 
-from playground.mdp.legged import Context
+from playground.limits import AtLeast0
+from playground.mdp.context import StepContext
+from playground.mdp.hands import HandContext
+from playground.mdp.legged import LeggedContext
 
 
-def fall(c: Context, threshold: float) -> jax.Array:
-  """The base's upward axis points below `threshold` (its world z; 0 is lying on the side). Paper: inverted."""
-  return c.sensor("upvector")[2] < threshold
+def nonfinite_state(c: StepContext) -> jax.Array:
+  """Some position or velocity is not a finite number."""
+  return ~(jnp.isfinite(c.data.qpos).all() & jnp.isfinite(c.data.qvel).all())
 
 
-def power(c: Context, threshold: float) -> jax.Array:
-  """The motors' power, sum |tau_j qd_j|, is above `threshold` W. Paper: 400 W, then down to 200 W."""
-  return jnp.abs(c.data.actuator_force * c.joint_vel).sum() > threshold
+def upvector_below(c: LeggedContext, limit: float) -> jax.Array:
+  """The world z of the base's upward axis is below the limit; 0 is lying on the side. Paper: inverted."""
+  return c.sensor("upvector")[2] < limit
 
 
-def joint_limits(c: Context, threshold: float) -> jax.Array:
-  """Some joint is more than `threshold` rad outside its range."""
+def power_above(c: StepContext, limit: AtLeast0) -> jax.Array:
+  """The actuators' power, sum |tau_j qd_j|, is above the limit, W. Paper: 400 W, then down to 200 W."""
+  return jnp.abs(c.data.actuator_force * c.joint_vel).sum() > limit
+
+
+def joint_pos_out_of_limit(c: StepContext, margin: AtLeast0 = 0.0) -> jax.Array:
+  """Some joint is more than the margin outside its range, rad."""
   lower, upper = c.robot.joint_range
-  return ((c.joint_pos < lower - threshold) | (c.joint_pos > upper + threshold)).any()
+  return ((c.joint_pos < lower - margin) | (c.joint_pos > upper + margin)).any()
 
 
-def target_limits(c: Context, threshold: float) -> jax.Array:
-  """Some joint is more than `threshold` rad outside the range of its targets."""
+def joint_pos_out_of_target_range(c: LeggedContext, margin: AtLeast0 = 0.0) -> jax.Array:
+  """Some joint is more than the margin outside the range of its targets, rad."""
   lower, upper = c.robot.target_range
-  return ((c.joint_pos < lower - threshold) | (c.joint_pos > upper + threshold)).any()
+  return ((c.joint_pos < lower - margin) | (c.joint_pos > upper + margin)).any()
 
 
-def low(c: Context, threshold: float) -> jax.Array:
-  """The base site is less than `threshold` m above the world's z = 0."""
-  return c.base_height < threshold
+def base_height_below(c: LeggedContext, limit: float) -> jax.Array:
+  """The base site is less than the limit above the world's z = 0, m."""
+  return c.base_height < limit
 
 
-def fatal_contact(c: Context, threshold: float) -> jax.Array:
-  """More than `threshold` of the contacts between the robot's parts that its `fatal_contact` names."""
-  return c.robot.touching(c.data, "fatal_contact").sum() > threshold
+def fatal_contact(c: LeggedContext, count: int = 0) -> jax.Array:
+  """There are more than `count` of the contacts that `fatal_contact` of the robot's YAML lists."""
+  return c.robot.touching(c.data, "fatal_contact").sum() > count
 
 
-TERMINATIONS: dict[str, Callable[[Context, float], jax.Array]] = {
-  "fall": fall,
-  "power": power,
-  "joint_limits": joint_limits,
-  "target_limits": target_limits,
-  "low": low,
-  "fatal_contact": fatal_contact,
-}
+def leg_contact(c: LeggedContext) -> jax.Array:
+  """A part of a supporting leg other than its foot touches the floor (task Stand)."""
+  return c.robot.touching(c.data, "leg_contact").any()
+
+
+def cube_height_below(c: HandContext, limit: float) -> jax.Array:
+  """The cube's centre is below the limit, world z, m."""
+  return c.sensor("cube_position")[2] < limit

@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 
+from playground.interpreter import PYTHON
+
 NO_GL_REMEDY = (
   "No working OpenGL was found: install one (on Debian or Ubuntu `apt install libegl1` for EGL or "
   "`apt install libosmesa6` for software rendering), or name one that works in MUJOCO_GL."
@@ -36,19 +38,20 @@ def withhold_gl() -> None:
 def find_gl() -> str | None:
   """Returns a value of MUJOCO_GL with which MuJoCo draws here, or None; probed once per process, in subprocesses.
 
-  The user's own MUJOCO_GL comes first (and `MUJOCO_GL=disable` means none), then EGL, OSMesa and, if there is a
-  display, GLFW.
+  The user's own MUJOCO_GL comes first (and `MUJOCO_GL=disable` means none). Then come EGL, OSMesa and, if there is a
+  display, GLFW on Linux, and CGL (macOS) and GLFW elsewhere.
   """
   asked = os.environ.get("MUJOCO_GL", os.environ.get(_ASKED, "")).lower().strip()
   if asked in _OFF:
     return None
-  candidates = [asked, "egl", "osmesa", "glfw" if os.environ.get("DISPLAY") else ""]
+  linux = [asked, "egl", "osmesa", "glfw" if os.environ.get("DISPLAY") else ""]
+  candidates = linux if sys.platform == "linux" else [asked, "cgl", "glfw"]
   return next((backend for backend in dict.fromkeys(candidates) if backend and works(backend)), None)
 
 
 def works(backend: str, timeout_s: float = 60.0) -> bool:
   """Returns whether MuJoCo can draw a picture with this backend, found out in a subprocess."""
-  command = [sys.executable, "-c", _PROBE]
+  command = [*PYTHON, "-c", _PROBE]
   try:
     done = subprocess.run(command, env=gl_environment(backend), capture_output=True, timeout=timeout_s)
   except subprocess.TimeoutExpired:

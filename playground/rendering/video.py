@@ -1,16 +1,21 @@
 """Renders a recorded trajectory to MP4 in a child process, so that no GL crash or hang reaches the run.
 
-`python -m playground.rendering.video <trajectory.npz> <out.mp4>` is the child; $MUJOCO_GL chooses how it draws.
+`python -m playground.rendering.video <out.mp4> <scratch> <pipe>` is the child, which `render_video` starts with the
+trajectory as its standard input; $MUJOCO_GL chooses how it draws. The child owns the scratch folder. It removes the
+folder and ends when its parent dies, however that happens: then the other end of the pipe closes.
 """
 
 import contextlib
+import io
 import math
 import os
+import secrets
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,43 +23,14 @@ from typing import Any
 import numpy as np
 
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
+from playground.interpreter import PYTHON
 from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
 from playground.runs.files import need_file, replacing
 
 MAX_FPS = 50.0
+_TRIES = 100
 # Names of cameras that look on from where a task is seen best; the swimmer's is tracking1.
 _CAMERAS = ("track", "tracking", "tracking1", "fixed", "side", "front", "back", "cam0")
-
-
-def save_trajectory(
-  path: str | Path,
-  mj_model: Any,
-  qpos: np.ndarray,
-  mocap_pos: np.ndarray | None = None,
-  mocap_quat: np.ndarray | None = None,
-  dt: float = 0.02,
-  **view: Any,
-) -> Path:
-  """Writes a trajectory to `path` (.npz) and its model next to it (.mjb).
-
-  Args:
-    path: ends in .npz.
-    mj_model: the MjModel that `qpos` belongs to.
-    qpos: [T, nq].
-    mocap_pos: [T, nmocap, 3], if bodies are moved by mocap.
-    mocap_quat: [T, nmocap, 4].
-    dt: seconds between two rows of `qpos`.
-    **view: camera, width, height, seen of the video (`render_video`).
-  """
-  import mujoco
-
-  path, qpos = Path(path), np.asarray(qpos)
-  if qpos.ndim != 2 or qpos.shape[1] != mj_model.nq:
-    raise ValueError(f"qpos must have shape [T, {mj_model.nq}], not {list(qpos.shape)}")
-  arrays: dict[str, Any] = {"qpos": qpos, "dt": dt, "mocap_pos": mocap_pos, "mocap_quat": mocap_quat, **view}
-  np.savez_compressed(path, **{k: v for k, v in arrays.items() if v is not None})
-  mujoco.mj_saveModel(mj_model, str(path.with_suffix(".mjb")))
-  return path
 
 
 def render_video(
@@ -97,34 +73,40 @@ def render_video(
     notify(f"No video at {out_path.name}. {NO_GL_REMEDY}")
     return None
   timeout_s = timeout_s or 60.0 + 0.5 * len(qpos)
-  scratch = tempfile.TemporaryDirectory(prefix="playground_video_", ignore_cleanup_errors=True)
-  with scratch as folder, open(f"{folder}/stderr", "w+") as stderr:
-    view = {"camera": camera, "width": width, "height": height, "seen": seen}
-    trajectory = save_trajectory(Path(folder) / "trajectory.npz", mj_model, qpos, mocap_pos, mocap_quat, dt, **view)
-    environment = gl_environment(backend) | {
-      # The child runs this very package, whatever its folder.
-      "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
-      "JAX_PLATFORMS": "cpu",  # and must never reach for the GPU memory that training holds
-    }
-    rendered = Path(folder) / "video.mp4"  # what a killed encoder leaves goes with the folder
-    command = [sys.executable, "-m", "playground.rendering.video", str(trajectory), str(rendered)]
-    child = subprocess.Popen(command, cwd=folder, env=environment, stderr=stderr, start_new_session=True)
-    try:
-      code = child.wait(timeout_s)
-      stderr.seek(0)
-      lines = stderr.read().strip().splitlines()
-      reason = lines[-1].rstrip(".") if lines else f"the renderer ended with code {code}"
-    except subprocess.TimeoutExpired:
-      code, reason = 1, f"rendering with MUJOCO_GL={backend} took longer than {timeout_s:g} s"
-    finally:
-      with contextlib.suppress(OSError):
-        os.killpg(child.pid, signal.SIGKILL)  # the whole group: the encoder would live on and write its file
-      child.wait()
-    if code == 0 and rendered.is_file():
-      out_path.parent.mkdir(parents=True, exist_ok=True)
-      with replacing(out_path) as temporary:
-        shutil.copyfile(rendered, temporary)
-      return out_path
+  view = {"camera": camera, "width": width, "height": height, "seen": seen}
+  trajectory = _pack(mj_model, qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat, dt=dt, **view)
+  environment = gl_environment(backend) | {
+    # The child runs this very package, whatever its folder.
+    "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
+    "JAX_PLATFORMS": "cpu",  # and must never reach for the GPU memory that training holds
+  }
+  scratch = Path(tempfile.gettempdir()).absolute() / f"playground_video_{secrets.token_hex(8)}"
+  theirs, ours = os.pipe()
+  command = [*PYTHON, "-m", "playground.rendering.video", str(out_path), str(scratch), str(theirs)]
+  try:
+    with subprocess.Popen(
+      command,
+      env=environment,
+      stdin=subprocess.PIPE,
+      stderr=subprocess.PIPE,
+      pass_fds=(theirs,),
+      start_new_session=True,
+    ) as child:
+      try:
+        stderr = child.communicate(trajectory, timeout_s)[1].decode(errors="replace")
+        lines = stderr.strip().splitlines()
+        reason = lines[-1].rstrip(".") if lines else f"the renderer ended with code {child.returncode}"
+      except subprocess.TimeoutExpired:
+        reason = f"rendering with MUJOCO_GL={backend} took longer than {timeout_s:g} s"
+      finally:
+        with contextlib.suppress(OSError):
+          os.killpg(child.pid, signal.SIGKILL)  # the whole group: the encoder would live on and write its file
+  finally:
+    os.close(theirs)
+    os.close(ours)
+    shutil.rmtree(scratch, ignore_errors=True)
+  if child.returncode == 0:
+    return out_path
   notify(f"No video at {out_path.name}: {reason}; `playground doctor` shows what rendering needs.")
   return None
 
@@ -161,13 +143,52 @@ def frame_stride(dt: float) -> int:
   return max(1, math.ceil(1 / (MAX_FPS * dt) - 1e-6))
 
 
-def _render(trajectory: Path, out_path: Path) -> None:
-  """The child's work: draws and encodes."""
+def _pack(mj_model: Any, qpos: np.ndarray, **arrays: Any) -> bytes:
+  """A trajectory `qpos` [T, nq], its model and what else is not None, as the bytes of an .npz file."""
+  import mujoco
+
+  qpos = np.asarray(qpos)
+  if qpos.ndim != 2 or qpos.shape[1] != mj_model.nq:
+    raise ValueError(f"qpos must have shape [T, {mj_model.nq}], not {list(qpos.shape)}")
+  model = np.empty(mujoco.mj_sizeModel(mj_model), np.uint8)
+  mujoco.mj_saveModel(mj_model, None, model)
+  file = io.BytesIO()
+  np.savez_compressed(file, qpos=qpos, model=model, **{k: v for k, v in arrays.items() if v is not None})
+  return file.getvalue()
+
+
+def _work(out_path: Path, scratch: Path, pipe: int) -> None:
+  """The child's work: makes the video in its scratch folder and puts it in its place."""
+  scratch.mkdir(mode=0o700)
+  threading.Thread(target=_end_with_parent, args=(scratch, pipe), daemon=True).start()
+  try:
+    os.chdir(scratch)  # what MuJoCo logs, and what a killed encoder leaves, goes with the folder
+    rendered = scratch / "video.mp4"
+    _render(io.BytesIO(sys.stdin.buffer.read()), rendered)
+    out_path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(out_path) as temporary:
+      shutil.copyfile(rendered, temporary)
+  finally:
+    shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _end_with_parent(scratch: Path, pipe: int) -> None:
+  """Waits until the parent has died, however it did, then removes the scratch folder and ends, encoder included."""
+  os.read(pipe, 1)  # returns when nobody holds the other end any more
+  for _ in range(_TRIES):
+    if not scratch.exists():
+      break
+    shutil.rmtree(scratch, ignore_errors=True)  # fails where the encoder makes a file meanwhile
+  os.killpg(0, signal.SIGKILL)
+
+
+def _render(trajectory: io.BytesIO, out_path: Path) -> None:
+  """Draws and encodes."""
   import imageio_ffmpeg
   import mujoco
 
   saved = np.load(trajectory)
-  model = mujoco.MjModel.from_binary_path(str(trajectory.with_suffix(".mjb")))
+  model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": saved["model"].tobytes()})
   data = mujoco.MjData(model)
   width, height, dt = int(saved["width"]), int(saved["height"]), float(saved["dt"])
   camera = choose_camera(model, str(saved["camera"]) if "camera" in saved else None)
@@ -247,6 +268,6 @@ def walks(model: Any) -> bool:
 
 if __name__ == "__main__":
   try:
-    _render(Path(sys.argv[1]), Path(sys.argv[2]))
+    _work(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]))
   except Exception as error:  # the parent shows the last line
     sys.exit(str(error).splitlines()[0] if str(error) else type(error).__name__)

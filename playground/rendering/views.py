@@ -1,7 +1,7 @@
 """A contact sheet: what a task's camera sees at the start of episodes, each on a randomised model of its own."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,12 @@ from playground.runs.files import need_file, replacing
 _GAP = 2  # pixels between two views
 
 
-def save_views(env: Env, terms: Iterable[Mapping[str, Any]], path: str | Path, count: int = 16, seed: int = 0) -> Path:
+def save_views(env: Env, events: Mapping[str, Any], path: str | Path, count: int = 16, seed: int = 0) -> Path:
   """Writes `count` views as one picture.
 
   Args:
     env: a task with pictures in its observation.
-    terms: of the randomisation, see `Randomizer`.
+    events: `env.events`, see `Randomizer`.
     path: the .png to write.
     count: views, all rendered at once.
     seed: of episodes and models.
@@ -42,7 +42,7 @@ def save_views(env: Env, terms: Iterable[Mapping[str, Any]], path: str | Path, c
     have = ", ".join(camera_names(env.mj_model)) or "none"
     raise ConfigError(f"The task sees nothing: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
-  model = Randomizer(env.mj_model, terms).sample_batch(jax.random.split(model_key, count))
+  model = Randomizer(env.mj_model, events).sample_batch(jax.random.split(model_key, count))
   state: Any = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)
   page = sheet(np.asarray(newest_picture(env, state.obs)))
   path.parent.mkdir(parents=True, exist_ok=True)

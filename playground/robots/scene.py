@@ -10,14 +10,16 @@ the solver's options. A few conventions let this file work for all of them:
 - a keyframe `<name>_rough` takes the place of `<name>` where bumps of 0.05 m may lie under the feet.
 """
 
+import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
+from playground.config.text import first_line
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.robots.terrain import TERRAINS, add_terrain
+from playground.robots.terrain import add_terrain
 
 ROBOTS = Path(__file__).parent
 
@@ -29,25 +31,48 @@ _ROUGH = 0.05
 
 
 def configured_scene(config: Any) -> mujoco.MjSpec:
-  """Returns the scene that a task's config describes under `robot` and `scene` (and `parity`).
+  """Returns the scene that a task's config describes under `robot` and `scene`.
 
-  `scene` holds `terrain`, `collision` and, under a terrain's name, that terrain's parameters. With `parity`, rough
-  ground is white noise, as in Playground 0.2.0.
+  `scene` holds `terrain`, `terrain_params` (the terrain's arguments) and `collision`.
   """
   scene, robot = config.scene, config.robot
-  parameters = {name: dict(scene[name]) for name in TERRAINS if name in scene}
-  terrain = "white_noise" if config.parity and scene.terrain == "rough" else scene.terrain
   return build_scene(
-    robot.name,
-    terrain=terrain,
-    parameters=parameters.get(terrain, {}),
+    robot.mjcf,
+    terrain=scene.terrain,
+    parameters=dict(scene.terrain_params or {}),
     collision=scene.collision,
     floor_contacts=tuple(robot.floor_contacts),
   )
 
 
+def find_mjcf(mjcf: str) -> Path:
+  """Returns the path of a robot's MJCF.
+
+  Args:
+    mjcf: `my_robot/my_robot.xml`, a file in an importable package (which is not imported), the path of a file, or the
+      name of one of our robots.
+
+  Raises:
+    UnknownNameError: there is no such file.
+  """
+  ours = {path.stem: path for path in sorted(ROBOTS.glob("*/*.xml")) if path.stem == path.parent.name}
+  if mjcf in ours:
+    return ours[mjcf]
+  if (path := Path(mjcf)).is_file():
+    return path
+  package, _, rest = mjcf.partition("/")
+  spec = importlib.util.find_spec(package) if package.isidentifier() else None
+  for folder in (spec.submodule_search_locations or ()) if spec else ():
+    if (path := Path(folder) / rest).is_file():
+      return path
+  raise UnknownNameError(
+    f"env.robot.mjcf={mjcf} does not exist: give the path of a file, or <package>/<path> of an installed package."
+    f"{nearest(mjcf, ours)}"
+  )
+
+
 def build_scene(
-  robot: str,
+  mjcf: str,
   *,
   terrain: str = "flat",
   parameters: Mapping[str, Any] | None = None,
@@ -57,7 +82,7 @@ def build_scene(
   """Puts a robot on a terrain.
 
   Args:
-    robot: folder of `playground/robots`, e.g. `go1`.
+    mjcf: the robot's MJCF, see `find_mjcf`; of ours the name is enough, e.g. `go1`.
     terrain: a key of `TERRAINS`. Its ground is geom 0, named `floor`.
     parameters: of the terrain, by name.
     collision: a key of `COLLISIONS`.
@@ -68,15 +93,17 @@ def build_scene(
     The scene, to edit further or `compile()`.
 
   Raises:
-    UnknownNameError: no such robot, terrain, parameter, collision variant or geom.
-    ConfigError: a parameter's value that cannot be, or a collision variant that the robot has no geoms for.
+    UnknownNameError: no such file, terrain, parameter, collision variant or geom.
+    ConfigError: an invalid MJCF or parameter, or a collision variant that the robot has no geoms for.
   """
-  known = [path.stem for path in sorted(ROBOTS.glob("*/*.xml")) if path.stem == path.parent.name]
-  _check("robot", robot, known)
   _check("collision", collision, COLLISIONS)
-  spec = mujoco.MjSpec.from_file(str(ROBOTS / robot / f"{robot}.xml"))
+  path = find_mjcf(mjcf)
+  try:
+    spec = mujoco.MjSpec.from_file(str(path))
+  except ValueError as error:
+    raise ConfigError(f"env.robot.mjcf={mjcf} is not an MJCF that MuJoCo reads: {first_line(error)}.") from None
   if collision != "feet" and not _full_geoms(spec):
-    raise ConfigError(f"collision={collision}: robot={robot} has geoms for the feet only, choose collision=feet.")
+    raise ConfigError(f"collision={collision}: {path.stem} has geoms for the feet only, choose collision=feet.")
   COLLISIONS[collision](spec)
   add_studio(spec)
   _set_keyframes(spec, add_terrain(spec, terrain, parameters or {}))

@@ -8,6 +8,7 @@ The stages run one after another in this process. A child process for each would
 start JAX and the device again for every stage, and would need signals and terminals handed on.
 """
 
+import contextlib
 import gc
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from playground import registry
 from playground.config import in_stage, stage_folders
 from playground.errors import ConfigError
+from playground.hardware.distributed import agree, is_main, noting_loss, share
 from playground.hardware.setup import setup
 from playground.learning.algorithms import make_learner
 from playground.learning.checkpoints import Checkpoint, describe, find_checkpoints
@@ -56,27 +58,31 @@ def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun
     if chain.status.get("status") == "finished":
       print(f"{chain.path} is finished: nothing to resume (init_from={chain.path} trains on from its weights).")
       return 0
+  setup(config.hardware)  # from here on a process knows whether it writes
   folders = stage_folders(config.resolved["curriculum"])
   began_s, before = 0.0, None  # what the first stage starts from is in its config
-  with chain.recorded():
+  with chain.recorded() if is_main() else contextlib.nullcontext(), noting_loss(chain.note_loss):
     try:
       for stage, (name, folder) in zip(stages, folders.items(), strict=True):
         run_dir = RunDirectory(chain.path / folder)
-        if run_dir.status.get("status") != "finished":
-          chain.set_status("running", f"stage {folder}")
-          print(f"\nStage {folder} of {chain.path}: {stage.agent.num_timesteps:,} steps of {stage.choices['env']}")
+        if share(run_dir.status.get("status", "")) != "finished":
+          if is_main():
+            chain.set_status("running", f"stage {folder}")
+            print(f"\nStage {folder} of {chain.path}: {stage.agent.num_timesteps:,} steps of {stage.choices['env']}")
           with in_stage(name):
             train_run(replace(stage, init_from=before), interrupts, began_s)
           interrupts.stop_saving()
           began_s = process_age_s()
           gc.collect()  # what the stage held on the device goes now, not when Python comes round to it
-        if interrupts.signum is not None:
+        if agree(interrupts.signum is not None):
           break
         before = str(run_dir.path)
     finally:
-      write_result(chain, folders)
-  finished = chain.summary["status"] == "finished"
-  _say_where(chain)
+      if is_main():
+        write_result(chain, folders)
+  finished = is_main() and chain.summary["status"] == "finished"
+  if is_main():
+    _say_where(chain)
   return 0 if interrupts.signum is None or finished else exit_code(interrupts.signum)
 
 
@@ -94,7 +100,7 @@ def _check(config: "RunConfig") -> None:
     with in_stage(name):
       env = registry.load(stage.choices["env"], config=stage.env)
       need_camera(env.mj_model, stage.video.camera, "video.camera")
-      Randomizer(env.mj_model, stage.randomization.terms)
+      Randomizer(env.mj_model, stage.env.events)
       learner = make_learner(env, stage.agent, hardware.mesh, hardware.network_precision)
       learner.notices()  # raises for a replay buffer that the device cannot hold
       size = env.observation_size
@@ -118,19 +124,28 @@ def _compare(env: str, facts: dict[str, Any], before: str, theirs: dict[str, Any
 
 
 def _lay_out(config: "RunConfig") -> "tuple[RunDirectory, list[RunConfig]]":
-  """Makes the chain's directory and those of its stages; returns the stages' configurations as of runs to resume."""
-  chain = RunDirectory.claim(str(config.run_dir), numbered=config.resolved["run_dir"] is None)
+  """Makes the chain's directory and those of its stages; returns the stages' configurations as of runs to resume.
+
+  Process 0 makes them, the others wait for that.
+  """
+  if is_main():
+    chain = RunDirectory.claim(str(config.run_dir), numbered=config.resolved["run_dir"] is None)
+  else:
+    chain = RunDirectory(share())
   before, stages = config.init_from, []
   for stage, folder in zip(config.stages, stage_folders(config.resolved["curriculum"]).values(), strict=True):
     path = str(chain.path / folder)
     tracking = stage.resolved["tracking"]
     wandb = {**tracking["wandb"], "group": tracking["wandb"]["group"] or chain.path.resolve().name}
     resolved = {**stage.resolved, "tracking": {**tracking, "wandb": wandb}, "run_dir": path, "init_from": before}
-    RunDirectory(path).write_config(resolved, stage.overrides)
+    if is_main():
+      RunDirectory(path).write_config(resolved, stage.overrides)
     going_on = {**resolved, "resume": path, "init_from": None}
     stages.append(replace(stage, resolved=going_on, run_dir=path, resume=path, init_from=None))
     before = path
-  chain.write_config(config.resolved, config.overrides)  # last: from here on it is a chain that can be resumed
+  if is_main():
+    chain.write_config(config.resolved, config.overrides)  # last: from here on it is a chain that can be resumed
+    share(str(chain.path.absolute()))
   return chain, stages
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from playground.runs.csv_tracker import STAGE, read_metrics
 from playground.runs.files import write_text
 from playground.runs.plots import plot_learning_curve
 from playground.runs.run_dir import RunDirectory
@@ -35,7 +36,7 @@ def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
       **{key: last.get(key) for key in _RESULT},
       "steps": steps,
       "steps_per_second": steps / seconds if seconds else None,
-      "wall_clock_s": sum(stage["wall_clock_s"] for stage in begun),
+      "wall_clock_s": sum(stage["wall_clock_s"] or 0.0 for stage in begun),
       "stages": stages,
     }
   )
@@ -53,15 +54,15 @@ def _write_metrics(chain: RunDirectory, runs: Mapping[str, RunDirectory]) -> Non
 
   tables, steps, seconds = [], 0, 0.0
   for name, run in runs.items():
-    if not run.metrics_csv.is_file():
-      break
-    table = pd.read_csv(run.metrics_csv, float_precision="round_trip", on_bad_lines="skip")
+    table = read_metrics(run.metrics_csv)
     if table.empty:
       break
-    table.insert(1, "stage", name)
+    table.insert(1, STAGE, name)
     table["step"] += steps
-    table["time/wall_clock_s"] += seconds
-    steps, seconds = int(table["step"].iloc[-1]), float(table["time/wall_clock_s"].iloc[-1])
+    steps = int(table["step"].iloc[-1])
+    if "time/wall_clock_s" in table:
+      table["time/wall_clock_s"] += seconds
+      seconds = float(table["time/wall_clock_s"].iloc[-1])
     tables.append(table)
   if tables:
     write_text(chain.metrics_csv, pd.concat(tables, ignore_index=True).to_csv(index=False))

@@ -2,33 +2,72 @@
 
 import csv
 import io
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, NamedTuple, TextIO
 
-from playground.runs.files import write_text
+from playground.runs.files import keep_copy, write_text
+
+if TYPE_CHECKING:
+  import pandas as pd
+
+_STEP = re.compile(r"[0-9]{1,18}")
+STAGE = "stage"  # the one column of text, in a chain's metrics.csv
+
+
+class Table(NamedTuple):
+  """The content of a metrics.csv.
+
+  Attributes:
+    columns: their names, the first is `step`.
+    rows: by column; a value that is not a number is ''.
+    torn: whether the last line has no end, as a SIGKILL leaves it; it is not among the rows.
+    damage: what else is not as it was written, '' if nothing is.
+  """
+
+  columns: list[str]
+  rows: list[dict[str, str]]
+  torn: bool
+  damage: str
 
 
 class CsvTracker:
   """Appends rows to a CSV file whose first column is `step` and whose other columns grow as metrics appear.
 
-  A file that is already there is continued; what a SIGKILL left of a half-written last row is dropped.
+  A file that is already there is continued. What a SIGKILL left of a half-written last row is dropped; a file that is
+  damaged otherwise is kept aside, as `metrics_damaged.csv`, and what can be read of it is written anew.
+
+  Args:
+    path: the file.
+    columns: those that the file had at the checkpoint that the run continues from; its header may be damaged.
+    notify: takes one sentence about a damaged file.
   """
 
-  def __init__(self, path: Path):
+  def __init__(self, path: Path, columns: Sequence[str] = (), notify: Callable[[str], None] = print):
     self._path = path
-    self._columns = ["step"]
     self._file: TextIO | None = None
+    self._columns = list(columns) or ["step"]
     if path.is_file():
-      rows, torn = self._read()
-      if torn:
-        self._rewrite(rows)
+      table = read_table(path, columns)
+      self._columns = table.columns
+      if table.damage:
+        aside = keep_copy(path, f"{path.stem}_damaged")
+        notify(f"{path} is damaged ({table.damage}): it is kept as {aside.name}, {len(table.rows)} rows are rebuilt.")
+      if table.damage or table.torn:
+        self._rewrite(table.rows)
+
+  @property
+  def columns(self) -> list[str]:
+    """Names of the columns so far."""
+    return list(self._columns)
 
   def log(self, step: int, metrics: dict[str, float]) -> None:
     if "step" in metrics:
       raise ValueError("a metric cannot be called 'step': that is the first column of metrics.csv")
     new = [name for name in metrics if name not in self._columns]
     if new or not self._path.exists():
-      rows, _ = self._read() if self._path.exists() else ([], False)
+      rows = self._rows()
       self._columns += new
       self._rewrite(rows)
     if self._file is None:
@@ -38,26 +77,21 @@ class CsvTracker:
     self._file.write(self._text([row]))
     self._file.flush()
 
-  def truncate_after(self, step: int) -> None:
-    """Drops, atomically, every row whose step is larger than `step`."""
-    if self._path.is_file():
-      rows, _ = self._read()
-      self._rewrite([row for row in rows if int(row["step"]) <= step])
+  def truncate_after(self, step: int) -> int:
+    """Drops, atomically, every row whose step is larger than `step`; returns the last step that is left, or -1."""
+    if not self._path.is_file():
+      return -1
+    rows = [row for row in self._rows() if int(row["step"]) <= step]
+    self._rewrite(rows)
+    return int(rows[-1]["step"]) if rows else -1
 
   def close(self, status: str = "finished") -> None:
     if self._file is not None:
       self._file.close()
       self._file = None
 
-  def _read(self) -> tuple[list[dict[str, str]], bool]:
-    """Returns the file's whole rows, and whether there was a torn one; takes over the file's columns."""
-    whole, newline, rest = self._path.read_text(encoding="utf-8", errors="replace").rpartition("\n")
-    reader = csv.DictReader(io.StringIO(whole + newline))
-    if reader.fieldnames and reader.fieldnames[0] == "step":
-      self._columns = list(reader.fieldnames)
-    lines = list(reader)
-    rows = [row for row in lines if (row.get("step") or "").isdecimal() and None not in row.values()]
-    return rows, bool(rest) or len(rows) < len(lines)
+  def _rows(self) -> list[dict[str, str]]:
+    return read_table(self._path, self._columns).rows if self._path.exists() else []
 
   def _rewrite(self, rows: list[dict[str, str]]) -> None:
     self.close()
@@ -67,3 +101,76 @@ class CsvTracker:
     buffer = io.StringIO()
     csv.DictWriter(buffer, self._columns, restval="", lineterminator="\n").writerows(rows)
     return buffer.getvalue()
+
+
+def read_metrics(path: Path) -> "pd.DataFrame":
+  """What can be read of a metrics.csv: `step` as integers, the other columns as numbers; empty without a file."""
+  import pandas as pd
+
+  table = read_table(path) if path.is_file() else Table(["step"], [], False, "")
+  frame = pd.DataFrame(table.rows, columns=pd.Index(table.columns), dtype=str)
+  kinds = {name: int if name == "step" else float for name in table.columns if name != STAGE}
+  return frame.replace("", "nan").astype(kinds)
+
+
+def read_table(path: Path, known: Sequence[str] = ()) -> Table:
+  """Reads what can be read of a metrics.csv.
+
+  Every row is a line of numbers of its own, so a stray quote spoils no more than its cell.
+
+  Args:
+    path: the file.
+    known: its first columns, if they are known from elsewhere: they hold, whatever the header says.
+  """
+  content, newline, rest = path.read_bytes().decode("utf-8", errors="replace").rpartition("\n")
+  if not newline:
+    return Table(list(known) or ["step"], [], bool(rest), "")
+  header, *lines = content.split("\n")
+  names, damage = _split(header), ""
+  headless = _STEP.fullmatch(names[0]) is not None
+  if headless:
+    names, lines, damage = [], [header, *lines], "its header is missing"
+  columns = _unique([*(known or ["step"]), *names[max(len(known), 1) :]])
+  if not headless and header != _joined(columns):
+    damage = "its header has changed"
+  rows = []
+  for line in lines:
+    cells = line.split(",")
+    if headless:  # columns that came after the known ones have lost their names
+      cells = cells[: len(columns)]
+    values = [text if name == STAGE else _number(text) for name, text in zip(columns, cells, strict=False)]
+    if len(cells) == len(columns) and _STEP.fullmatch(values[0]):
+      rows.append(dict(zip(columns, values, strict=True)))
+      intact = cells == values
+    else:
+      intact = False
+    damage = damage or ("" if intact else "a line has changed")
+  return Table(columns, rows, bool(rest), damage)
+
+
+def _number(text: str) -> str:
+  """A number as it is written, without quotes around it; '' if it is none."""
+  text = text.strip("\"' \r\ufeff")
+  try:
+    float(text)
+  except ValueError:
+    return ""
+  return text
+
+
+def _split(line: str) -> list[str]:
+  try:
+    return next(csv.reader([line]), [""]) or [""]
+  except csv.Error:
+    return [line]
+
+
+def _joined(cells: Sequence[str]) -> str:
+  buffer = io.StringIO()
+  csv.writer(buffer, lineterminator="").writerow(cells)
+  return buffer.getvalue()
+
+
+def _unique(names: Sequence[str]) -> list[str]:
+  """The names, with a number behind one that is there already."""
+  return [name if name not in names[:i] else f"{name} ({i})" for i, name in enumerate(names)]

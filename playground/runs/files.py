@@ -1,23 +1,33 @@
-"""Files that are either complete or absent: whatever kills a run never leaves half of one under its real name."""
+"""Files that are either complete or absent: whatever kills a run never leaves half of one under its real name.
 
+And locks: files that say which process is at work on a run, a job or a sweep.
+"""
+
+import errno
+import fcntl
 import json
 import math
 import os
+import shutil
+import socket
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from playground.errors import ConfigError
+from playground.errors import CheckpointError, ConfigError
 
 
 def need_folder(folder: Path, option: str) -> None:
   """Raises ConfigError, which names the option that it is of, where no folder can be or be written to; makes none."""
   folder = folder.absolute()
   there = next(path for path in (folder, *folder.parents) if os.path.exists(path))
-  if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
-    raise ConfigError(f"{option} cannot be written: {there} is not a folder that you may write to.")
+  try:
+    tempfile.TemporaryDirectory(dir=there).cleanup()  # permissions alone say yes to root, and of /proc
+  except OSError as error:
+    raise ConfigError(f"{option} cannot be written: {there} is not a folder that you may write to.") from error
 
 
 def need_file(path: Path, suffix: str, option: str) -> None:
@@ -56,9 +66,97 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
   write_text(path, json.dumps(plain(content, finite=True), indent=2, allow_nan=False) + "\n")
 
 
-def read_json(path: Path) -> dict[str, Any]:
-  """Returns the object in `path`, or {} if there is no such file."""
-  return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK, errno.EINVAL)  # what file systems say that have none
+
+
+@contextmanager
+def locking(path: Path, patience_s: float = 0.0) -> Iterator[int | None]:
+  """Holds a lock while the block runs; yields its file descriptor, or None if another process holds it.
+
+  Processes that inherit the descriptor hold the lock, too. The kernel releases it when the last of them has ended,
+  however that was, so there is no stale one: the file stays and names the last holder. On a file system without locks
+  everybody gets it.
+
+  Args:
+    path: the lock's file.
+    patience_s: how long to wait for it.
+  """
+  handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
+  try:
+    until = time.monotonic() + patience_s
+    while not (got := _try_lock(handle, fcntl.LOCK_EX)) and time.monotonic() < until:
+      time.sleep(0.05)
+    if got:
+      os.ftruncate(handle, 0)
+      os.pwrite(handle, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode(), 0)
+    yield handle if got else None
+  finally:
+    os.close(handle)
+
+
+def is_locked(path: Path) -> bool:
+  """Whether a process holds a lock, on this machine or another that shares the file system."""
+  try:
+    handle = os.open(path, os.O_RDWR)
+  except FileNotFoundError:
+    return False
+  try:
+    return not _try_lock(handle, fcntl.LOCK_SH)
+  finally:
+    os.close(handle)
+
+
+def lock_holder(path: Path) -> str:
+  """The process that took a lock last, in words."""
+  try:
+    holder = json.loads(path.read_bytes())
+    return f"process {holder['pid']} on {holder['host']}"
+  except (OSError, ValueError, KeyError, TypeError):
+    return "another process"
+
+
+def _try_lock(handle: int, kind: int) -> bool:
+  try:
+    fcntl.flock(handle, kind | fcntl.LOCK_NB)
+  except OSError as error:
+    return error.errno in _NO_LOCKS
+  return True
+
+
+def keep_copy(path: Path, stem: str) -> Path:
+  """Copies a file to a sibling `<stem><suffix>`, numbered if that is there already; returns the copy."""
+  number, copy = 1, path.with_name(f"{stem}{path.suffix}")
+  while copy.exists():
+    number += 1
+    copy = path.with_name(f"{stem}_{number}{path.suffix}")
+  shutil.copy2(path, copy)
+  return copy
+
+
+def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Any]:
+  """Returns the object in `path`, or {} if there is no such file.
+
+  Args:
+    path: the file.
+    **kinds: the types of those keys that the caller reads, as far as they are there.
+
+  Raises:
+    CheckpointError: the file cannot be read, is not JSON or has a value of another type.
+  """
+  if not path.is_file():
+    return {}
+  try:
+    content = json.loads(path.read_text(encoding="utf-8"))
+  except OSError as error:
+    raise CheckpointError(f"{path} cannot be read: {error.strerror}.") from error
+  except (ValueError, RecursionError):
+    content = None
+  given = content if isinstance(content, dict) else {}
+  wrong = [key for key, kind in kinds.items() if key in given and not isinstance(given[key], kind)]
+  if not isinstance(content, dict) or wrong:
+    why = f"its {wrong[0]!r} has the wrong type" if wrong else "it is no JSON object"
+    raise CheckpointError(f"{path} is damaged ({why}): move it away to go on without it.")
+  return content
 
 
 def plain(value: Any, finite: bool = False) -> Any:

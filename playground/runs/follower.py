@@ -6,7 +6,7 @@ from playground.envs.base import Env
 from playground.learning.loop import Metrics
 from playground.learning.rollout import Step
 from playground.runs.interrupts import Interrupts
-from playground.runs.job import check_fraction
+from playground.runs.job import check_fraction, check_updates
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
@@ -25,6 +25,7 @@ class Follower:
     taken, self._step = step - self._step, step
     bad = metrics.get("training/nonfinite", 0.0)
     check_fraction(bad * self._action_repeat / max(taken, 1), self._allowed, step)
+    check_updates(metrics, self._allowed, step)
 
   def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
     """Process 0 saves."""

@@ -1,7 +1,9 @@
-"""SIGINT and SIGTERM: finish the work in flight, save, leave."""
+"""SIGINT, SIGTERM and SIGHUP: finish the work in flight, save, leave."""
 
 import contextlib
+import os
 import signal
+import stat
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -18,8 +20,16 @@ class Interrupted(BaseException):
 
 @contextlib.contextmanager
 def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-  """While it lasts, `handle` gets SIGINT and SIGTERM; only for a main thread."""
-  before = {signum: signal.signal(signum, handle) for signum in (signal.SIGINT, signal.SIGTERM)}
+  """While it lasts, `handle` gets SIGINT, SIGTERM and (unless `nohup` ignores it) SIGHUP; only for a main thread."""
+
+  def hang_up(signum: int, frame: FrameType | None) -> None:
+    _leave_terminal()
+    handle(signum, frame)
+
+  handlers = {signal.SIGINT: handle, signal.SIGTERM: handle}
+  if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+    handlers[signal.SIGHUP] = hang_up
+  before = {signum: signal.signal(signum, handler) for signum, handler in handlers.items()}
   try:
     yield
   finally:
@@ -29,7 +39,7 @@ def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[No
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[threading.Event]:
-  """An event that SIGINT and SIGTERM set: for loops mostly in callbacks of C code, where exceptions get lost."""
+  """An event that these signals set: for loops mostly in callbacks of C code, where exceptions get lost."""
   told = threading.Event()
   with on_signals(lambda *_: told.set()):
     yield told
@@ -71,5 +81,14 @@ class Interrupts:
 
 
 def exit_code(signum: int) -> int:
-  """What a shell reports for a process that this signal ended: 130 for SIGINT, 143 for SIGTERM."""
+  """What a shell reports for a process that this signal ended: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
   return 128 + signum
+
+
+def _leave_terminal() -> None:
+  """Sends output that went to a terminal which is gone to nowhere: writing there is an error."""
+  for stream in (1, 2):
+    if stat.S_ISCHR(os.fstat(stream).st_mode) and not os.isatty(stream):
+      nowhere = os.open(os.devnull, os.O_WRONLY)
+      os.dup2(nowhere, stream)
+      os.close(nowhere)

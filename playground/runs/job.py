@@ -18,6 +18,7 @@ from playground.learning.learner import Learner
 from playground.learning.loop import Loop, Metrics
 from playground.learning.rollout import Step
 from playground.rendering.video import render_video
+from playground.runs.csv_tracker import read_metrics
 from playground.runs.interrupts import Interrupts
 from playground.runs.nonfinite import write_dump
 from playground.runs.plots import plot_learning_curve
@@ -59,7 +60,7 @@ class Job:
     self._interrupts = interrupts
     # A run that is resumed from the beginning logs all its rows again: step 0 is after "step -1".
     continued = -1 if start.run_dir and start.step is None else start.step
-    self._trackers = make_trackers(config.resolved, run_dir, continued, progress.print)
+    self._trackers = make_trackers(config.resolved, run_dir, continued, progress.print, start.columns)
     self._store = CheckpointStore(run_dir.checkpoints, config.checkpoint.keep, continued)
     self._videos = ThreadPoolExecutor(1, thread_name_prefix="video")
     self._video: Future[Path | None] | None = None
@@ -72,6 +73,7 @@ class Job:
     self._recording: Any = None
     self._rates: list[float] = []  # steps per second, by row
     self._start_to_first_update_s: float | None = None
+    self._rejected = 0  # gradient steps
     self._dumped = any(run_dir.nan_dump.glob("*.npz"))  # by an earlier start of this run
     self._warned_of_buffers = False
     self._closed = False
@@ -98,6 +100,7 @@ class Job:
     self._advance_trace(metrics)
     self._check_buffers(taken, metrics)
     self._check_numbers(step, taken, metrics, captured)
+    self._rejected += check_updates(metrics, self._config.on_nonfinite.max_fraction, step)
 
   def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
     policy, rest = self._learner.split(state)
@@ -106,6 +109,7 @@ class Job:
       "env": self._config.choices["env"],
       "wall_clock_s": self.wall_clock_s,
       "config": self._config.resolved,
+      "columns": self._trackers.columns,
     }
     experience = None if final else partial(self._learner.experience, state)
     self._store.save(step, policy, rest, meta, experience, self._return)
@@ -126,6 +130,10 @@ class Job:
     if self._video:
       self._video.result()
     self.close("finished" if completed else "preempted")
+    if self._rejected:
+      self._progress.print(
+        f"{self._rejected:,} gradient steps were NaN or infinite and left out (training/nonfinite_updates)."
+      )
     plot_learning_curve(self._run_dir.metrics_csv, self._run_dir.plots)
     if self._config.profile.enable and self._profile.is_dir():  # a run of one row has traced nothing
       for line in format_ops(write_top_ops(self._profile)):
@@ -158,9 +166,7 @@ class Job:
 
   def _scores(self) -> dict[str, float | None]:
     """The result as metrics.csv has it: of the whole run, however often it was resumed."""
-    import pandas as pd
-
-    table = pd.read_csv(self._run_dir.metrics_csv)
+    table = read_metrics(self._run_dir.metrics_csv)
     column = lambda name: np.asarray(table[name] if name in table else np.full(len(table), np.nan), float)
     steps, returns, rate = (column(name) for name in ("step", "eval/episode_reward", "time/steps_per_second"))
     scores = [(value, int(step)) for value, step in zip(returns.tolist(), steps, strict=True) if np.isfinite(value)]
@@ -245,6 +251,21 @@ def check_fraction(fraction: float, allowed: float, step: int, where: str = "") 
       f"{fraction:.1%} of the environment steps before step {step:,} went NaN, infinite or absurd, more than "
       f"on_nonfinite.max_fraction={allowed:g}.{where}"
     )
+
+
+def check_updates(metrics: Metrics, allowed: float, step: int) -> int:
+  """Counts a row's gradient steps that were left out because they were not finite.
+
+  Raises:
+    NonfiniteError: they are more than the allowed share.
+  """
+  bad, taken = (round(metrics.get(f"training/{name}", 0.0)) for name in ("nonfinite_updates", "gradient_steps"))
+  if bad > allowed * taken:
+    raise NonfiniteError(
+      f"{bad:,} of {taken:,} gradient steps before step {step:,} were NaN or infinite and left out, more than "
+      f"on_nonfinite.max_fraction={allowed:g} allows."
+    )
+  return bad
 
 
 def episodes_of(recording: Any, count: int) -> dict[str, Any]:

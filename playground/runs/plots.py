@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from playground.runs.csv_tracker import read_metrics
 from playground.runs.files import replacing
 
 _AXES = {  # file name -> (column, its label)
@@ -25,12 +26,8 @@ def plot_learning_curve(metrics_csv: str | Path, out_dir: str | Path) -> list[Pa
   Returns:
     The files written; none if there has been no evaluation yet.
   """
-  import pandas as pd
-
   metrics_csv, out_dir = Path(metrics_csv), Path(out_dir)
-  if not metrics_csv.is_file() or metrics_csv.stat().st_size == 0:
-    return []
-  table = pd.read_csv(metrics_csv, on_bad_lines="skip")
+  table = read_metrics(metrics_csv)
   if "eval/episode_reward" not in table:
     return []
   table = table.dropna(subset=["eval/episode_reward"]).sort_values("step", kind="stable")

@@ -1,8 +1,9 @@
 """Training progress: a bar on a terminal, an occasional plain line in a log file."""
 
+import errno
 import sys
 import time
-from typing import Self
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn
@@ -18,12 +19,16 @@ class Progress:
     total_steps: the run's whole budget; a resumed run starts its bar where it continues.
     enabled: False shows no progress at all; `print` still prints.
     console: where to; standard output by default.
+    activity: what makes the steps, as the bar calls it.
   """
 
-  def __init__(self, total_steps: int, enabled: bool = True, console: Console | None = None):
+  def __init__(
+    self, total_steps: int, enabled: bool = True, console: Console | None = None, activity: str = "training"
+  ):
     self._total = total_steps
+    self._activity = activity
     self._enabled = enabled
-    self._console = console or Console(file=sys.stdout)
+    self._console = console or Console(file=_Terminal(sys.stdout))  # pyright: ignore[reportArgumentType]
     self._live = enabled and self._console.is_terminal
     self._step: int | None = None
     self._step_at = 0.0
@@ -71,7 +76,7 @@ class Progress:
     self._last_return = self._last_return if last_return is None else last_return
     text = self._text(step)
     if self._live:
-      self._bar.update(self._task, description="training", completed=step, total=self._total, text=text)
+      self._bar.update(self._task, description=self._activity, completed=step, total=self._total, text=text)
     elif self._enabled:
       self._line = f"{100 * step / max(self._total, 1):5.1f} %  {text}"
       if step >= self._total or now - self._line_at >= PLAIN_INTERVAL_S:
@@ -93,6 +98,30 @@ class Progress:
   def _print_plain(self, line: str) -> None:
     self.print(line)
     self._line, self._line_at = "", time.monotonic()
+
+
+class _Terminal:
+  """A stream that ignores that its terminal is gone: the run is about to be told by SIGHUP, and saves."""
+
+  def __init__(self, stream: Any):
+    self._stream = stream
+
+  def write(self, text: str) -> None:
+    self._unless_gone(self._stream.write, text)
+
+  def flush(self) -> None:
+    self._unless_gone(self._stream.flush)
+
+  def __getattr__(self, name: str) -> Any:
+    return getattr(self._stream, name)
+
+  @staticmethod
+  def _unless_gone(call: Any, *args: str) -> None:
+    try:
+      call(*args)
+    except OSError as error:
+      if error.errno != errno.EIO:
+        raise
 
 
 def _short(number: float) -> str:

@@ -7,16 +7,18 @@ import os
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, get_args
 
 import yaml
 from ml_collections import ConfigDict
 
 from playground.errors import CheckpointError, PlaygroundError, nearest
-from playground.runs.files import plain, read_json, write_json, write_text
+from playground.runs.files import lock_holder, locking, plain, read_json, write_json, write_text
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
 
+_NUMBERS_OF_SUMMARY = ("final_return", "best_return", "best_step", "steps", "steps_per_second", "wall_clock_s")
 RunStatus = Literal["running", "finished", "failed", "preempted"]
 
 
@@ -24,7 +26,8 @@ class RunDirectory:
   """Paths and records of one run. Get one from `create` (new run) or `open` (resume, eval)."""
 
   def __init__(self, path: str | Path):
-    self.path = Path(path).expanduser()
+    self.path = Path(os.path.expanduser(path))
+    self._locked = False
 
   @classmethod
   def create(
@@ -85,7 +88,7 @@ class RunDirectory:
       raise CheckpointError(f"{run.path} is not a run directory: it has no config.yaml.")
     try:
       valid = isinstance(run.config, dict)
-    except (yaml.YAMLError, UnicodeDecodeError):
+    except (yaml.YAMLError, ValueError, RecursionError):
       valid = False
     if not valid:
       raise CheckpointError(f"{run.path} is not a readable run directory: its config.yaml is damaged.")
@@ -139,15 +142,16 @@ class RunDirectory:
 
   @property
   def manifest(self) -> dict[str, Any]:
-    return read_json(self.path / "manifest.json")
+    return read_json(self.path / "manifest.json", earlier_starts=list, git=(dict, NoneType), timings=dict)
 
   @property
   def status(self) -> dict[str, Any]:
-    return read_json(self.path / "status.json")
+    return read_json(self.path / "status.json", status=str, reason=str, started=str)
 
   @property
   def summary(self) -> dict[str, Any]:
-    return read_json(self.path / "summary.json")
+    numbers = dict.fromkeys(_NUMBERS_OF_SUMMARY, (int, float, NoneType))
+    return read_json(self.path / "summary.json", status=str, **numbers)
 
   def write_manifest(self, **fields: Any) -> None:
     """Records this process: git state, package versions, host, and `fields` (device, precision, seed, timings, …).
@@ -172,25 +176,67 @@ class RunDirectory:
     content = {"status": status, "reason": reason, "pid": os.getpid(), "started": started, "updated": _now()}
     write_json(self.path / "status.json", content)
 
+  def note_loss(self, reason: str) -> None:
+    """Records that a run fails for the loss of one of its processes, which may be the one that writes here."""
+    if self.status.get("status") == "running":  # nothing where this machine does not see the folder
+      self.set_status("failed", f"{reason} resume={self.path} continues")
+
+  @contextlib.contextmanager
+  def locked(self) -> Iterator[None]:
+    """Makes this process the only one that writes the run while the block runs.
+
+    Raises:
+      CheckpointError: another process is.
+    """
+    if self._locked:  # by a block around this one
+      yield
+      return
+    file = self.path / "run.lock"
+    with contextlib.ExitStack() as stack:
+      with _writing(self.path):
+        lock = stack.enter_context(locking(file))
+      if lock is None:
+        raise CheckpointError(
+          f"{self.path} is being written by {lock_holder(file)}: a run has one writer, wait for that one or stop it."
+        )
+      self._locked = True
+      stack.callback(setattr, self, "_locked", False)
+      yield
+
   @contextlib.contextmanager
   def recorded(self) -> Iterator[None]:
-    """Keeps `status.json` true, whatever ends the block; a block that ends well has written the summary."""
-    self.set_status("running")
-    try:
-      yield
-    except Interrupted as interrupt:
-      self.set_status("preempted", f"{interrupt}, without a last checkpoint; resume={self.path} continues")
-      raise
-    except PlaygroundError as error:
-      self.set_status("failed", str(error))
-      raise
-    except BaseException as error:
-      self.set_status("failed", f"{type(error).__name__}: {error}")
-      raise
-    if self.summary["status"] == "finished":
-      self.set_status("finished")
-    else:
-      self.set_status("preempted", f"interrupted and saved; resume={self.path} continues")
+    """Locks the run and keeps `status.json` true, whatever ends the block.
+
+    A block that ends well has written the summary.
+    """
+    with self.locked():
+      try:
+        self.set_status("running")
+        yield
+        if self.summary.get("status") == "finished":
+          self.set_status("finished")
+        else:
+          self.set_status("preempted", f"interrupted and saved; resume={self.path} continues")
+      except Interrupted as interrupt:
+        self._note_end("preempted", f"{interrupt}, without a last checkpoint; resume={self.path} continues")
+        raise
+      except PlaygroundError as error:
+        self._note_end("failed", str(error))
+        raise
+      except OSError as error:  # a full disk, a folder that was removed: nothing that a traceback would help with
+        reason = error.strerror or str(error)
+        where = f" ({error.filename})" if error.filename else ""
+        sentence = f"{self.path} cannot be written: {reason}{where}. resume={self.path} goes on from what is saved."
+        self._note_end("failed", sentence)
+        raise CheckpointError(sentence) from error
+      except BaseException as error:
+        self._note_end("failed", f"{type(error).__name__}: {error}")
+        raise
+
+  def _note_end(self, status: RunStatus, reason: str) -> None:
+    """Records how the run ended, if that can be written; the error that ended it matters more."""
+    with contextlib.suppress(OSError, CheckpointError):
+      self.set_status(status, reason)
 
   def write_summary(self, summary: Mapping[str, Any]) -> None:
     """Writes the run's result, which sweeps and tables read."""

@@ -1,13 +1,16 @@
 """Where a run begins: anew, at the last good checkpoint of its own, or from another run's weights."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import jax
 
 from playground.errors import CheckpointError
-from playground.learning.checkpoints import Checkpoint, find_checkpoints
+from playground.hardware.distributed import is_main
+from playground.learning.checkpoints import Checkpoint, DamagedCheckpointError, NoCheckpointError, find_checkpoints
 from playground.learning.learner import Learner
 from playground.learning.loop import Draw
 from playground.runs.run_dir import RunDirectory
@@ -29,6 +32,7 @@ class Start:
     update: training steps done in it.
     wall_clock_s: time the run had taken by then.
     policy: restored weights (host arrays) for a new run.
+    columns: of metrics.csv at the restored checkpoint.
     began_s: age of the process when the run's turn came.
   """
 
@@ -41,6 +45,7 @@ class Start:
   step: int | None = None
   wall_clock_s: float = 0.0
   policy: Any = None
+  columns: list[str] = dataclasses.field(default_factory=list)
   began_s: float = 0.0
 
   @classmethod
@@ -55,7 +60,7 @@ class Start:
       start = cls(run_dir=run_dir, began_s=began_s)
       try:
         start.checkpoints = find_checkpoints(config.resume)
-      except CheckpointError:
+      except NoCheckpointError:
         if run_dir.status:  # else a chain made it, and has only now come to it
           start.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
         # A resumed run's `config` says this only for a chain, which may have been moved.
@@ -69,6 +74,19 @@ class Start:
       return cls(weights=Checkpoint(find_checkpoints(config.init_from)[0]))
     return cls()
 
+  @contextlib.contextmanager
+  def locked(self, config: "RunConfig") -> Iterator[Self]:
+    """Locks the resumed run, if any; yields what is there by then, as the last holder of the lock may have gone on.
+
+    Raises:
+      CheckpointError: another process writes the run.
+    """
+    if self.run_dir is None:
+      yield self
+      return
+    with self.run_dir.locked() if is_main() else contextlib.nullcontext():
+      yield dataclasses.replace(type(self).find(config, self.began_s), run_dir=self.run_dir)
+
   @property
   def finished(self) -> bool:
     """Whether the resumed run has nothing left to do."""
@@ -78,12 +96,12 @@ class Start:
     """Reads what there is to restore, checked against the algorithm and its shapes, before anything is compiled.
 
     Raises:
-      CheckpointError: no checkpoint is whole and fits.
+      CheckpointError: no checkpoint is whole, or the newest whole one cannot be read now or does not fit.
     """
     if not self.checkpoints and self.weights is None:
       return
     if self.weights is not None:
-      theirs = self.weights.meta["config"]["agent"]["name"]
+      theirs = self.weights.meta["config"].get("agent", {}).get("name")
       if theirs != name:
         raise CheckpointError(f"{self.weights.path} was trained by {theirs}: agent={name} cannot start from it.")
       self.policy = self.weights.restore("policy", learner.policy_shape())
@@ -96,12 +114,15 @@ class Start:
       try:
         checkpoint = Checkpoint(path)
         self.state, notice = learner.restore(checkpoint, template)
-      except CheckpointError as error:
+      except DamagedCheckpointError as error:
         if path == self.checkpoints[-1]:
           raise
-        self.notices.append(f"{error} Falling back to the checkpoint before it.")
+        self.notices.append(
+          f"{error} It is moved to checkpoints/damaged_{path.name}. Falling back to the checkpoint before it."
+        )
         continue
       self.update, self.step = checkpoint.meta["update"], checkpoint.step
       self.wall_clock_s = checkpoint.meta["wall_clock_s"]
+      self.columns = checkpoint.meta.get("columns", [])  # earlier versions did not note them
       self.notices.append(notice)
       return

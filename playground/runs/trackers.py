@@ -1,6 +1,7 @@
 """Where metrics go. A new tracker is one class with `log` and `close`, and one line in `make_trackers`."""
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -26,18 +27,32 @@ class Tracker(Protocol):
 
 
 class TensorBoardTracker:
-  """Scalars for `tensorboard --logdir <run>`; on resume, points after `resume_step` are hidden by TensorBoard."""
+  """Scalars for `tensorboard --logdir <run>`; on resume, points after `resume_step` are hidden by TensorBoard.
+
+  Written here and now: tensorboardX's `SummaryWriter` has a thread of its own, whose end at the first error (a full
+  disk) makes the run wait for it for ever.
+  """
 
   def __init__(self, folder: Path, resume_step: int | None = None):
-    from tensorboardX import SummaryWriter
+    from tensorboardX.event_file_writer import EventsWriter
+    from tensorboardX.proto.event_pb2 import Event, SessionLog
+    from tensorboardX.proto.summary_pb2 import Summary
 
-    purge = None if resume_step is None else resume_step + 1
-    self._writer = SummaryWriter(str(folder), purge_step=purge, flush_secs=10)
+    self._event, self._summary = Event, Summary
+    folder.mkdir(parents=True, exist_ok=True)
+    self._writer = EventsWriter(str(folder / "events"))
+    self._flushed = time.monotonic()
+    if resume_step is not None:
+      session: Any = SessionLog(status=SessionLog.START)  # pyright: ignore[reportAttributeAccessIssue]
+      self._writer.write_event(Event(step=resume_step + 1, wall_time=time.time(), session_log=session))
 
   def log(self, step: int, metrics: dict[str, float]) -> None:
-    for name, value in metrics.items():
-      if math.isfinite(value):  # tensorboardX warns about every NaN; the CSV keeps them
-        self._writer.add_scalar(name, value, step)
+    finite = {name: value for name, value in metrics.items() if math.isfinite(value)}  # the CSV keeps the others
+    summary = self._summary(value=[self._summary.Value(tag=name, simple_value=finite[name]) for name in finite])
+    self._writer.write_event(self._event(step=step, wall_time=time.time(), summary=summary))
+    if time.monotonic() - self._flushed > 10:
+      self._writer.flush()
+      self._flushed = time.monotonic()
 
   def close(self, status: str) -> None:
     self._writer.close()
@@ -46,8 +61,14 @@ class TensorBoardTracker:
 class TrackerGroup:
   """Several trackers behind one `log`."""
 
-  def __init__(self, trackers: Sequence[Tracker]):
-    self.trackers = tuple(trackers)
+  def __init__(self, csv: CsvTracker, others: Sequence[Tracker] = ()):
+    self._csv = csv
+    self.trackers: tuple[Tracker, ...] = (csv, *others)
+
+  @property
+  def columns(self) -> list[str]:
+    """Names of the columns of metrics.csv so far."""
+    return self._csv.columns
 
   def log(self, step: int, metrics: dict[str, float]) -> None:
     for tracker in self.trackers:
@@ -63,6 +84,7 @@ def make_trackers(
   run_dir: RunDirectory,
   resume_step: int | None = None,
   notify: Callable[[str], None] = print,
+  columns: Sequence[str] = (),
 ) -> TrackerGroup:
   """Builds the trackers that `config["tracking"]` asks for; metrics.csv is always written.
 
@@ -71,16 +93,18 @@ def make_trackers(
     run_dir: where files go.
     resume_step: environment steps of the checkpoint that the run continues from; later records are dropped, since
       they are about to be made again. Log the metrics of step S before saving checkpoint S, and none is ever lost.
-    notify: takes one sentence when a tracker drops out.
+    notify: takes one sentence when a tracker drops out, or a file is damaged.
+    columns: of metrics.csv at that checkpoint, if it knows them.
   """
   resolved: dict[str, Any] = plain(config)
   tracking = resolved["tracking"]
-  csv = CsvTracker(run_dir.metrics_csv)
-  if resume_step is not None:
-    csv.truncate_after(resume_step)
-  trackers: list[Tracker] = [csv]
+  csv = CsvTracker(run_dir.metrics_csv, columns, notify)
+  if resume_step is not None and csv.truncate_after(resume_step) < resume_step:
+    file = run_dir.metrics_csv
+    notify(f"{file} has no row of step {resume_step:,}, where the run goes on: rows before it are lost.")
+  trackers: list[Tracker] = []
   if tracking["tensorboard"]:
     trackers.append(TensorBoardTracker(run_dir.path / "tensorboard", resume_step))
   if tracking["wandb"]["enable"]:
     trackers.append(WandbTracker(tracking["wandb"], run_dir.path, resolved, notify))
-  return TrackerGroup(trackers)
+  return TrackerGroup(csv, trackers)

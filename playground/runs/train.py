@@ -11,10 +11,9 @@ import jax
 from playground import registry
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
-from playground.errors import ConfigError
-from playground.hardware.distributed import is_main, leaving_at_once, preflight
+from playground.hardware.distributed import ending_together, is_main, leave, noting_loss, preflight, share, wait_for_all
 from playground.hardware.scaling import describe_division, scale_envs
-from playground.hardware.setup import setup
+from playground.hardware.setup import Hardware, setup
 from playground.learning.algorithms import algorithm
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
@@ -47,9 +46,7 @@ def train(config: "RunConfig") -> int:
   Raises:
     PlaygroundError: what the user can act on; a run directory that exists by then says failed and why.
   """
-  if config.hardware.distributed.enable and config.stages:
-    raise ConfigError("hardware=multi_node trains single runs: give a chain's stages one by one, with init_from.")
-  with leaving_at_once(), Interrupts() as interrupts:
+  with ending_together(), Interrupts() as interrupts:
     try:
       if config.hardware.scale_envs:
         config, notice = scale_envs(config, setup(config.hardware).mesh.size)
@@ -57,16 +54,25 @@ def train(config: "RunConfig") -> int:
       return train_chain(config, interrupts, _train) if config.stages else _train(config, interrupts)
     except Interrupted as interrupt:
       print(f"Interrupted by {interrupt}.")
-      return exit_code(interrupt.signum)
+      code = exit_code(interrupt.signum)
+      leave(code, f"was interrupted by {interrupt}")
+      return code
 
 
 def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) -> int:
   """One run; `began_s` is the age of the process by then, 0 for its first."""
   start = Start.find(config, began_s)
-  if start.finished:
-    print(f"{config.resume} is finished: nothing to resume (init_from={config.resume} trains on from its weights).")
-    return 0
-  hardware = setup(config.hardware)
+  if not start.finished:
+    hardware = setup(config.hardware)
+    with start.locked(config) as start:
+      if not start.finished:
+        return _train_locked(config, interrupts, began_s, start, hardware)
+  print(f"{config.resume} is finished: nothing to resume (init_from={config.resume} trains on from its weights).")
+  return 0
+
+
+def _train_locked(config: "RunConfig", interrupts: Interrupts, began_s: float, start: Start, hardware: Hardware) -> int:
+  """One run, new or to resume, that no other process writes."""
   preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
   algorithm_class = algorithm(config.agent.name)
   agent = algorithm_class.Config.from_config(config.agent)
@@ -80,6 +86,7 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
   if hardware.mesh.size > 1:
     start.notices.append(describe_division(config.agent, hardware.mesh.size))
   start.restore(learner, config.agent.name, draw)
+  preflight(config.hardware, [start.step, start.weights and start.weights.step], "checkpoint")  # one may see it damaged
 
   num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
   marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
@@ -87,19 +94,18 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
   num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
   evaluate = make_evaluator(env, learner.act, agent.num_eval_envs, hardware.mesh, num_recorded)
   if not is_main():
-    program = compile_program(learner, evaluate, draw)
-    follower = Follower(config, env, interrupts, start.step)
-    loop = Loop(learner, program, marks, config.seed, follower)
-    _, completed = _run(loop, learner, start, interrupts)
+    with noting_loss(RunDirectory(share()).note_loss):
+      program = compile_program(learner, evaluate, draw)
+      follower = Follower(config, env, interrupts, start.step)
+      loop = Loop(learner, program, marks, config.seed, follower)
+      _, completed = _run(loop, learner, start, interrupts)
     return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
   run_dir = start.run_dir or RunDirectory.create(
     str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
   )
-  with run_dir.recorded(), Progress(num_updates * learner.steps_per_update) as progress:
-    notes = [] if not env.parity else ["env.parity=true: playground 0.2.0 bug for bug"]
-    run_dir.write_manifest(
-      seed=config.seed, task=config.choices["env"], impl=env.impl, task_notes=notes, **hardware.facts
-    )
+  share(str(run_dir.path.absolute()))
+  with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(num_updates * learner.steps_per_update) as progress:
+    run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=env.impl, **hardware.facts)
     for notice in start.notices:
       progress.print(notice)
     progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
@@ -142,6 +148,7 @@ def cut_short(agent: Any, episode_length: int, marks: Sequence[Mark], steps_per_
 
 def _run(loop: Loop, learner: Learner, start: Start, interrupts: Interrupts) -> tuple[Any, bool]:
   """Trains from where the run begins; returns the last state, and whether the schedule was completed."""
+  wait_for_all()  # a first exchange waits for half a minute on CPUs: not all compile equally fast
   interrupts.start_saving()
   state = loop.init() if start.state is None else start.state
   if start.policy is not None:
@@ -161,7 +168,7 @@ def model_sampler(
   Raises:
     PlaygroundError: a term that does not go with the model.
   """
-  randomizer = Randomizer(env.mj_model, config.randomization.terms)
+  randomizer = Randomizer(env.mj_model, config.env.events)
   sample = jax.jit(randomizer.sample_batch)
 
   def draw(seed: int) -> tuple[ModelFields, ModelFields]:

@@ -3,21 +3,25 @@
 import contextlib
 import dataclasses
 import datetime
-import fcntl
 import os
-import time
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal
 
 import yaml
 
+from playground.config import format_value
+from playground.config.text import first_line
 from playground.errors import CheckpointError, nearest
-from playground.runs.files import read_json, write_json, write_text
+from playground.runs.files import is_locked, lock_holder, locking, read_json, write_json, write_text
+from playground.runs.run_dir import RunDirectory
 
 Status = Literal["queued", "submitted", "running", "finished", "failed", "timeout", "preempted", "killed"]
 ENDED = ("finished", "failed", "timeout", "preempted", "killed")
 STOP_FILE = "stop"
+_JOB_NAME = re.compile(r"\w[\w.=+-]*")
 FAILED = ("failed", "timeout", "killed")
 
 
@@ -56,8 +60,11 @@ class JobState:
     """How long the last start took, or has taken so far."""
     if self.started is None:
       return None
-    end = datetime.datetime.fromisoformat(self.ended) if self.ended else datetime.datetime.now(datetime.UTC)
-    return (end - datetime.datetime.fromisoformat(self.started)).total_seconds()
+    try:
+      end = datetime.datetime.fromisoformat(self.ended) if self.ended else datetime.datetime.now(datetime.UTC)
+      return (end - datetime.datetime.fromisoformat(self.started)).total_seconds()
+    except (ValueError, TypeError):  # no time, or one without a zone: damaged
+      return None
 
 
 class JobFolder:
@@ -75,7 +82,14 @@ class JobFolder:
 
   @property
   def record(self) -> dict[str, Any]:
-    return read_json(self.record_path)
+    optional = (str, NoneType)
+    kinds: Any = {"status": str, "reason": str, "attempt": int, "started": optional, "ended": optional, "where": str}
+    return read_json(self.record_path, **kinds)
+
+  @property
+  def run(self) -> RunDirectory:
+    """What the job's run says of itself."""
+    return RunDirectory(self.path)
 
   def write(self, **fields: Any) -> None:
     """Records how the job stands."""
@@ -89,7 +103,7 @@ class JobFolder:
     state = JobState(**fields)
     if state.status != "running" or self.locked():
       return state
-    if read_json(self.path / "status.json").get("status") == "finished":  # it outlived its worker
+    if self.run.status.get("status") == "finished":  # it outlived its worker
       return dataclasses.replace(state, status="finished")
     return dataclasses.replace(state, status="killed", reason="its process is gone without a word")
 
@@ -100,25 +114,12 @@ class JobFolder:
     Processes that inherit the descriptor hold the job, too: what outlives its worker is still at work.
     """
     self.path.mkdir(parents=True, exist_ok=True)
-    handle = os.open(self.path / "job.lock", os.O_CREAT | os.O_RDWR, 0o666)
-    try:
-      until = time.monotonic() + patience_s  # `locked` holds it for a moment to see
-      while not (got := _try_lock(handle, fcntl.LOCK_EX)) and time.monotonic() < until:
-        time.sleep(0.05)
-      yield handle if got else None
-    finally:
-      os.close(handle)
+    with locking(self.path / "job.lock", patience_s) as lock:  # `locked` holds it for a moment to see
+      yield lock
 
   def locked(self) -> bool:
     """Whether a process is at the job, on this machine or another that shares its folder."""
-    try:
-      handle = os.open(self.path / "job.lock", os.O_RDWR)
-    except FileNotFoundError:
-      return False
-    try:
-      return not _try_lock(handle, fcntl.LOCK_SH)
-    finally:
-      os.close(handle)
+    return is_locked(self.path / "job.lock")
 
   def progress(self) -> tuple[int | None, float | None]:
     """Steps trained and the last evaluation's return, as its metrics.csv has them."""
@@ -127,14 +128,12 @@ class JobFolder:
         columns = file.readline().decode().strip().split(",")
         file.seek(max(file.tell(), file.seek(0, os.SEEK_END) - 16384))
         rows = [line.split(",") for line in file.read().decode(errors="replace").split("\n")[:-1]]
-    except (FileNotFoundError, ValueError):
+      rows = [row for row in rows if len(row) == len(columns)]
+      column = columns.index("eval/episode_reward") if "eval/episode_reward" in columns else None
+      returns = [row[column] for row in rows if row[column]] if column is not None else []
+      return int(rows[-1][0]) if rows else None, float(returns[-1]) if returns else None
+    except (FileNotFoundError, ValueError):  # none yet, or damaged
       return None, None
-    rows = [row for row in rows if len(row) == len(columns)]
-    if not rows:
-      return None, None
-    column = columns.index("eval/episode_reward") if "eval/episode_reward" in columns else None
-    returns = [row[column] for row in rows if row[column]] if column is not None else []
-    return int(rows[-1][0]), float(returns[-1]) if returns else None
 
 
 class SweepDirectory:
@@ -180,16 +179,18 @@ class SweepDirectory:
   @classmethod
   def open(cls, path: str | Path) -> "SweepDirectory":
     """Reads the sweep at `path`; raises CheckpointError if there is none."""
-    path = Path(path).expanduser()
+    path = Path(os.path.expanduser(path))
     file = path / "sweep.yaml"
     if not file.is_file():
       siblings = [p.name for p in path.parent.glob("*/")] if path.parent.is_dir() else []
       near = "" if path.is_dir() else nearest(path.name, siblings)
       raise CheckpointError(f"{path} is not the folder of a sweep: it has no sweep.yaml.{near}")
     try:
-      return cls(path, yaml.safe_load(file.read_text(encoding="utf-8")))
-    except (yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError):
-      raise CheckpointError(f"{file} is damaged.") from None
+      content = yaml.safe_load(file.read_text(encoding="utf-8"))
+      _check(content)
+    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+      raise CheckpointError(f"{file} is damaged: {first_line(error)}.") from None
+    return cls(path, content)
 
   @property
   def name(self) -> str:
@@ -236,25 +237,43 @@ class SweepDirectory:
     self._write()
 
   @contextlib.contextmanager
-  def controlled(self) -> Iterator[bool]:
-    """Holds the sweep as long as the block runs; yields False if another process does."""
-    handle = os.open(self.path / "sweep.lock", os.O_CREAT | os.O_RDWR, 0o666)
-    try:
-      yield _try_lock(handle, fcntl.LOCK_EX)
-    finally:
-      os.close(handle)
+  def controlled(self) -> Iterator[None]:
+    """Holds the sweep while the block runs; raises CheckpointError if another process does."""
+    with locking(self.path / "sweep.lock") as lock:
+      if lock is None:
+        raise CheckpointError(
+          f"{self.path} is being run by {lock_holder(self.path / 'sweep.lock')}: `playground sweep status {self.path}` "
+          "shows how it stands, sweep_dir=<path> starts the same jobs anew."
+        )
+      yield
 
   def _write(self) -> None:
     write_text(self.path / "sweep.yaml", yaml.safe_dump(self._content, sort_keys=False, allow_unicode=True))
 
 
+def _check(content: Any) -> None:
+  """Raises KeyError, TypeError or ValueError where a sweep.yaml does not say what `create` writes."""
+  texts = lambda key, value: _need(key, value, list) and [_need(key, text, str) for text in value]
+  _need("it", content, dict)
+  for key, kind in {"name": str, "cwd": str, "jobs": list}.items():
+    _need(key, content[key], kind)
+  for key in ("command", "settings", "lines"):
+    texts(key, content[key])
+  for entry in content["jobs"]:
+    job = Job(**_need("a job", entry, dict))
+    if not _JOB_NAME.fullmatch(_need("a job's name", job.name, str)):  # a path would lead out of the sweep's folder
+      raise ValueError(f"{job.name!r} is not the name of a job")
+    texts("overrides", job.overrides)
+    _need("varies", job.varies, dict)
+    _need("needs", job.needs, int | None)
+    _need("steps", job.steps, int | None)
+
+
+def _need(what: str, value: Any, kind: Any) -> Any:
+  if not isinstance(value, kind):
+    raise TypeError(f"{what} is {format_value(value)}")
+  return value
+
+
 def now() -> str:
   return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
-
-
-def _try_lock(handle: int, kind: int) -> bool:
-  try:
-    fcntl.flock(handle, kind | fcntl.LOCK_NB)
-  except OSError:
-    return False
-  return True

@@ -5,12 +5,12 @@ import dataclasses
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Sequence
 
 from playground.config import Section
 from playground.errors import ConfigError, HardwareError
 from playground.hardware.gpus import visible_gpus
+from playground.interpreter import PYTHON
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.mps import MultiProcessService, control_program
 from playground.sweep.worker import COMMAND
@@ -99,7 +99,7 @@ class LocalLauncher:
     args = [*limits, "--where", where, "--slots", *numbers, "--cores", *map(str, cores), "--", *self._command]
     with folder.log.open("ab") as log:
       self._workers[job.name] = subprocess.Popen(
-        [sys.executable, "-m", "playground.sweep.worker", str(folder.path), *args],
+        [*PYTHON, "-m", "playground.sweep.worker", str(folder.path), *args],
         env=self._environment(gpus),
         stdin=subprocess.DEVNULL,
         stdout=log,

@@ -1,8 +1,10 @@
 """NVIDIA's Multi-Process Service: processes that share a GPU run side by side on it instead of by turns."""
 
+import contextlib
 import hashlib
 import os
 import shutil
+import stat
 import subprocess
 import tempfile
 from pathlib import Path
@@ -21,6 +23,17 @@ def control_program() -> str:
       f"launcher.mps=true, but {CONTROL}, which comes with NVIDIA's driver, is not on PATH: leave launcher.mps out."
     )
   return program
+
+
+def _make_own(folder: Path) -> None:
+  """Makes a folder in one that all users share; raises HardwareError if somebody else was there first."""
+  with contextlib.suppress(FileExistsError):
+    folder.mkdir(mode=0o700)
+  found = folder.lstat()
+  if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o077:
+    raise HardwareError(
+      f"launcher.mps=true, but {folder} is not a folder of yours alone: remove it, or set TMPDIR to another place."
+    )
 
 
 class MultiProcessService:
@@ -42,8 +55,8 @@ class MultiProcessService:
     name = hashlib.sha256(str(sweep.resolve()).encode()).hexdigest()[:12]
     pipes = Path(tempfile.gettempdir(), f"playground-mps-{os.getuid()}-{name}")  # its sockets' names must be short
     logs = sweep / "mps"
-    for folder in (pipes, logs):
-      folder.mkdir(mode=0o700, exist_ok=True)
+    logs.mkdir(mode=0o700, exist_ok=True)
+    _make_own(pipes)
     self.environment = {"CUDA_MPS_PIPE_DIRECTORY": str(pipes), "CUDA_MPS_LOG_DIRECTORY": str(logs)}
     if self._control(command="get_server_list\n")[0] == 0:
       return

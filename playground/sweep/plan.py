@@ -1,5 +1,6 @@
 """From a command line to a sweep on disk: its jobs, each composed and checked, or the sweep that they already are."""
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -53,6 +54,7 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
       make_job(number, job, varying, config)
       for number, (job, config) in enumerate(zip(combinations, composed, strict=True))
     ]
+  lines = [line for line in lines if not configs.is_of_command(line)]
   found = _find(chosen.sweep_dir, name, lines, jobs)
   if found is not None:
     return found, chosen
@@ -97,7 +99,8 @@ def make_job(number: int, overrides: Sequence[str], varying: Sequence[str], conf
   needs = 0 if config.hardware.platform == "cpu" else config.hardware.devices
   stages = [stage.agent.num_timesteps for stage in config.stages]
   steps = sum(stages) if stages else config.agent.num_timesteps
-  return Job(f"{number:03d}_{words}", list(overrides), varies, needs, int(steps))
+  kept = [text for text in overrides if not configs.is_of_command(text)]
+  return Job(f"{number:03d}_{words}", kept, varies, needs, int(steps))
 
 
 def _value(config: RunConfig, key: str) -> Any:
@@ -122,7 +125,7 @@ def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
 def _find(path: str | None, name: str, lines: Sequence[str], jobs: Sequence[Job]) -> SweepDirectory | None:
   """The sweep that this is, if it has been started before."""
   if path is not None:
-    if not (Path(path).expanduser() / "sweep.yaml").exists():
+    if not (Path(os.path.expanduser(path)) / "sweep.yaml").exists():
       return None
     sweep = SweepDirectory.open(path)
     if not _same(sweep, lines, jobs):
@@ -166,4 +169,21 @@ def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> Section:
   kept = [text for text in sweep.settings if text.partition("=")[0] not in keys]
   if "launcher" in keys:  # another launcher has other keys
     kept = [text for text in kept if not text.startswith("launcher.")]
+  for text in kept:
+    if not _is_plain(text):
+      what = "may name a program or a machine, or lets Optuna read pickles"
+      raise ConfigError(
+        f"{sweep.path / 'sweep.yaml'} says {text}, which {what}: give it again on this command line if you trust it."
+      )
   return configs.compose_settings([*kept, *extra])
+
+
+def _is_plain(setting: str) -> bool:
+  """Whether a setting that was read from a sweep's folder, which may be somebody else's, can do no harm.
+
+  Text that goes to a scheduler must be one word; CMA-ES keeps pickles in the sweep's study.
+  """
+  value = configs.parse_with_hydra(setting).value()
+  if isinstance(value, str):
+    return bool(re.fullmatch(r"[A-Za-z0-9_.-]+", value)) and value != "cmaes"
+  return value is None or isinstance(value, int | float)

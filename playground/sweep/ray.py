@@ -1,8 +1,10 @@
 """Jobs as tasks of a Ray cluster, whose nodes share the sweep's folder; a task whose node is lost goes on elsewhere."""
 
+import contextlib
 import os
 import socket
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -16,6 +18,12 @@ try:
   import ray
 except ImportError:
   raise ConfigError('launcher=ray needs Ray: pip install "playground-run[ray]".') from None
+
+
+_CORES = 4  # of a job, unless launcher.cores_per_job says otherwise
+
+# Ray puts the current folder first on its workers' path, where somebody else's yaml.py would win: let it be this one.
+_PACKAGES = Path(__file__).parents[2]
 
 
 class RayLauncher:
@@ -39,13 +47,14 @@ class RayLauncher:
       address = config.address or os.environ.get("RAY_ADDRESS")
       try:
         _knock(address)
-        ray.init(address=address, log_to_driver=False, include_dashboard=False)
+        with contextlib.chdir(_PACKAGES):
+          ray.init(address=address, log_to_driver=False, include_dashboard=False)
       except (OSError, RuntimeError, ValueError) as error:
         raise HardwareError(f"launcher=ray: no cluster at {address}: {str(error).splitlines()[0]}") from None
       RayLauncher._owned = True
     has = ray.cluster_resources()
     for job in jobs:
-      gpus, cores = _gpus(config, job), config.cores_per_job
+      gpus, cores = _gpus(config, job), _cores(config)
       if gpus > has.get("GPU", 0) or cores > has.get("CPU", 0):
         raise HardwareError(
           f"Job {job.name} takes {gpus:g} GPUs and {cores:g} cores, but Ray's cluster has {has.get('GPU', 0):g} and "
@@ -56,7 +65,7 @@ class RayLauncher:
     folder, gpus = self._sweep.folder(job), _gpus(self._config, job)
     folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
     task = self._run.options(
-      num_cpus=self._config.cores_per_job, num_gpus=gpus, max_retries=self._config.retries, name=job.name
+      num_cpus=_cores(self._config), num_gpus=gpus, max_retries=self._config.retries, name=job.name
     )
     limits = (self._config.timeout, self._config.grace)
     self._tasks[job.name] = task.remote(str(folder.path.absolute()), self._command, *limits, gpus)
@@ -91,10 +100,15 @@ def _gpus(config: Section, job: Job) -> float:
   return job.needs if job.needs is not None else min(1, ray.cluster_resources().get("GPU", 0))
 
 
+def _cores(config: Section) -> float:
+  """What a job takes of a node's cores."""
+  if config.cores_per_job is not None:
+    return config.cores_per_job
+  return min(_CORES, max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]))
+
+
 def _run(folder: str, command: tuple[str, ...], timeout: float | None, grace: float, gpus: float) -> int:
   """A task: a worker, on the GPUs that Ray gave it."""
-  from pathlib import Path
-
   if 0 < gpus < 1:
     os.environ["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION * gpus:.3f}"
   given = ",".join(map(str, ray.get_gpu_ids()))

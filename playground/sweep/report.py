@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from playground.runs.csv_tracker import read_metrics
 from playground.runs.files import replacing, write_text
 from playground.sweep.folder import FAILED, Job, SweepDirectory
 from playground.sweep.results import AVERAGED, CONFIDENCE, group_keys, with_interval
@@ -67,12 +68,7 @@ def mean_curve(curves: "list[tuple[np.ndarray, np.ndarray]]") -> tuple[np.ndarra
 
 def _metrics(sweep: SweepDirectory, job: Job) -> "pd.DataFrame | None":
   """A job's evaluations; None if it has none."""
-  import pandas as pd
-
-  path = sweep.folder(job).path / "metrics.csv"
-  if not path.is_file() or not path.stat().st_size:
-    return None
-  table = pd.read_csv(path, on_bad_lines="skip")
+  table = read_metrics(sweep.folder(job).path / "metrics.csv")
   if "eval/episode_reward" not in table:
     return None
   table = table.dropna(subset=["eval/episode_reward"])

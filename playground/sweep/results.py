@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from playground.runs.files import read_json, write_text
+from playground.runs.files import write_text
 from playground.sweep.folder import SweepDirectory
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def collect(sweep: SweepDirectory) -> "pd.DataFrame":
   rows = []
   for job in sweep.jobs:
     folder = sweep.folder(job)
-    state, summary = folder.state(), read_json(folder.path / "summary.json")
+    state, summary = folder.state(), folder.run.summary
     row: dict[str, Any] = {"job": job.name, **job.varies, "status": state.status}
     row |= {key: summary.get(key) for key in FIGURES}
     row |= {"attempts": state.attempt, "reason": state.reason, "overrides": " ".join(job.overrides)}

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from playground.config import Section
-from playground.errors import CheckpointError
+from playground.config import Section, check_saved_job
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
 from playground.sweep.launchers import Launcher, launcher_class
@@ -46,12 +45,9 @@ def run_sweep(
   Raises:
     PlaygroundError: it cannot be run like this, or another process runs it.
   """
-  with sweep.controlled() as ours:
-    if not ours:
-      raise CheckpointError(
-        f"{sweep.path} is being run by another process: `playground sweep status {sweep.path}` shows how it stands, "
-        "sweep_dir=<path> starts the same jobs anew."
-      )
+  for job in sweep.jobs:
+    check_saved_job(job.name, job.overrides)
+  with sweep.controlled():
     view, search = View(sweep, console), None
     if settings.search.name != "grid":
       from playground.sweep.search import Search

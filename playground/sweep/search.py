@@ -154,6 +154,4 @@ def first_values(lines: Sequence[str]) -> list[str]:
 
 
 def _value(folder: JobFolder, metric: str) -> float | None:
-  from playground.runs.files import read_json
-
-  return read_json(folder.path / "summary.json").get(metric)
+  return folder.run.summary.get(metric)

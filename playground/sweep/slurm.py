@@ -6,6 +6,8 @@ What Slurm preempts, or ends at its time limit, is asked to save, queued again, 
 import dataclasses
 import math
 import os
+import re
+import shlex
 import shutil
 import signal
 import socket
@@ -17,6 +19,7 @@ from typing import Any
 
 from playground.config import Section
 from playground.errors import ConfigError, HardwareError
+from playground.interpreter import PYTHON
 from playground.sweep.folder import ENDED, STOP_FILE, Job, JobFolder, SweepDirectory
 from playground.sweep.worker import COMMAND, Worker
 
@@ -26,6 +29,7 @@ except ImportError:
   raise ConfigError('launcher=slurm needs submitit: pip install "playground-run[slurm]".') from None
 
 SETTLED = tuple(status for status in ENDED if status not in ("preempted", "killed"))  # those Slurm may start again
+_SLURM_ID = re.compile(r"\d+(_\d+)?")  # no option of squeue or scancel
 QUEUE_S = 5.0  # how often Slurm is asked
 
 
@@ -99,7 +103,7 @@ class SlurmLauncher:
     """
     self.check(config, sweep.jobs)
     self._folder = sweep.path.absolute() / "slurm"
-    self._executor = executor or submitit.SlurmExecutor(self._folder, max_num_timeout=config.requeues)
+    self._executor = executor or _executor(self._folder, config.requeues)
     self._sweep = sweep
     self._config = config
     self._command = tuple(command)
@@ -162,9 +166,14 @@ class SlurmLauncher:
   def _submitted(self, job: Job, folder: JobFolder) -> Any:
     """What submitit knows of a job, also of one that an earlier process submitted."""
     known = folder.path / "slurm_id"
-    if job.name not in self.submitted and known.is_file():
-      self.submitted[job.name] = self._executor.job_class(self._folder, known.read_text())
+    if job.name not in self.submitted and known.is_file() and _SLURM_ID.fullmatch(job_id := known.read_text()):
+      self.submitted[job.name] = self._executor.job_class(self._folder, job_id)
     return self.submitted.get(job.name)
+
+
+def _executor(folder: Path, requeues: int) -> Any:
+  """Submitit's, whose jobs start Python as `PYTHON` says."""
+  return submitit.SlurmExecutor(folder, max_num_timeout=requeues, python=shlex.join(PYTHON))
 
 
 def slurm_parameters(config: Section, job: Job) -> dict[str, Any]:

@@ -16,12 +16,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from playground.runs.files import read_json
+from playground.config.text import quoted
+from playground.interpreter import PYTHON
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import STOP_FILE, JobFolder, SweepDirectory, now
 
-COMMAND = (sys.executable, "-m", "playground.cli.run")
+COMMAND = (*PYTHON, "-m", "playground.cli.run")
 POLL_S = 0.2
+
+
+def job_command(trusted: Sequence[str] = (), lines: Sequence[str] = ()) -> tuple[str, ...]:
+  """What a sweep's jobs are run with: packages to trust, and lines that its folder does not keep (`is_of_command`)."""
+  return (*COMMAND, *([f"trust=[{','.join(trusted)}]"] if trusted else []), *lines)
 
 
 class Worker:
@@ -126,7 +132,7 @@ class Worker:
 
   def _outcome(self, code: int, why: str) -> tuple[str, str]:
     """The job's status and its reason, in words."""
-    run = read_json(self._folder.path / "status.json")
+    run = self._folder.run.status
     if code == 0:
       return "finished", ""
     if why == "timeout":
@@ -140,11 +146,6 @@ class Worker:
     if run.get("status") == "failed" and run.get("reason"):
       return "failed", run["reason"]
     return "failed", f"exit code {code}: {_last_line(self._folder.log)}"
-
-
-def quoted(value: object) -> str:
-  """A value for Hydra's command line, whatever characters it has."""
-  return "'" + str(value).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,18 +1,35 @@
 """gymnasium's view of tasks: its own checker, its registry, and a batch whose episodes begin anew."""
 
+import os
+import subprocess
+import sys
 import warnings
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from playground.adapters.gym import GymEnv, GymVectorEnv, observation_space
-from playground.errors import UnknownNameError
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError
 from playground.registry import names
+from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from tests.dummy import Point
 
 SHORT = {"episode_length": 5}
+
+# In a process of its own: MuJoCo chooses its OpenGL when it is imported. Whoever forgets to close gets no traceback.
+RENDER = """
+import gymnasium, playground.adapters.gym
+env = gymnasium.make("playground/PendulumSwingup", render_mode="rgb_array")
+env.reset(seed=0)
+first = env.render()
+for _ in range(20): env.step(env.action_space.sample())
+image = env.render()
+assert image.shape == (480, 640, 3) and image.std() > 10 and (image != first).any()
+"""
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +43,25 @@ def test_gymnasium_finds_nothing_to_complain_about(env: GymEnv) -> None:
   with warnings.catch_warnings():
     warnings.filterwarnings("error", module="gymnasium")
     warnings.filterwarnings("ignore", message=".*infinity.*")  # velocities have no bounds
-    check_env(env, skip_render_check=True, skip_close_check=True)
+    check_env(env, skip_render_check=find_gl() is None)
+
+
+@pytest.mark.parametrize("end", ["env.close(); env.close()", ""])
+def test_renders_without_a_screen(end: str) -> None:
+  if find_gl() is None:
+    pytest.skip(NO_GL_REMEDY)
+  headless = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")} | {"JAX_PLATFORMS": "cpu"}
+  done = subprocess.run([sys.executable, "-c", RENDER + end], env=headless, capture_output=True, text=True)
+  assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_without_opengl_rendering_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr("playground.adapters.gym.find_gl", lambda: None)
+  env = gymnasium.make("playground/CartpoleBalance", render_mode="rgb_array").unwrapped
+  env.reset(seed=0)
+  with pytest.raises(PlaygroundError, match=r"No working OpenGL was found: install one"):
+    env.render()
+  env.close()
 
 
 def test_every_task_is_registered() -> None:
@@ -38,7 +73,8 @@ def test_time_truncates(env: GymEnv) -> None:
   steps = [env.step(np.zeros(1, np.float32)) for _ in range(SHORT["episode_length"])]
   assert [truncated for *_, truncated, _ in steps] == [False] * 4 + [True]
   assert not any(terminated for _, _, terminated, _, _ in steps)
-  assert set(steps[0][-1]) == {f"reward/{name}" for name in ("upright", "centered", "small_control", "small_velocity")}
+  rewards = {f"reward/{name}" for name in ("upright", "centered", "small_control", "small_velocity")}
+  assert {name for name in steps[0][-1] if name.startswith("reward/")} == rewards
 
 
 def test_a_batch_begins_anew_in_the_step_after_an_end() -> None:
@@ -56,6 +92,62 @@ def test_a_batch_begins_anew_in_the_step_after_an_end() -> None:
   assert not np.allclose(began, first)  # and drawn anew
   again, _ = envs.reset(seed=0)
   np.testing.assert_array_equal(again, first)
+
+
+def test_a_batch_can_begin_anew_in_the_step_that_ends() -> None:
+  make = lambda **kwargs: gymnasium.make_vec(
+    "playground/CartpoleBalance", num_envs=3, overrides=SHORT, physics="c", **kwargs
+  )
+  later, envs = make(), make(autoreset_mode="SameStep")
+  theirs = SyncVectorEnv([lambda: GymEnv("CartpoleBalance", SHORT)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
+  assert (later.metadata["autoreset_mode"], envs.metadata["autoreset_mode"]) == (
+    AutoresetMode.NEXT_STEP,
+    AutoresetMode.SAME_STEP,
+  )
+  first, _ = envs.reset(seed=0)
+  later.reset(seed=0)
+  theirs.reset(seed=0)
+  right = np.ones((3, 1), np.float32)
+  for i in range(5):
+    obs, rewards, terminated, truncated, info = envs.step(right)
+    last, *same, metrics = later.step(right)
+    expected = theirs.step(right)[-1]
+    for a, b in zip((rewards, terminated, truncated), same, strict=True):
+      np.testing.assert_array_equal(a, b)
+    finals = {name for name in info if "final" in name}
+    assert finals == {name for name in expected if "final" in name}
+    assert bool(finals) == (i == 4)
+  # The last of the episode, as gymnasium's own batch of single environments has it:
+  assert info["final_obs"].dtype == expected["final_obs"].dtype == object
+  np.testing.assert_array_equal(np.stack(list(info["final_obs"])), last)
+  assert info["_final_obs"].all() and info["_final_info"].all()
+  assert set(info["final_info"]) == set(expected["final_info"])
+  for name, values in metrics.items():
+    np.testing.assert_array_equal(info["final_info"][name], values)
+    np.testing.assert_array_equal(info["final_info"][f"_{name}"], True)
+  # The first of the next, which goes on:
+  assert np.abs(obs[:, 3:]).max() < 0.1 < np.abs(last[:, 3:]).max() and not np.allclose(obs, first)
+  for i in range(5):
+    *_, terminated, truncated, info = envs.step(right)
+    assert truncated.all() == (i == 4) and not terminated.any()
+
+
+def test_only_who_ended_has_a_last_observation() -> None:
+  envs: Any = GymVectorEnv(3, "CartpoleBalance", SHORT, "c", autoreset_mode=AutoresetMode.SAME_STEP)
+  envs.reset(seed=0)
+  steps = envs._state.info["steps"].at[1].set(4)
+  envs._state = envs._state.replace(info=envs._state.info | {"steps": steps})
+  obs, _, _, truncated, info = envs.step(np.ones((3, 1), np.float32))
+  assert truncated.tolist() == info["_final_obs"].tolist() == [False, True, False]
+  assert [final is None for final in info["final_obs"]] == [True, False, True]
+  assert info["final_obs"][1].shape == (5,) and (info["final_obs"][1] != obs[1]).any()
+  upright = info["final_info"]["reward/upright"]
+  assert upright[1] > 0 and upright[0] == upright[2] == 0
+
+
+def test_a_batch_that_never_begins_anew_is_refused() -> None:
+  with pytest.raises(ConfigError, match="autoreset_mode='Disabled' is not there: choose 'NextStep' or 'SameStep'"):
+    GymVectorEnv(3, "CartpoleBalance", autoreset_mode="Disabled")
 
 
 def test_one_entry_of_a_dict_observation() -> None:

@@ -57,6 +57,7 @@ def test_nothing_is_copied_either_way(env: VecEnv) -> None:
     (rewards, state.reward),
     (dones, state.done),
     (extras["time_outs"], state.info["truncation"]),
+    (extras["final_obs"]["critic"], state.info["final_obs"]["privileged_state"]),
   ):
     assert seen.data_ptr() == array.unsafe_buffer_pointer()
 
@@ -77,6 +78,16 @@ def test_time_outs_are_no_terminations(env: VecEnv) -> None:
   first = int(ends.any(1).int().argmax())
   assert set(logs[first]) == {"Episode/reward", "Episode/length", "Episode/distance"}
   assert logs[first]["Episode/length"] == first + 1 < LENGTH
+
+
+def test_the_last_observation_of_an_episode_is_there(env: VecEnv) -> None:
+  first, actions = env.get_observations()["policy"], torch.tensor([[0.5, -1.0]]).repeat(NUM_ENVS, 1)
+  env.episode_length_buf = torch.tensor([LENGTH - 1, 0, LENGTH - 1, 0])
+  obs, _, dones, extras = env.step(actions)
+  moved = first + 0.1 * actions
+  torch.testing.assert_close(extras["final_obs"]["policy"], moved)
+  torch.testing.assert_close(extras["final_obs"]["critic"], torch.hstack([moved, actions]))
+  torch.testing.assert_close(obs["policy"], torch.where(dones[:, None] > 0, first, moved))
 
 
 def test_episodes_can_begin_at_any_length(env: VecEnv) -> None:
@@ -101,8 +112,9 @@ def test_groups_of_go1() -> None:
 
 @pytest.mark.slow  # compiles a task's physics
 def test_each_environment_has_a_model_of_its_own() -> None:
-  terms = [{"field": "dof_damping", "target": "all", "operation": "set", "range": [0.0, 5.0]}]
-  env = vec_env(load("CartpoleBalance"), 2, terms=terms)
+  params = {"field": "dof_damping", "target": "all", "operation": "set", "range": [0.0, 5.0]}
+  events = {"damping": {"mode": "startup", "func": "model_field", "params": params}}
+  env = vec_env(load("CartpoleBalance"), 2, events=events)
   assert env.groups == {"policy": "state", "critic": "state"}, "a task without privileged observations"
   env.state = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), env.state)
   for _ in range(3):

@@ -164,4 +164,4 @@ def test_a_run_that_cannot_be_written_to_is_said_before_anything_is_evaluated(
 
 def test_no_episodes_are_refused(command: Command, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
   assert command(str(trained), "--episodes", "0") == 2
-  assert "--episodes=0 must be above 0" in capsys.readouterr().err
+  assert "--episodes=0 must be a whole number from 1 to" in capsys.readouterr().err

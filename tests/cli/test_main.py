@@ -54,22 +54,50 @@ def test_list_needs_no_jax():
   ("args", "shown"),
   [
     (
-      ["Go1JoystickFlatTerrain"],
       [
+        "Go1JoystickFlatTerrain",
+        "env.observations.state.gyro.delay=[0,1]",
+        "env.rewards.joint_deviation_l2.weight=-0.1",
+      ],
+      [
+        *("robot go1", "Tracks commanded forward, sideways and turning velocity", "action 12 in [-1, 1]"),
+        *("control 50 Hz (0.02 s)", "physics 250 Hz (0.004 s), 5 per control step", "backend auto: jax on CPU"),
+        *("episode 1000 control steps (20 s)", "reward sum of the terms, clipped to [0.0, 10000.0]"),
         *(
-          "robot go1",
-          "action 12 in [-1, 1]",
-          "control 50 Hz (0.02 s)",
-          "physics 250 Hz (0.004 s), 5 per control step",
+          "state 48 linvel 3 uniform 0.1",
+          "gyro 3 uniform 0.2 [0, 1] Angular velocity of the base",
+          "privileged_state 123",
         ),
-        *("episode 1000 control steps (20 s)", "backend auto: jax on CPU", "state 48", "privileged_state 123", "gyro"),
-        *("tracking_lin_vel 1.0", "torques -0.0002", "randomization: go1", "trunk: add uniform(-1, 1)"),
+        "track_linear_velocity_exp 1 std 0.5 exp(-|command_xy - v_xy|² / std²)",
+        "stand_still -1 command below 0.01 Sum |q - default| over the joints",
+        *(
+          "joint_deviation_l1 playground/mdp/rewards.py:",
+          "joint_torques_norms -0.0002",
+          "joint_deviation_l2 -0.1 Sum",
+        ),
+        *("fell_over limit 0.0 The world z of", "upvector_below playground/mdp/terminations.py:"),
+        *("velocity max [1.5, 0.8, 1.2], resample_s 5.0", "VelocityWalk playground/mdp/commands.py:"),
+        *("events (randomization: go1)", "payload startup body_mass trunk: add uniform(-1, 1) model_field"),
+        *("reset_root_xy reset distance 0.5 Moves", "push interval no velocity [0.0, 3.0]"),
         *("ppo (tuned/ppo/Go1JoystickFlatTerrain.yaml)", "network.policy_hidden_layer_sizes [512, 256, 128]"),
       ],
     ),
-    (["CartpoleBalance", "env.impl=jax"], ["state 5", "upright", "backend jax", "randomization: none none"]),
+    (
+      ["CartpoleBalance", "env.impl=jax"],
+      [
+        *("state 5 cart_position 1", "upright Cartpole.reward playground/envs/dm_control/cartpole.py:", "backend jax"),
+        *("nonfinite_state Some", "commands none events (randomization: none) none"),
+      ],
+    ),
+    (
+      ["PandaPickCubeCartesian"],
+      ["gripper_pos 3 site gripper Position of a site", "site_pos playground/mdp/arm_observations.py:"],
+    ),
     (["CartpoleBalance", "--num-views", "2", "env.impl=jax"], ["backend jax"]),
-    (["randomization=go1"], ["randomization: go1", "trunk: add uniform(-1, 1)", "geom_friction[:, 0] floor"]),
+    (
+      ["randomization=go1"],
+      ["randomization: go1", "body_mass trunk: add uniform(-1, 1)", "geom_friction[:, 0] floor: set"],
+    ),
     (["joystick", "robot=go1"], ["joystick", "robot go1", "ppo (defaults, not tuned for this task)"]),
   ],
 )

@@ -14,6 +14,7 @@ from playground.config import RunConfig, compose, to_yaml
 from playground.envs import warp_kernels
 from playground.errors import HardwareError
 from playground.sweep.folder import SweepDirectory
+from playground.sweep.worker import COMMAND
 from tests.command import Command, caller
 
 
@@ -108,7 +109,7 @@ def test_shows_and_does_not_train(
     (["agent.num_envs=1,2"], "add -m"),
     (["seed=99"], "error: hardware.devices=9: this machine has 1."),
     (["-m", "seed=1", "env=Gone"], "error: "),
-    (["-m", "agent.num_envs=0"], "error: agent.num_envs=0 must be a number above 0."),
+    (["-m", "agent.num_envs=0"], "error: agent.num_envs=0 must be a whole number from 1 to"),
     (["-m", "sweep=dm_control_pop"], "error: sweep=dm_control_pop does not exist: choose from dm_control_ppo,"),
     (["launcher=ray"], "launcher=ray is about a sweep: add -m"),
     (["-m", "agent.num_envs=128,7"], "error: Job experiment=quickstart agent.num_envs=7: agent.num_envs=7 does not"),
@@ -116,6 +117,20 @@ def test_shows_and_does_not_train(
     (["-m", "seed=1,2", "--cfg", "all"], "--cfg all shows one run: leave -m out"),
     (["-m", "sweep=dm_control_ppo", "--dry-run"], "error: --dry-run is no option"),
     (["--seed", "3"], "error: --seed is no option"),
+    (["--resolve"], "error: --resolve goes with --cfg job"),
+    (["--package", "agent"], "error: --package goes with --cfg job"),
+    (["--package", "x", "--cfg", "job"], "error: --package x: the configuration has no such key."),
+    (["--experimental-rerun", "x"], "error: --experimental-rerun is no option"),
+    (["--config-dir", "x"], "error: --config-dir is no option"),
+    (["--config-name", "x"], "error: --config-name is no option"),
+    (["-sc", "x"], "error: --shell-completion takes install=<shell>"),
+    (["--cfg", "x"], "error: argument --cfg/-c: invalid choice: 'x'"),
+    (["--cfg"], "error: argument --cfg/-c: expected one argument"),
+    (["-m", "seed=1,2", "sweep_dir=" + "a" * 300], "File name too long"),
+    (["resume=" + "a" * 300 + "/run"], "File name too long"),
+    (["hardware.kind=5"], "error: hardware.kind=5 has the wrong type: it must be text"),
+    (["video.camera=5"], "error: video.camera=5 has the wrong type: it must be text"),
+    (["agent.name=sac"], "error: agent.name=sac cannot be set: agent=<name> chooses it"),
     (["sweep=dm_control_ppo"], "add -m, as in `playground-run -m sweep=dm_control_ppo`."),
   ],
 )
@@ -147,18 +162,24 @@ def test_multirun_shows_every_job(command: Command, trained: list[RunConfig], ca
 
 
 def test_multirun_is_a_sweep(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-  swept: list[tuple[SweepDirectory, Any]] = []
-  monkeypatch.setattr("playground.sweep.runner.run_sweep", lambda sweep, settings: swept.append((sweep, settings)) or 3)
+  swept: list[tuple[SweepDirectory, Any, Any]] = []
+  monkeypatch.setattr("playground.sweep.runner.run_sweep", lambda *args: swept.append(args) or 3)
   monkeypatch.chdir(tmp_path)
   line = ["sweep=dm_control_ppo", "env=glob(Cartpole*Sparse)", "seed=range(2)", "debug=fast", "launcher.timeout=9"]
   assert command("-m", *line) == 3
-  ((sweep, settings),) = swept
+  ((sweep, settings, job_command),) = swept
+  assert job_command == COMMAND
   assert settings.launcher.timeout == 9
   assert [job.overrides[:2] for job in sweep.jobs[:2]] == [["agent=ppo", "env=CartpoleBalanceSparse"]] * 2
   assert [job.varies["seed"] for job in sweep.jobs] == [0, 1, 0, 1]
   assert sweep.path.parent == Path("results/sweeps/dm_control_ppo")
   assert command("-m", *line) == 3
   assert swept[1][0].path == sweep.path, "not finished, so it goes on"
+  own = ["hardware.cache_dir=/fast", "hydra.verbose=true"]
+  assert command("-m", *line, *own, "trust=[mine,theirs]") == 3
+  assert swept[2][0].path == sweep.path and swept[2][2] == (*COMMAND, "trust=[mine,theirs]", *own)
+  assert not any(word in (sweep.path / "sweep.yaml").read_text() for word in ("/fast", "hydra.", "mine"))
+  assert command("-m", *line, "hardware.cache_dir=/a,/b") == 2
 
 
 def test_a_mistake_is_reported_before_jax_is_imported():

@@ -29,7 +29,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
   """What would have been measured: a policy needs more than random actions do."""
   asked: list[tuple[Any, ...]] = []
 
-  def measure(config: Any, act: Any, envs: int, steps: int) -> BufferSizes:
+  def measure(config: Any, act: Any, envs: int, steps: int, **watch: Any) -> BufferSizes:
     asked.append((config.success_distance, act, envs, steps))
     return BufferSizes(19, 4.0, 1) if act is None else BufferSizes(49, 6.56, 4)
 
@@ -56,7 +56,7 @@ def test_random_actions(command: Command, measured: list[Any], capsys: pytest.Ca
   assert measured == [(0.02, None, 64, 7)]
   config = registry.config("PandaPickCube")
   out = capsys.readouterr().out
-  assert "PandaPickCube on Warp, 64 environments, 7 decisions" in out
+  assert "PandaPickCube on Warp, 64 environments, 7 policy steps" in out
   assert rows(out) == {
     "njmax": ["19", "24", str(config.njmax)],
     "naconmax_per_env": ["4.00", "5", str(config.naconmax_per_env)],
@@ -76,11 +76,22 @@ def test_a_policy_beside_them(command: Command, measured: list[Any], capsys: pyt
   assert [asked[0] for asked in measured[2:]] == [0.02, 0.02]
 
 
+@pytest.mark.slow  # compiles Warp's kernels for the CPU: half a minute
+def test_a_real_task_shows_progress_apart_from_its_result(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+  pytest.importorskip("warp")
+  assert command("CartpoleBalance", "--envs", "4", "--steps", "10") == 0
+  said = capsys.readouterr()
+  assert rows(said.out)["njmax"] == ["0", "0", "2"]
+  compiling, *steps = said.err.splitlines()
+  assert compiling == "random policy: compiling with njmax=32 naconmax_per_env=32 naccdmax_per_env=1"
+  assert "100.0 %  40/40 steps" in steps[-1]
+
+
 @pytest.mark.parametrize(
   ("args", "why"),
   [
     (["PandaPickCub"], "Did you mean 'PandaPickCube'"),
-    (["PandaPickCube", "--envs", "0"], "--envs=0 and --steps=500 must be above 0"),
+    (["PandaPickCube", "--envs", "0"], "--envs=0 must be a whole number from 1 to"),
     (["PandaPickCube", "env.njmx=3"], "Did you mean 'env.njmax'"),
     (["PandaOpenCabinet", "--run", RUN], f"--run={RUN} is one of PandaPickCube, not of PandaOpenCabinet"),
   ],

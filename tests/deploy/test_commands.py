@@ -239,14 +239,20 @@ def test_one_sentence_each(
   for name in ("policy", "other", "cut"):
     (tmp_path / f"{name}.onnx").touch()
   (tmp_path / "other.yaml").write_text("format: something else")
-  (tmp_path / "cut.yaml").write_text("format: playground-policy/2\ntask: CartpoleBalance\n")
+  (tmp_path / "cut.yaml").write_text("format: playground-policy/3\ntask: CartpoleBalance\n")
   for args, said in [
     (["play", str(tmp_path / "policy.onnx")], "policy.yaml does not exist"),
     (["play", str(tmp_path / "other.onnx")], "other.yaml is not a policy's contract"),
     (["play", str(tmp_path / "cut.onnx")], "cut.yaml is not a policy's contract"),
     (["play", str(tmp_path / "none")], "does not exist: give a run directory"),
-    (["play", str(tmp_path), "--episodes", "0"], "--episodes=0 must be above 0"),
-    (["play", str(tmp_path), "--seed", "-1", "--web"], "--seed=-1 must not be negative"),
+    (["play", str(tmp_path), "--episodes", "0"], "--episodes=0 must be a whole number from 1"),
+    (["play", str(tmp_path), "--seed", "-1", "--web"], "--seed=-1 must be a whole number from 0 to 4294967295"),
+    (["eval", str(tmp_path), "--seed", "99999999999999999999"], "must be a whole number from 0 to 4294967295"),
+    (["eval", str(tmp_path), "--episodes", "9999999999"], "--episodes=9999999999 must be a whole number from 1 to"),
+    (["play", str(tmp_path), "--port", "99999"], "--port=99999 must be a whole number from 0 to 65535"),
+    (["eval", "a" * 300], "File name too long"),
+    (["sweep", "status", "a" * 300], "File name too long"),
+    (["export", str(tmp_path), "--out", "/proc/nowhere/at/all"], "cannot be written"),
     (["play", str(tmp_path), "--video", "a.gif"], "--video=a.gif must be a file that ends in .mp4"),
     (["play", str(tmp_path), "--video", str(tmp_path / "cut.yaml" / "a.mp4")], "cut.yaml is not a folder"),
     (["play", str(tmp_path), "--camera", "fixed"], "--camera=fixed is of the video that --video=<file> asks for"),

@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from playground import registry
-from playground.deploy.contract import describe_policy
-from playground.deploy.parts import describe_part
+from playground.deploy.contract import check_contract, describe_policy, first_docstring_line
 from playground.envs.base import State
+from playground.mdp.terms import registered
 from playground.runs.files import plain
 
 
@@ -31,18 +31,27 @@ def contract(
 
 
 def test_a_joystick_policy() -> None:
-  overrides = {"clip_targets": True, "obs_scales": {"gyro": 0.25}, "history": {"joint_pos": 2}}
-  parts = ["linvel", "gyro", "gravity", "joint_pos", "joint_vel", "last_act", "command", "joint_pos_history"]
-  said = contract("Go1JoystickFlatTerrain", 72, overrides | {"obs.state": parts})
-  observation = said["observation"]
-  assert [(part["part"], part["start"], part["size"]) for part in observation] == [
-    *(("linvel", 0, 3), ("gyro", 3, 3), ("gravity", 6, 3), ("joint_pos", 9, 12), ("joint_vel", 21, 12)),
-    *(("last_act", 33, 12), ("command", 45, 3), ("joint_pos_history", 48, 24)),
+  overrides = {
+    "clip_targets": True,
+    "noise_level": 0.5,
+    "observations.state.gyro": {"noise": {"uniform": 0.2}, "scale": 0.25},
+    "observations.state.joint_vel.delay": [0, 2],
+    "observations.state.past": {"func": "joint_pos_rel", "history": 2, "noise": {"same_as": "joint_pos_rel"}},
+  }
+  said = contract("Go1JoystickFlatTerrain", 72, overrides)
+  observation = {term["name"]: term for term in said["observation"]}
+  assert [(name, term["start"], term["size"]) for name, term in observation.items()] == [
+    *(("linvel", 0, 3), ("gyro", 3, 3), ("gravity", 6, 3), ("joint_pos_rel", 9, 12), ("joint_vel", 21, 12)),
+    *(("last_act", 33, 12), ("command", 45, 3), ("past", 48, 24)),
   ]
-  assert (observation[1]["scale"], observation[1]["noise"]) == (0.25, 0.2)
-  assert observation[0]["what"] == "Linear velocity of the base in its own frame, m/s [3]."
+  assert observation["gyro"] == {
+    "name": "gyro", "start": 3, "size": 3, "scale": 0.25, "noise": {"uniform": 0.1},
+    "what": "Angular velocity of the base in its own frame, rad/s [3].",
+  }  # fmt: skip
+  assert observation["joint_vel"]["delay"] == [0, 2]
+  assert (observation["past"]["history"], observation["past"]["noise"]) == (2, {"same_as": "joint_pos_rel"})
   assert said["policy"]["inputs"] == [{"name": "obs", "entry": "state", "shape": [1, 72], "type": "float32"}]
-  assert (said["rate_hz"], said["history"], said["frames"], said["cameras"]) == (50, {"joint_pos": 2}, 1, [])
+  assert (said["rate_hz"], said["frames"], said["cameras"], said["delays"]) == (50, 1, [], {})
   law = said["action"]
   assert (law["law"], law["base"], law["scale"]) == ("ctrl = base + scale * action", "default_pose", 0.5)
   assert law["clipped_to"]["lower"][0] == pytest.approx(-0.863)
@@ -51,17 +60,20 @@ def test_a_joystick_policy() -> None:
   assert (first["joint"], first["kp"], first["damping"], first["force_limit"]) == ("FR_hip_joint", 35, 0.5, 23.7)
   assert (first["default"], first["default_of"]) == (0.1, "keyframe home")
   assert [row["joint"] for row in said["actuators"]] == said["joints"][1:]
-  assert said["command"]["max"] == [1.5, 0.8, 1.2]
+  assert said["command"]["max"] == [1.5, 0.8, 1.2] and "gait" not in said
+  check_contract(said | {"origin": {"steps": 1, "evaluation": {}}})
 
 
-@pytest.mark.parametrize(
-  "task",
-  ["Op3Joystick", "PandaPickCubeCartesian", "PandaRobotiqPushCube", "AlohaHandOver", "AlohaSinglePegInsertion"],
-)
-def test_each_part_of_a_robots_observation_is_explained(task: str) -> None:
-  env = registry.load(task)
-  actor = env.observation_parts["state"]
-  assert actor and [name for name in actor if not describe_part(env, name.removesuffix("_history"))] == []
+def test_frames_and_a_gait() -> None:
+  said = contract("G1JoystickFlatTerrain", 206, {"observation_frames": 2})
+  last = said["observation"][-1]
+  assert (last["name"], last["start"], last["size"], last["what"][:15]) == ("past_frames", 103, 103, "All terms above")
+  assert (said["frames"], said["gait"]["modes"]) == (2, ["walk"])
+
+
+@pytest.mark.parametrize("kind", ["observations", "rewards", "terminations", "commands", "events"])
+def test_each_registered_term_is_explained(kind: str) -> None:
+  assert [name for name, func in registered(kind).items() if not first_docstring_line(func)] == []
 
 
 def test_targets_that_actions_move() -> None:
@@ -70,13 +82,11 @@ def test_targets_that_actions_move() -> None:
   assert len(said["action"]["clipped_to"]["upper"]) == 8
 
 
-def test_delays_and_a_control_of_its_own() -> None:
+def test_delays_and_an_action_of_its_own() -> None:
   env = registry.load("PandaRobotiqPushCube")
-  history = jnp.zeros((4, env.action_size))
-  info = {"action_history": history, "action_delay": jnp.zeros((), jnp.int32)}
+  info = {"action_history": jnp.zeros((4, env.action_size)), "action_delay": jnp.zeros((), jnp.int32)}
   said = contract("PandaRobotiqPushCube", 48, info=info)
-  delays = {f"delays.{name}": steps for name, steps in said["env"]["delays"].items()}
-  assert said["delays"] == delays and delays["delays.obs_max"] == 12
+  assert said["delays"] == {"action_delay": [1, 3], "observation_delay": [6, 12]}
   assert (said["action"]["law"], said["rate_hz"]) == (None, 50)  # 200 Hz, each action four times
 
 
@@ -115,4 +125,4 @@ def test_a_camera_that_sees_depth_beside_a_vector() -> None:
   assert [(row["name"], row["shape"]) for row in said["policy"]["inputs"]] == [
     ("pixels_lookatcart", [1, 64, 64, 1]), ("obs", [1, 5]),
   ]  # fmt: skip
-  assert [part["part"] for part in said["observation"]] == ["cart_position", "pole_cos", "pole_sin", "velocity"]
+  assert [term["name"] for term in said["observation"]] == ["cart_position", "pole_cos", "pole_sin", "velocity"]

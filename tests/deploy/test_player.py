@@ -37,8 +37,8 @@ class Commanded(Point):
     data = state.data.replace(xfrc_applied=jnp.zeros((1, 6)))
     return state.replace(data=data, info=state.info | {"command": jnp.zeros(3)})
 
-  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
-    state = super().evaluate(data, info, action)
+  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+    state = super().post_step(data, info, action)
     return state.replace(
       reward=info["command"][0],
       metrics={"force": data.xfrc_applied[0, 0]},

@@ -102,11 +102,11 @@ def test_plots(watch: Watch, session: Session) -> None:
     watch.panel.record()
   watch.panel.draw()
   total, terms = watch.panel.plots.charts
-  assert terms.series[-1].get("label") == "tracking_lin_vel"
+  assert terms.series[-1].get("label") == "track_linear_velocity_exp"
   seconds, values = total.data
   assert len(seconds) == 11 and seconds[-1] == pytest.approx(session.player.seconds)
   assert values[-1] == pytest.approx(session.player.episode_return)
-  assert terms.data[-1][-1] == pytest.approx(session.player.term_sums["tracking_lin_vel"])
+  assert terms.data[-1][-1] == pytest.approx(session.player.term_sums["track_linear_velocity_exp"])
   session.reset()
   watch.panel.record()
   watch.panel.draw()

@@ -32,8 +32,9 @@ class UntrainedRun:
   def save(self, *steps: int, episode_return: float | None = None) -> None:
     """Writes checkpoints."""
     store = CheckpointStore(self.directory.checkpoints)
+    meta = {"update": 0, "wall_clock_s": 0.0, "env": self._task, "config": {}}
     for step in steps:
-      store.save(step, self._policy, {"rest": np.zeros(1)}, {"env": self._task}, episode_return=episode_return)
+      store.save(step, self._policy, {"rest": np.zeros(1)}, meta, episode_return=episode_return)
     store.close()
 
 

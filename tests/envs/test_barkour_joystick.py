@@ -1,4 +1,4 @@
-"""The joystick task on Barkour, without compiling physics: directions, limits, kicks, and stacked observations."""
+"""The joystick task on Barkour, without compiling physics: directions, limits, pushes, and stacked observations."""
 
 from typing import Any
 
@@ -22,13 +22,12 @@ def barkour() -> Any:
 
 
 def evaluate(env: Any, state: State, **data: Any) -> State:
-  state = env.disturb(state)
-  return env.evaluate(state.data.replace(**data), state.info, jnp.zeros(12))
+  return env.post_step(state.data.replace(**data), state.info, jnp.zeros(12))
 
 
-@pytest.mark.parametrize(("parity", "forward"), [(False, 1.0), (True, -1.0)])
-def test_ahead_is_where_the_head_is(parity: bool, forward: float) -> None:
-  env = load_task(TASK, {"parity": parity})
+@pytest.mark.parametrize(("task", "forward"), [(TASK, 1.0), (f"v020/{TASK}", -1.0)])
+def test_ahead_is_where_the_head_is(task: str, forward: float) -> None:
+  env = load_task(task)
   data = mujoco.MjData(env.mj_model)
   mujoco.mj_resetDataKeyframe(env.mj_model, data, 0)
   data.qvel[0] = 1.0  # to the front feet
@@ -42,31 +41,26 @@ def test_ahead_is_where_the_head_is(parity: bool, forward: float) -> None:
 
 def test_targets_stay_within_the_robots_own_range(barkour: Any) -> None:
   for sign, limit in ((-1, barkour.robot.target_range[0]), (1, barkour.robot.target_range[1])):
-    np.testing.assert_allclose(barkour.control(recorded(TASK), jnp.full(12, sign * 20.0)), limit)
+    np.testing.assert_allclose(barkour.action_to_ctrl(recorded(TASK), jnp.full(12, sign * 20.0)), limit)
   assert (barkour.robot.target_range[1] < barkour.mj_model.actuator_ctrlrange[:, 1]).all()
 
 
-def test_endings(barkour: Any) -> None:
+def test_endings_all_of_which_cost(barkour: Any) -> None:
   state = recorded(TASK)
   assert evaluate(barkour, state).done == 0
   beyond = state.data.qpos.at[7].set(barkour.robot.target_range[1, 0] + 0.01)  # the joint itself could go on
-  assert evaluate(barkour, state, qpos=beyond).done == 1
   low = state.data.site_xpos.at[barkour.robot.base_site, 2].set(0.17)
-  assert evaluate(barkour, state, site_xpos=low).done == 1
+  for name, data in (("joint_pos_out_of_target_range", {"qpos": beyond}), ("base_height_below", {"site_xpos": low})):
+    after = evaluate(barkour, state, **data)
+    ended = {key for key, value in after.metrics.items() if key.startswith("termination/") and value}
+    assert ended == {f"termination/{name}"}
+    assert (after.done, after.metrics["reward/is_terminated"]) == (1, -1)
 
 
-@pytest.mark.parametrize(("parity", "cost"), [(False, -1.0), (True, 0.0)])
-def test_every_fall_costs(parity: bool, cost: float) -> None:
-  env = load_task(TASK, {"parity": parity})
-  state = recorded(TASK, step=jnp.array(500))
-  low = state.data.site_xpos.at[env.robot.base_site, 2].set(0.1)
-  assert evaluate(env, state, site_xpos=low).metrics["reward/termination"] == cost
-
-
-def test_it_is_kicked(barkour: Any) -> None:
-  kick = {"pert_interval": jnp.array(50), "pert_duration": jnp.array(4), "pert_dir": jnp.array([0.0, 1.0, 0.0])}
-  kick |= {"pert_mag": jnp.array(1.0), "pert_mass": jnp.array(14.5), "push_step": jnp.array(102)}
-  force = barkour.disturb(recorded(TASK, **kick)).data.xfrc_applied[barkour.robot.root, :3]
+def test_it_is_pushed(barkour: Any) -> None:
+  push = {"push_interval": jnp.array(50), "push_duration": jnp.array(4), "push_direction": jnp.array([0.0, 1.0, 0.0])}
+  push |= {"push_velocity": jnp.array(1.0), "push_mass": jnp.array(14.5), "push_step": jnp.array(102)}
+  force = barkour.pre_step(recorded(TASK, **push)).data.xfrc_applied[barkour.robot.root, :3]
   np.testing.assert_allclose(force, [0, 0.5 * 14.5 * 1.0 / 0.08, 0], rtol=1e-5)
 
 
@@ -75,7 +69,7 @@ def test_observations_never_mix_episodes(barkour: Any, monkeypatch: pytest.Monke
   monkeypatch.setattr(barkour.physics, "forward", lambda model, data: data)
   monkeypatch.setattr(barkour.physics, "step", step)
   monkeypatch.setattr(barkour, "episode_length", 3)
-  monkeypatch.setattr(barkour, "_terminations", [])
+  monkeypatch.setattr(barkour.terminations, "terms", [])
   env = wrap_for_training(barkour)
   state = env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
   first, seen, step_all = state.obs, [], jax.jit(env.step)

@@ -11,12 +11,13 @@ import playground
 from playground.randomization import domain_randomizer
 
 N = 16
-TERMS = [{"field": "body_mass", "target": "pole_1", "operation": "scale", "range": [0.5, 2.0]}]
+MASS = {"field": "body_mass", "target": "pole_1", "operation": "scale", "range": [0.5, 2.0]}
+EVENTS = {"pole_mass": {"mode": "startup", "func": "model_field", "params": MASS}}
 
 
 def test_the_same_start_on_different_models_goes_different_ways() -> None:
   env = playground.load("CartpoleBalance")
-  randomize: Any = domain_randomizer(env.mj_model, TERMS)
+  randomize: Any = domain_randomizer(env.mj_model, EVENTS)
   keys = jax.random.split(jax.random.PRNGKey(1), N)
   wrapped = playground.wrap_for_brax_training(
     env, episode_length=3, action_repeat=1, randomization_fn=functools.partial(randomize, rng=keys)

@@ -45,7 +45,7 @@ def touch(env: Stand, state: State, geom: str) -> State:
 
 
 def evaluate(env: Stand, state: State, **data: Any) -> State:
-  return env.evaluate(state.data.replace(**data), state.info, jnp.zeros(12))
+  return env.post_step(state.data.replace(**data), state.info, jnp.zeros(12))
 
 
 @pytest.mark.parametrize(
@@ -55,26 +55,27 @@ def test_which_legs_mean_what(task: str, support: list[str], lifted: list[str], 
   env = load_task(task)
   for foot in FEET:
     after = touch(env, state, foot)
-    np.testing.assert_allclose(after.metrics["reward/contact"], -0.1 if foot in lifted else 0, rtol=1e-6)
+    np.testing.assert_allclose(after.metrics["reward/feet_contact"], -0.1 if foot in lifted else 0, rtol=1e-6)
     assert after.done == 0
   for i, joint in enumerate(env.config.robot.joints):
     moved = evaluate(env, state, qpos=env.robot.init_qpos.at[7 + i].add(0.1))
-    np.testing.assert_allclose(moved.metrics["reward/pose"], -0.001 if joint[:2] in lifted else 0, rtol=1e-4)
+    cost = moved.metrics["reward/lifted_leg_deviation_l2"]
+    np.testing.assert_allclose(cost, -0.001 if joint[:2] in lifted else 0, rtol=1e-4)
   for foot in support:
     for part in ("hip", "thigh1", "thigh2", "thigh3", "calf1", "calf2"):
       assert touch(env, state, f"{foot.lower()}_{part}").done == 1
   assert len(env.leg_geoms) == 12
 
 
-def test_parity_watches_the_front_legs_and_all_feet(state: State) -> None:
-  env = load_task("Go1Footstand", {"parity": True})
+def test_0_2_0_watches_the_front_legs_and_all_feet(state: State) -> None:
+  env = load_task("v020/Go1Footstand")
   assert touch(env, state, "fl_calf1").done == 1
-  assert [round(float(touch(env, state, foot).metrics["reward/contact"]), 6) for foot in FEET] == [-0.1] * 4
+  assert [round(float(touch(env, state, foot).metrics["reward/feet_contact"]), 6) for foot in FEET] == [-0.1] * 4
 
 
 def test_targets_move_on_from_the_last(hand: Stand, state: State) -> None:
   action = jnp.linspace(-1, 1, 12)
-  np.testing.assert_allclose(hand.control(state, action), state.data.ctrl + 0.3 * action, rtol=1e-6)
+  np.testing.assert_allclose(hand.action_to_ctrl(state, action), state.data.ctrl + 0.3 * action, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("task", "down"), [("Go1Handstand", 1.0), ("Go1Footstand", -1.0)])
@@ -83,14 +84,18 @@ def test_rewards_of_a_robot_that_stands(task: str, down: float, state: State) ->
   nose = jnp.array([[0.0, 0, down], [0, 1, 0], [-down, 0, 0]])  # the forward axis points down, or up
   site = env.robot.base_site
   pose = {
-    "site_xpos": state.data.site_xpos.at[site, 2].set(env.config.reward.target_height),
+    "site_xpos": state.data.site_xpos.at[site, 2].set(env.config.rewards.base_height_exp.params.target),
     "site_xmat": state.data.site_xmat.at[site].set(nose),
     "qpos": env.robot.init_qpos,
   }
   after = evaluate(env, state, **pose)
   rewards = {name.removeprefix("reward/"): float(value) for name, value in terms(after).items()}
   assert rewards == pytest.approx(
-    {"height": 1.0, "orientation": 1.0, "contact": 0.0, "pose": 0.0, "dof_pos_limits": 0.0}, abs=1e-6
+    {
+      **{"base_height_exp": 1.0, "forward_alignment": 1.0},
+      **{"feet_contact": 0.0, "lifted_leg_deviation_l2": 0.0, "joint_pos_limits": 0.0},
+    },
+    abs=1e-6,
   )
   np.testing.assert_allclose(after.reward, 0.02 * 2, rtol=1e-5)
 
@@ -104,21 +109,26 @@ def test_a_fall_ends_the_episode(hand: Stand, state: State) -> None:
 def test_finetuning(state: State) -> None:
   """The paper's later stages: costs of energy and acceleration, a power budget of 400 W that falls to 200 W."""
   force, velocity = jnp.full(12, 10.0), jnp.zeros(18).at[6:].set(2.5)  # 300 W
-  costs = {"reward.scales.energy": -0.003, "reward.scales.dof_acc": -2.5e-7}
+  costs = {"rewards.joint_power_l1": {"weight": -0.003}, "rewards.joint_acc_l2": {"weight": -2.5e-7}}
   for power, done in ((400.0, 0), (200.0, 1)):
-    env = load_task("Go1Handstand", {"termination.power": power, **costs})
+    env = load_task("Go1Handstand", {"terminations.power_above": {"params": {"limit": power}}, **costs})
     after = evaluate(env, state, actuator_force=force, qvel=velocity, qacc=jnp.full(18, 100.0))
     assert after.done == done
-    np.testing.assert_allclose(after.metrics["reward/energy"], -0.9, rtol=1e-5)
-    np.testing.assert_allclose(after.metrics["reward/dof_acc"], -2.5e-7 * 12e4, rtol=1e-5)
+    np.testing.assert_allclose(after.metrics["reward/joint_power_l1"], -0.9, rtol=1e-5)
+    np.testing.assert_allclose(after.metrics["reward/joint_acc_l2"], -2.5e-7 * 12e4, rtol=1e-5)
+
+
+def crouch(probability: float, keyframe: str) -> dict[str, Any]:
+  params = {"probability": probability, "keyframe": keyframe}
+  return {"events.reset_to_keyframe": {"mode": "reset", "params": params}}
 
 
 def test_crouched_start() -> None:
-  env = load_task("Go1Handstand", {"reset.crouch_probability": 1.0})
+  env = load_task("Go1Handstand", crouch(1.0, "pre_recovery"))
   env.physics.forward = lambda model, data: data  # nothing here reads what it computes
   start = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4))
-  crouch = env.robot.keyframe("pre_recovery")
-  np.testing.assert_array_equal(start.data.qpos[:, 7:], np.tile(crouch[7:], (4, 1)))
+  pose = env.robot.keyframe("pre_recovery")
+  np.testing.assert_array_equal(start.data.qpos[:, 7:], np.tile(pose[7:], (4, 1)))
   np.testing.assert_array_equal(start.data.ctrl, start.data.qpos[:, 7:])
   assert not start.data.qvel.any()
   assert len(np.unique(start.data.qpos[:, 0])) == 4
@@ -128,14 +138,26 @@ def test_crouched_start() -> None:
   ("overrides", "message"),
   [
     ({"support": ["FR", "FLL"]}, r"env\.support: 'FLL' is unknown.*Did you mean 'FL'\?"),
-    ({"reset.crouch_probability": 0.5, "reset.crouch_keyframe": "crouch"}, "the key 'crouch', which the model has not"),
-    ({"action_base": "last_targt"}, r"env\.action_base: 'last_targt' is unknown.*Did you mean 'last_target'\?"),
-    ({"reward.functions.pose": "posee"}, r"env\.reward\.functions\.pose: 'posee' is unknown.*Did you mean 'pose'\?"),
+    ({"robot.keyframe": "hom"}, r"the key 'hom', which the model does not have.*Did you mean 'home'\?"),
+    ({"rewards.lifted_leg_deviation_l2.func": "joint_deviation"}, "Did you mean 'joint_deviation_l"),
   ],
 )
 def test_unknown_names(overrides: dict[str, Any], message: str) -> None:
   with pytest.raises(UnknownNameError, match=message):
     load_task("Go1Handstand", overrides)
+
+
+@pytest.mark.parametrize(
+  ("params", "message"),
+  [
+    ({"rewards.feet_contact.params.feet": ["RX"]}, "feet: 'RX' is unknown"),
+    ({"rewards.lifted_leg_deviation_l2.params.joints": "lifted_leg"}, "Did you mean 'lifted_legs'"),
+  ],
+)
+def test_unknown_parts_of_the_robot(params: dict[str, Any], message: str, state: State) -> None:
+  """They are looked up in the first step, while it is traced."""
+  with pytest.raises(UnknownNameError, match=message):
+    evaluate(load_task("Go1Handstand", params), state)
 
 
 def test_any_robot_with_legs_can_be_named() -> None:

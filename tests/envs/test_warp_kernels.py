@@ -55,7 +55,7 @@ def model():
 
 
 def test_what_went_wrong_is_said(model, monkeypatch, tmp_path):
-  monkeypatch.setattr(warp_kernels.sys, "executable", "false")
+  monkeypatch.setattr(warp_kernels, "PYTHON", ("false",))
   building = warp_kernels.Building(model, 7)
   assert building.wait() == "Warp's kernels were not compiled ahead, they are at their first launch: exit code 1"
   assert not building._marker.exists()
@@ -74,7 +74,7 @@ def test_a_run_waits_and_says_it(model, monkeypatch, tmp_path, capsys):
   made = []
 
   def compile_ahead(physics: Physics) -> warp_kernels.Building:
-    monkeypatch.setattr(warp_kernels.sys, "executable", "false")
+    monkeypatch.setattr(warp_kernels, "PYTHON", ("false",))
     made.append(warp_kernels.Building(physics.mj_model, 9))
     return made[0]
 

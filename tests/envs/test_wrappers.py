@@ -1,7 +1,9 @@
 """Batching, episode limits, resets and the guard against non-finite numbers, on a task without physics."""
 
+import itertools
+from collections.abc import Mapping
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +28,8 @@ class Counting(PointTask):
     state = super().reset(rng)
     return state.replace(info=state.info | {wrappers.PRESERVE_INFO: {"total": jnp.zeros(())}})
 
-  def evaluate(self, data: Any, info: Any, action: jax.Array) -> State:
-    state = super().evaluate(data, info, action)
+  def post_step(self, data: Any, info: Any, action: jax.Array) -> State:
+    state = super().post_step(data, info, action)
     total = info[wrappers.PRESERVE_INFO]["total"] + 1
     done = state.done if self.die_at is None else jnp.where(state.info["age"] == self.die_at, 1.0, state.done)
     return state.replace(done=done, info=state.info | {wrappers.PRESERVE_INFO: {"total": total}})
@@ -76,6 +78,51 @@ def test_cached_reset_returns_to_the_first_state_and_keeps_info() -> None:
   assert (states[LENGTH].reward != 0).all(), "the last step's reward is kept"
 
 
+def test_what_belongs_to_an_episode_starts_over_with_it() -> None:
+  class Remembering(Counting):
+    episode_info = ("age",)
+
+  env = wrappers.wrap_for_training(Remembering(episode_length=LENGTH))
+  state, step = env.reset(jax.random.split(jax.random.PRNGKey(0), N)), jax.jit(env.step)
+  ages = []
+  for _ in range(LENGTH + 1):
+    state = step(state, jnp.zeros((N, 2)))
+    ages.append(int(state.info["age"][0]))
+  assert ages == [1, 2, 3, 0, 1]
+  np.testing.assert_array_equal(state.info[wrappers.PRESERVE_INFO]["total"], LENGTH + 1)  # the rest goes on
+
+
+def test_an_auto_reset_redraws_where_a_task_asks_for_it() -> None:
+  class Redrawing(Counting):
+    redraws = True
+
+    def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
+      return info | {"time": jax.random.uniform(key)}
+
+  env = wrappers.wrap_for_training(Redrawing(episode_length=LENGTH))
+  state, step = env.reset(jax.random.split(jax.random.PRNGKey(0), N)), jax.jit(env.step)
+  drawn = []
+  for _ in range(2 * LENGTH):
+    state = step(state, jnp.zeros((N, 2)))
+    drawn.append(np.asarray(state.info["time"]))
+  assert not np.any(drawn[: LENGTH - 1])
+  first, second = drawn[LENGTH - 1], drawn[2 * LENGTH - 1]
+  assert len(np.unique([*first, *second])) == 2 * N
+  np.testing.assert_array_equal(drawn[2 * LENGTH - 2], first)
+
+
+@pytest.mark.parametrize("full_reset", [False, True])
+def test_the_last_observation_of_an_episode_may_be_kept(full_reset: bool) -> None:
+  episodes = wrappers.wrap_for_evaluation(Counting(episode_length=LENGTH))
+  env = wrappers.AutoReset(episodes, full_reset, keep_final_obs=True)
+  state, step = env.reset(jax.random.split(jax.random.PRNGKey(0), N)), jax.jit(env.step)
+  for count in range(1, LENGTH + 2):
+    before, state = state, step(state, jnp.full((N, 2), 0.1))
+    final = state.info[wrappers.FINAL_OBS]["state"]
+    np.testing.assert_allclose(final, before.obs["state"] + 0.01, rtol=1e-5)  # pyright: ignore
+    assert np.array_equal(final, state.obs["state"]) == (count != LENGTH)  # pyright: ignore
+
+
 def test_full_reset_draws_anew_and_keeps_what_is_preserved() -> None:
   states = roll(2 * LENGTH, full_reset=True)
   first, second, third = (states[i].data.qpos for i in (0, LENGTH, 2 * LENGTH))
@@ -100,6 +147,36 @@ def test_action_repeat_sums_rewards_and_stops_at_a_termination() -> None:
   np.testing.assert_allclose(ended.reward, single[1], rtol=1e-5)
 
 
+def test_a_success_in_any_repeat_of_an_action_counts() -> None:
+  class Event(Counting):
+    """Succeeds in the control step `at` and in the third."""
+
+    summaries: ClassVar[Mapping[str, str]] = {"success": "max"}
+
+    def __init__(self, at: int, **kwargs: Any):
+      super().__init__(episode_length=LENGTH, action_repeat=4, **kwargs)
+      self.at = at
+
+    def reset(self, rng: jax.Array, model: Any = None) -> State:
+      state = super().reset(rng, model)
+      return state.replace(metrics={"success": jnp.zeros(())})
+
+    def post_step(self, data: Any, info: Any, action: jax.Array) -> State:
+      state = super().post_step(data, info, action)
+      age = state.info["age"]
+      return state.replace(metrics={"success": ((age == self.at) | (age == 3)).astype(jnp.float32)})
+
+  def success(env: Any) -> list[float]:
+    wrapped = wrappers.wrap_for_training(env)
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), N))
+    after = jax.jit(wrapped.step)(state, jnp.full((N, 2), 0.1))
+    np.testing.assert_array_equal(after.metrics["success"], after.info["episode_metrics"]["success"])
+    return after.metrics["success"].tolist()
+
+  assert success(Event(at=1)) == [1] * N
+  assert success(Event(at=0, die_at=2)) == [0] * N, "what comes after an episode's end is not part of it"
+
+
 @pytest.mark.parametrize("full_reset", [False, True])
 def test_a_nan_ends_the_episode_and_goes_no_further(full_reset: bool) -> None:
   states = roll(4, full_reset=full_reset, nan_at=2)
@@ -110,6 +187,20 @@ def test_a_nan_ends_the_episode_and_goes_no_further(full_reset: bool) -> None:
   assert np.isnan(bad.info["nonfinite_state"]["qpos"]).any()
   for leaf in jax.tree.leaves((bad.obs, bad.reward, bad.metrics, bad.data.qpos, bad.info["episode_metrics"])):
     assert np.isfinite(leaf).all()
+
+
+@pytest.mark.parametrize("full_reset", [False, True])
+def test_an_episode_with_nan_in_its_first_observation_sees_zeros_and_ends(full_reset: bool) -> None:
+  states = roll(3, full_reset=full_reset, nan_reset=True)
+  for state in states:
+    for leaf in jax.tree.leaves((state.obs, state.reward, state.metrics, state.info["episode_metrics"])):
+      assert np.isfinite(leaf).all()
+  for before, after in itertools.pairwise(states):
+    broken = np.asarray(before.info["nonfinite_reset"])
+    np.testing.assert_array_equal(after.info["nonfinite"], broken)
+    np.testing.assert_array_equal(np.asarray(after.done)[broken], 1)
+    np.testing.assert_array_equal(np.asarray(before.obs["state"])[broken], 0)
+  assert 0 < np.sum([state.info["nonfinite"] for state in states]) < 3 * N
 
 
 def test_an_absurd_velocity_counts_as_not_finite() -> None:

@@ -3,8 +3,6 @@
 import json
 import os
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -17,24 +15,20 @@ from playground.config import compose
 from playground.errors import ConfigError, HardwareError
 from playground.hardware import distributed
 from playground.hardware.scaling import describe_division, scale_envs
+from tests.processes import COMMAND, ended, start, two_processes
 
-ROOT = Path(__file__).parents[2]
 LINE = ["env=CartpoleBalance", "tuned=null", "debug=fast", "tracking=csv"]
-LINE += ["agent.num_timesteps=1600", "agent.num_evals=5"]
 
-# The point, trained through `train`; prints the checksum of the parameters that each process ends with.
+# Trains through `train`; each process knows the checksum of the parameters that it ends with.
 TRAIN = """
 import sys
 import jax, numpy as np
-from playground import registry
 from playground.config import compose
 from playground.learning.checkpoints import checksum
 from playground.learning.loop import Loop
 from playground.runs.job import Job
 from playground.runs.train import train
-from tests.dummy import Point
 
-registry.load = lambda name, config=None: Point()
 run, ended = Loop.run, []
 
 def remember(loop, *args):
@@ -60,19 +54,10 @@ print(json.dumps(results))
 """
 
 
-def start(
-  script: str, folder: Path, *overrides: str, devices: int = 1, line: list[str] = LINE
-) -> "subprocess.Popen[str]":
-  """Starts a process that trains on simulated devices."""
-  simulated = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu"}
-  command = [sys.executable, "-c", script, *line, *overrides]
-  env = os.environ | simulated | {"PYTHONPATH": str(ROOT)}
-  return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
 def test_checkpoints_go_on_on_another_topology(tmp_path: Path) -> None:
   """From two devices to one, and back."""
-  process = start(TRAIN + THERE_AND_BACK, tmp_path, "hardware=cpu", devices=2)
+  line = [*LINE, "agent.num_timesteps=1600", "agent.num_evals=5", "hardware=cpu"]
+  process = start(TRAIN + THERE_AND_BACK, tmp_path, *line, devices=2)
   out, _ = process.communicate(timeout=800)
   assert process.returncode == 0, out[-3000:]
   *_, ours = json.loads(out.strip().splitlines()[-1])
@@ -80,39 +65,34 @@ def test_checkpoints_go_on_on_another_topology(tmp_path: Path) -> None:
   assert (summary["status"], summary["steps"], summary["params_sha256"]) == ("finished", 1600, ours)
   table = pd.read_csv(tmp_path / "run/metrics.csv")
   assert table["step"].is_unique and table["step"].is_monotonic_increasing, "nothing is trained twice"
-  assert table["eval/episode_reward"].dropna().to_numpy()[-1] > table["eval/episode_reward"][0]
+  assert table["eval/episode_reward"].dropna().is_unique, "every part changes the policy"
   assert "On each of 2 devices: 4 of agent.num_envs=8, 4 of agent.batch_size=8, 2 of agent.num_eval_envs=4." in out
   assert "It was written on 2 devices: on 1, all of it goes on, but random numbers and rounding differ" in out
   assert "It was written on 1 device: on 2," in out
 
 
 def test_two_processes_are_one_training(tmp_path: Path) -> None:
-  """On the loopback, one device each: the same parameters everywhere, one run directory, one process's return curve."""
-  with socket.socket() as free:
-    free.bind(("localhost", 0))
-    port = free.getsockname()[1]
-  keys = [f"hardware.distributed.{key}" for key in ("coordinator", "num_processes", "process_id", "timeout")]
+  """Two devices each, a real task: the same parameters everywhere, one run directory, one process's return curve."""
+  params = "{field:dof_damping,target:all,operation:scale,range:[0.5,2.0]}"
+  damping = f"env.events.damping={{mode:startup,func:model_field,params:{params}}}"
+  line = [*LINE, damping, "agent.num_timesteps=640", "agent.num_evals=3", "run_dir=run"]
   script = TRAIN + "print(trained(), jax.process_index(), jax.device_count())"
-  both = ["hardware=multi_node", "hardware.platform=cpu", "run_dir=run"]
-  both += [f"{keys[0]}=localhost:{port}", f"{keys[1]}=2", f"{keys[3]}=200"]
-  processes = [start(script, tmp_path, *both, f"{keys[2]}={index}") for index in (1, 0)]
-  second, first = (process.communicate(timeout=800)[0] for process in processes)
-  assert [process.returncode for process in processes] == [0, 0], first[-3000:] + second[-3000:]
+  first, second = ended(two_processes(tmp_path, script, *line))
   ours, *place = first.strip().splitlines()[-1].split()
-  assert place == ["0", "2"]
-  assert second.strip().splitlines()[-1].split() == [ours, "1", "2"], "the same parameters"
+  assert place == ["0", "4"]
+  assert second.strip().splitlines()[-1].split() == [ours, "1", "4"], "the same parameters"
   summary = json.loads((tmp_path / "run/summary.json").read_text())
-  assert (summary["status"], summary["steps"], summary["params_sha256"]) == ("finished", 1600, ours)
+  assert (summary["status"], summary["steps"], summary["params_sha256"]) == ("finished", 640, ours)
   assert [path.name for path in tmp_path.iterdir()] == ["run"]
   assert "finished" not in second and "metrics" not in second, "only process 0 reports"
 
-  alone = start(script, tmp_path, "hardware=cpu", "hardware.devices=2", "run_dir=alone", devices=2)
+  alone = start(script, tmp_path, *line, "hardware=cpu", "hardware.devices=4", "run_dir=alone", devices=4)
   out, _ = alone.communicate(timeout=800)
   assert alone.returncode == 0, out[-3000:]
   tables = [pd.read_csv(tmp_path / run / "metrics.csv") for run in ("run", "alone")]
   curve, its = (table["eval/episode_reward"].dropna().to_numpy() for table in tables)
-  assert its[-1] > its[0] + 1, "it learns"
   np.testing.assert_allclose(curve, its, atol=0.01)
+  assert len(set(curve)) == 3, "the policy changes"
 
 
 # What cannot be
@@ -168,8 +148,7 @@ def test_others_that_do_not_come(tmp_path: Path) -> None:
     "hardware.platform=cpu",
     *(f"hardware.distributed.{k}={v}" for k, v in keys.items()),
   ]
-  script = "from playground.cli.run import main; main()"
-  process = start(script, tmp_path, line=line)
+  process = start(COMMAND, tmp_path, *line)
   out, _ = process.communicate(timeout=200)
   assert process.returncode == 2, out[-2000:]
   said = out.strip().splitlines()[-1]
@@ -188,6 +167,36 @@ def test_an_exchange_that_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setattr(multihost_utils, "process_allgather", lambda x: [x, x + 1])
   with pytest.raises(ConfigError, match="Process 1 has another configuration than process 0"):
     distributed.preflight(config, {})
+
+
+FAIL = """
+import os, signal, sys, time
+import jax
+from playground.config import compose
+from playground.errors import ConfigError
+from playground.hardware.distributed import ending_together, wait_for_all
+from playground.hardware.setup import setup
+
+config = compose(sys.argv[1:])
+with ending_together():
+  setup(config.hardware)
+  if jax.process_index() == int(os.environ["FAILS"]):
+    raise ConfigError("This does not work.")
+  wait_for_all()
+"""
+
+
+@pytest.mark.parametrize("fails", [0, 1])
+def test_a_process_that_fails_says_so_to_the_others(
+  fails: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  monkeypatch.setenv("FAILS", str(fails))
+  processes = two_processes(tmp_path, FAIL, "env=CartpoleBalance", devices=1)
+  said = [process.communicate(timeout=200)[0] for process in processes]
+  assert [process.returncode for process in processes] == [2, 2], said
+  assert said[fails].splitlines()[-1] == "error: This does not work."
+  sentence = f"process {fails} on {socket.gethostname()} failed: This does not work."
+  assert said[1 - fails].splitlines()[-1] == f"error: hardware=multi_node: {sentence}"
 
 
 # hardware.scale_envs

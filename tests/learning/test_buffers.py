@@ -57,7 +57,7 @@ def simulated(monkeypatch):
   tried = []
 
   def simulate(rows: int, pairs: int, convex: int = 0, stubborn: int = 0):
-    def roll(env, act, num_envs, num_steps, seed):
+    def roll(env, act, num_envs, num_steps, seed, on_steps):
       tried.append((env.njmax, env.naconmax_per_env * num_envs, env.naccdmax_per_env * num_envs))
       assert env.naccdmax_per_env <= env.naconmax_per_env, "Warp refuses this"
       have = dict(zip((1, 8, 16), tried[-1], strict=True))
@@ -80,6 +80,25 @@ def test_buffers_grow_until_they_are_large_enough(simulated, rows, pairs, convex
   config = registry.config("Go1Getup")  # njmax: 160
   assert measure_buffers(config, None, num_envs=2, num_steps=3) == BufferSizes(rows, pairs / 2, found)
   assert len(tried) == tries and all(have >= need for have, need in zip(tried[-1], (rows, pairs, convex), strict=True))
+
+
+def test_a_rollout_reports_its_steps_and_keeps_the_most():
+  class Counting(PointTask):
+    """Needs one more constraint row in each step."""
+
+    def reset(self, rng, model=None):
+      state = super().reset(rng, model)
+      return state.replace(data=state.data.replace(buffers=use(0, 0, 0)))
+
+    def post_step(self, data, info, action):
+      state = super().post_step(data, info, action)
+      return state.replace(data=state.data.replace(buffers=use(state.info["age"], 3, 1)))
+
+  for num_steps, stride in ((7, 1), (125, 2)):
+    reported: list[int] = []
+    found = buffers._roll(Counting(), None, 2, num_steps, 0, reported.append)
+    assert (found.constraints, found.contacts, found.overflow) == (num_steps, 3, 1)
+    assert reported == [*range(stride, num_steps, stride), num_steps]
 
 
 def test_other_buffers_are_named(simulated):

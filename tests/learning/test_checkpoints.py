@@ -1,14 +1,15 @@
 """Checkpoints: what is stored comes back bit for bit, and what is not whole, not ours or does not fit is refused."""
 
+import contextlib
 import errno
 import json
 import math
 import os
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +19,18 @@ import pytest
 
 from playground.errors import CheckpointError
 from playground.learning import checkpoints
-from playground.learning.checkpoints import Checkpoint, CheckpointStore, find_checkpoints
+from playground.learning.checkpoints import (
+  Checkpoint,
+  CheckpointStore,
+  DamagedCheckpointError,
+  NoCheckpointError,
+  find_checkpoints,
+)
 
 POLICY = {"w": jnp.linspace(-1, 1, 3000).reshape(50, 60), "count": jnp.asarray(7, jnp.int32)}
 STATE = {
   "scalar": jnp.asarray(-0.0),
-  "odd": jnp.asarray([np.nan, np.inf, 1e-45, 0.1], jnp.float32),
+  "odd": jnp.asarray([1e-45, 0.1, 3e38], jnp.float32),
   "half": jnp.asarray([1.5, -2], jnp.bfloat16),
   "found": jnp.asarray([True, False]),
   "flag": jnp.asarray(True),
@@ -34,6 +41,11 @@ STATE = {
 }
 
 
+def meta(update: int = 0) -> dict[str, Any]:
+  """What a run notes beside the arrays."""
+  return {"update": update, "wall_clock_s": 1.0, "env": "Point", "config": {"agent": {"name": "ppo"}}}
+
+
 def save(
   folder: Path, *steps: int, keep: int = 3, returns: dict[int, float] | None = None, **kwargs: Any
 ) -> list[Path]:
@@ -41,9 +53,15 @@ def save(
   store = CheckpointStore(folder / "checkpoints", keep, **kwargs)
   returns = returns or {}
   for step in sorted({*steps, *returns}):
-    store.save(step, POLICY, STATE, {"update": step // 10}, episode_return=returns.get(step))
+    store.save(step, POLICY, STATE, meta(step // 10), episode_return=returns.get(step))
   store.close()
   return find_checkpoints(folder)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+  (path,) = save(tmp_path_factory.mktemp("original"), returns={10: 1.0})
+  return path
 
 
 def numbers(paths: list[Path]) -> list[int]:
@@ -86,12 +104,17 @@ def test_the_newest_are_kept(tmp_path: Path) -> None:
   assert [p.name for p in save(tmp_path, 50, keep=2)] == ["000000000050", "000000000040"]
 
 
-def test_a_run_that_fell_back_makes_the_later_ones_again(tmp_path: Path) -> None:
+def test_a_run_that_fell_back_keeps_the_damaged_ones_aside_and_makes_them_again(tmp_path: Path) -> None:
   newest, _ = save(tmp_path, 10, 20)
   os.truncate(data_file(newest), 10)
-  paths = save(tmp_path, 20, continued=10)
-  assert [p.name for p in paths] == ["000000000020", "000000000010"]
-  Checkpoint(paths[0]).restore("state", like(STATE))
+  before = {path.relative_to(newest): path.read_bytes() for path in newest.rglob("*") if path.is_file()}
+  for aside in ("damaged_000000000020", "damaged_000000000020_2"):
+    paths = save(tmp_path, 20, continued=10)
+    assert [p.name for p in paths] == ["000000000020", "000000000010"]
+    Checkpoint(paths[0]).restore("state", like(STATE))
+    assert (newest.parent / aside).is_dir()
+  aside = newest.with_name("damaged_000000000020")
+  assert {path.relative_to(aside): path.read_bytes() for path in aside.rglob("*") if path.is_file()} == before
 
 
 # The best
@@ -111,6 +134,37 @@ def test_the_best_is_kept_besides_the_newest(tmp_path: Path) -> None:
   assert numbers(find_checkpoints(best)) == [80]
   assert numbers(save(tmp_path, keep=2, returns={100: 0.0})) == [100, 90]
   assert sorted(os.listdir(best.parent)) == ["000000000090", "000000000100", "best"]
+
+
+@pytest.mark.parametrize("item", ["policy", "state"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_never_the_best_and_refused_with_its_name(
+  tmp_path: Path, item: str, value: float
+) -> None:
+  broken = {"half": jnp.asarray([1.5, value], jnp.bfloat16)}
+  trees = {"policy": POLICY, "state": STATE} | {item: {"policy": POLICY, "state": STATE}[item] | broken}
+  store = CheckpointStore(tmp_path / "checkpoints")
+  store.save(10, POLICY, STATE, meta(), episode_return=1.0)
+  store.save(20, trees["policy"], trees["state"], meta(), episode_return=2.0)
+  store.close()
+  assert numbers(find_checkpoints(tmp_path / "checkpoints/best")) == [10]
+  newest = Checkpoint(find_checkpoints(tmp_path)[0])
+  with pytest.raises(CheckpointError) as error:
+    newest.restore(item, like(trees[item]))
+  one_sentence(error, f"{newest.path} cannot be used: its {item}['half'] holds NaN or infinite values")
+
+
+def test_environments_may_hold_numbers_that_are_not_finite(tmp_path: Path) -> None:
+  class Training(NamedTuple):
+    env_state: Any
+
+  state = Training({"nonfinite_state": jnp.asarray([jnp.nan, jnp.inf])})
+  store = CheckpointStore(tmp_path / "checkpoints")
+  store.save(10, POLICY, state, meta(), episode_return=1.0)
+  store.close()
+  (best,) = find_checkpoints(tmp_path / "checkpoints/best")
+  restored = Checkpoint(best).restore("state", like(state))
+  np.testing.assert_array_equal(restored.env_state["nonfinite_state"], [np.nan, np.inf])
 
 
 def test_without_a_return_there_is_no_best(tmp_path: Path) -> None:
@@ -144,11 +198,10 @@ def test_the_best_is_always_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     return watched
 
   monkeypatch.setattr(ocp.CheckpointManager, "delete", removing(ocp.CheckpointManager.delete))
-  monkeypatch.setattr(checkpoints, "shutil", SimpleNamespace(rmtree=removing(shutil.rmtree)))
+  monkeypatch.setattr(Path, "rename", removing(Path.rename))
   assert numbers(save(tmp_path, keep=1, returns={10: 2.0, 20: 1.0, 30: 3.0, 40: 4.0})) == [40]
   assert seen == [30, 30, 40]
   assert numbers(save(tmp_path, keep=2, returns={50: 5.0}, continued=40)) == [50, 40]
-  os.truncate(data_file(tmp_path / "checkpoints" / "000000000050"), 10)
   seen.clear()
   assert numbers(save(tmp_path, continued=40)) == [40]
   assert (seen, numbers(find_checkpoints(best))) == ([40], [40])
@@ -163,7 +216,8 @@ def test_a_run_whose_best_is_damaged_makes_it_again(tmp_path: Path) -> None:
   assert numbers(find_checkpoints(best)) == [20]
   store = CheckpointStore(tmp_path / "checkpoints", continued=-1)
   store.close()
-  assert list((tmp_path / "checkpoints").iterdir()) == [], "from the beginning"
+  aside = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+  assert aside == ["damaged_000000000010", "damaged_000000000020", "damaged_000000000020_2"], "from the beginning"
 
 
 def test_a_copy_without_links_loses_only_the_best(tmp_path: Path) -> None:
@@ -203,6 +257,30 @@ def test_what_cannot_be_written_is_raised(tmp_path: Path) -> None:
     store.close()
 
 
+def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  save(tmp_path, 10)
+
+  def half(self: Any, step: int, **kwargs: Any) -> None:
+    (tmp_path / "checkpoints" / f"{step:012d}.orbax-checkpoint-tmp").mkdir()
+    raise ValueError("UNKNOWN: Error writing [os_error_code='28']")  # as TensorStore does
+
+  monkeypatch.setattr(ocp.CheckpointManager, "save", half)
+  with pytest.raises(CheckpointError) as error:
+    save(tmp_path, 20)
+  one_sentence(error, f"{tmp_path / 'checkpoints'} cannot be written: No space left on device")
+  assert numbers(find_checkpoints(tmp_path)) == [10]
+  assert sorted(os.listdir(tmp_path / "checkpoints")) == ["000000000010"], "the space of the half is free again"
+
+
+def test_a_folder_that_was_removed_is_not_made_again(tmp_path: Path) -> None:
+  store = CheckpointStore(tmp_path / "run/checkpoints")
+  shutil.rmtree(tmp_path / "run")
+  store.save(10, POLICY, STATE, meta())
+  with pytest.raises(CheckpointError, match="checkpoints cannot be written: it was removed"):
+    store.close()
+  assert not (tmp_path / "run").exists()
+
+
 def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
   foreign = tmp_path / "checkpoints" / "000000000010"
   (foreign / "default").mkdir(parents=True)
@@ -211,8 +289,8 @@ def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
   one_sentence(error, str(foreign), "not a checkpoint of playground-run")
 
   (path,) = save(tmp_path / "other", 10)
-  meta = path / "meta" / "metadata"
-  meta.write_text(json.dumps(json.loads(meta.read_text()) | {"format": "brax/1"}))
+  file = path / "meta" / "metadata"
+  file.write_text(json.dumps(json.loads(file.read_text()) | {"format": "brax/1"}))
   with pytest.raises(CheckpointError) as error:
     Checkpoint(path)
   one_sentence(error, str(path), "playground-run/1")
@@ -222,13 +300,124 @@ def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
   one_sentence(error, "000000000099", "no such folder")
 
 
+def test_too_many_open_files_is_not_damage(original: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(checkpoints, "_RETRY_AFTER_S", (0.0,))
+  limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+  highest = max(map(int, os.listdir("/proc/self/fd")))
+  held = [os.open("/", os.O_RDONLY) for _ in range(highest)]  # no number is free below the limit
+  resource.setrlimit(resource.RLIMIT_NOFILE, (max(held) + 1, limits[1]))
+  try:
+    with pytest.raises(CheckpointError) as error:
+      Checkpoint(original)
+  finally:
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    for handle in held:
+      os.close(handle)
+  assert not isinstance(error.value, DamagedCheckpointError)
+  one_sentence(error, str(original), "cannot be read now", "Too many open files")
+  Checkpoint(original)
+
+
+@pytest.mark.parametrize(
+  ("problem", "passes"),
+  [
+    (OSError(errno.EMFILE, "Too many open files"), True),
+    (ValueError("UNKNOWN: read failed [os_error_code='5']"), True),
+    (RuntimeError("can't start new thread"), True),
+    (OSError(errno.EIO, "Input/output error"), False),
+    (MemoryError(), False),
+  ],
+)
+def test_what_may_pass_is_tried_again(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch, problem: Exception, passes: bool
+) -> None:
+  checkpoint = Checkpoint(save(tmp_path, 10)[0])
+  problems = [problem] * (2 if passes else 9)
+  arrays = Checkpoint._arrays
+
+  def read(self: Checkpoint, item: str) -> Any:
+    if problems:
+      raise problems.pop()
+    return arrays(self, item)
+
+  monkeypatch.setattr(Checkpoint, "_arrays", read)
+  monkeypatch.setattr(checkpoints, "_RETRY_AFTER_S", (0.0, 0.0))
+  if passes:
+    checkpoint.restore("policy", like(POLICY))
+    return
+  with pytest.raises(CheckpointError) as error:
+    checkpoint.restore("policy", like(POLICY))
+  assert not isinstance(error.value, DamagedCheckpointError)
+  assert len(problems) == 6
+
+
+def edit(checkpoint: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+  """Changes a checkpoint's meta data as an accident would, which computes no checksum."""
+  file = checkpoint / "meta" / "metadata"
+  content = json.loads(file.read_text())
+  change(content)
+  file.write_text(json.dumps(content))
+
+
+def test_a_newer_format_is_refused_with_its_version_and_stays(tmp_path: Path) -> None:
+  newest, _ = save(tmp_path, 10, 20)
+  edit(newest, lambda meta: meta.update(format="playground-run/2", leaves="another way to say it"))
+  with pytest.raises(CheckpointError) as error:
+    Checkpoint(newest)
+  assert not isinstance(error.value, DamagedCheckpointError)
+  one_sentence(error, str(newest), "newer version", "playground-run/2", "playground-run/1")
+  with pytest.raises(CheckpointError, match="newer version"):
+    save(tmp_path)
+  assert newest.is_dir()
+
+
+@pytest.mark.parametrize("key", ["step", "update", "wall_clock_s", "env", "config", "leaves", "sha256", "return"])
+@pytest.mark.parametrize("value", ["missing", None, -1, "text", [], {}, {"policy": 5}, {"policy": [[1, 2, 3]]}])
+@pytest.mark.parametrize("with_checksum", [True, False])
+def test_changed_meta_data_are_damage(
+  original: Path, tmp_path: Path, key: str, value: Any, with_checksum: bool
+) -> None:
+  """Those of earlier versions have no checksum; a change that shows is one sentence there, too."""
+  checkpoint = shutil.copytree(original, tmp_path / "checkpoints" / "000000000010")
+  if not with_checksum:
+    edit(checkpoint, lambda meta: meta.pop("meta_sha256"))
+  edit(checkpoint, lambda meta: meta.pop(key) if value == "missing" else meta.update({key: value}))
+  with contextlib.ExitStack() as stack:
+    if with_checksum:
+      error = stack.enter_context(pytest.raises(DamagedCheckpointError))
+    else:
+      error = stack.enter_context(contextlib.suppress(CheckpointError))
+    Checkpoint(checkpoint).restore("policy", like(POLICY))
+  if error is not None:
+    one_sentence(error, str(checkpoint), "is damaged: its meta data")
+
+
+def test_a_step_is_its_folders(tmp_path: Path) -> None:
+  newest, _ = save(tmp_path, 10, 20)
+  renamed = newest.rename(newest.with_name("000000000030"))
+  with pytest.raises(CheckpointError) as error:
+    Checkpoint(renamed)
+  assert not isinstance(error.value, DamagedCheckpointError), "its bytes are whole"
+  one_sentence(error, str(renamed), "holds step 20: rename the folder to 000000000020")
+
+
+def test_a_folder_that_cannot_be_listed_has_not_no_checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  """Else a resumed run would begin again, over what is there."""
+  save(tmp_path, 10)
+  monkeypatch.setattr(Path, "iterdir", lambda _: (_ for _ in ()).throw(OSError(errno.EMFILE, "Too many open files")))
+  with pytest.raises(CheckpointError) as error:
+    find_checkpoints(tmp_path)
+  assert not isinstance(error.value, NoCheckpointError)
+  one_sentence(error, "cannot be read: Too many open files")
+
+
 @pytest.mark.parametrize("item", ["policy", "state", "meta"])
 def test_a_missing_item_is_refused(tmp_path: Path, item: str) -> None:
   (path,) = save(tmp_path, 10)
   shutil.rmtree(path / item)
   with pytest.raises(CheckpointError) as error:
     Checkpoint(path).restore(item, like({"policy": POLICY}.get(item, STATE)))
-  one_sentence(error, str(path), "meta data" if item == "meta" else f"damaged: its '{item}'")
+  one_sentence(error, str(path), f"damaged: its '{item}' cannot be read")
 
 
 @pytest.mark.parametrize("size", [0, 10, 0.5, 0.9])

@@ -33,8 +33,8 @@ every_algorithm = pytest.mark.parametrize("config", [*JITTED, RSL_RL])
 
 
 @cache
-def built(config: Config, nan_at: int | None = None) -> tuple[Learner, Program]:
-  learner = point_learner(config, nan_at=nan_at)
+def built(config: Config, **events: Any) -> tuple[Learner, Program]:
+  learner = point_learner(config, **events)
   evaluate = make_evaluator(learner.env.unwrapped, learner.act, config.num_eval_envs, learner.mesh, 1)
   return learner, compile_program(learner, evaluate, lambda: ({}, {}))
 
@@ -44,9 +44,9 @@ def run(
   hooks: Recorder,
   updates: int = 12,
   resumed: tuple[Any, int] | None = None,
-  nan_at: int | None = None,
+  **events: Any,
 ) -> tuple[Any, bool]:
-  learner, program = built(config, nan_at)
+  learner, program = built(config, **events)
   marks = schedule(updates, 3, 1, max(5, updates // 20))
   loop = Loop(learner, program, marks, seed=3, hooks=hooks)
   return loop.run(*(resumed or (loop.init(), None)))
@@ -103,6 +103,18 @@ def test_a_training_call_of_any_length_is_one_program(config: Config) -> None:
 
 
 @every_algorithm
+def test_nan_in_first_observations_is_counted_and_kept_from_what_is_learned(config: Config) -> None:
+  learner, program = built(config, nan_reset=True)
+  state = program.init(jax.random.PRNGKey(0), {})
+  broken = np.asarray(state.env_state.info["nonfinite_reset"])
+  assert 0 < broken.sum() < len(broken)
+  state, metrics = program.train(state, {}, np.int32(8))
+  assert metrics["nonfinite"] == broken.mean() * 8 * learner.steps_per_update, "every step of these counts"
+  for leaf in numbers(state.replace(capture=None, env_state=None)):
+    assert np.isfinite(leaf).all()
+
+
+@every_algorithm
 def test_nan_is_counted_captured_and_kept_from_the_parameters(config: Config) -> None:
   hooks = Recorder()
   state, _ = run(config, hooks, updates=8, nan_at=3)
@@ -121,8 +133,8 @@ class Rising(PointTask):
     state = super().reset(rng)
     return state.replace(info=state.info | {PRESERVE_INFO: {"level": jnp.zeros(())}})
 
-  def evaluate(self, data: Any, info: Any, action: jax.Array) -> State:
-    state = super().evaluate(data, info, action)
+  def post_step(self, data: Any, info: Any, action: jax.Array) -> State:
+    state = super().post_step(data, info, action)
     return state.replace(info=state.info | {PRESERVE_INFO: {"level": info[PRESERVE_INFO]["level"] + 1}})
 
 

@@ -4,16 +4,19 @@ import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec as P
 
+from playground.envs.wrappers import FINAL_OBS
 from playground.errors import ConfigError
 from playground.hardware.mesh import jit_on_mesh
-from playground.learning.losses import Batch
-from playground.learning.networks import NetworkConfig
+from playground.learning.losses import Batch, gae, pay_time_outs
+from playground.learning.networks import NetworkConfig, normalize
 from playground.learning.ppo import PPO
+from playground.learning.rollout import unroll
 from tests.dummy import SMALL_PPO, numbers, point_learner
 
 
@@ -67,3 +70,55 @@ def test_environments_can_start_at_all_ages() -> None:
   assert len(set(ages)) > 4
   assert set(ages[: len(ages) // 2]) != set(ages[len(ages) // 2 :]), "each device draws its own"
   np.testing.assert_array_equal(same_age.obs["state"], mixed.obs["state"])
+
+
+def test_a_time_out_is_worth_what_its_true_last_observation_promises() -> None:
+  config = dataclasses.replace(SMALL_PPO, init_at_random_ep_len=True, bootstrap_on_timeout=True)
+  learner: Any = point_learner(config, episode_length=4)
+  state = learner.init(jax.random.PRNGKey(0), {})
+  normalizer = jax.tree.map(lambda x: x + 0.25 if x.dtype == jnp.float32 else x, state.normalizer)
+  actor = (learner.networks, state.params.policy, normalizer)
+  roll = lambda env_state, *args: unroll(learner.env, env_state, state.capture, {}, *actor, *args)[2]
+  data = jax.jit(roll, static_argnums=2)(state.env_state, jax.random.PRNGKey(1), 6, state.params.value)
+  place, action = data.obs["state"], learner.networks.distribution.postprocess(data.raw_action)
+  last = {"state": place + 0.1 * action, "privileged_state": jnp.concatenate([place + 0.1 * action, action], -1)}
+  value = learner.networks.value(state.params.value, normalize(last, normalizer))
+  assert 0 < data.truncation[0].sum() < 16, "some of the environments"
+  np.testing.assert_allclose(data.final_value, value * data.truncation, atol=1e-6)
+  assert np.abs(data.final_value).max() > 1e-3
+
+
+def test_paid_time_outs_are_ends_with_a_value() -> None:
+  """The advantages are those of a plain sum over each episode's own steps, its last state's value at the end."""
+  rng = np.random.default_rng(0)
+  steps, count, scale, discount, decay = 7, 5, 0.5, 0.9, 0.8
+  draw = lambda *shape: rng.normal(size=shape).astype(np.float32)
+  done = rng.random((steps, count)) < 0.5
+  truncation = (done & (rng.random(done.shape) < 0.6)).astype(np.float32)
+  termination = done - truncation
+  values, reward = jnp.asarray(draw(steps + 1, count)), draw(steps, count)
+  final_value = jnp.asarray(draw(steps, count) * truncation)
+  batch = Batch({}, {}, draw(0), draw(0), reward, termination, truncation)  # pyright: ignore
+  _, advantages = gae(pay_time_outs(batch, final_value, discount, scale), values, scale, discount, decay)
+  expected = np.zeros((steps, count))
+  for b in range(count):
+    # Brax's advantages are r + discount * (next value, with all that follows) - V, the sum of which is the target.
+    target = values[-1, b]
+    for t in reversed(range(steps)):
+      follows = final_value[t, b] if done[t, b] else target
+      expected[t, b] = reward[t, b] * scale + discount * follows - values[t, b]
+      delta = reward[t, b] * scale + discount * (final_value[t, b] if done[t, b] else values[t + 1, b]) - values[t, b]
+      target = values[t, b] + delta + (0 if done[t, b] else discount * decay * (target - values[t + 1, b]))
+  np.testing.assert_allclose(advantages, expected, atol=1e-5)
+
+
+def test_a_run_that_pays_time_outs_stores_no_more_and_learns() -> None:
+  shapes, learned = [], []
+  for pays in (False, True):
+    learner = point_learner(dataclasses.replace(SMALL_PPO, bootstrap_on_timeout=pays), num_devices=2)
+    state, metrics = learner.train(learner.init(jax.random.PRNGKey(0), {}), {}, np.int32(4))
+    assert metrics["episodes"] > 0 and FINAL_OBS not in state.env_state.info
+    shapes.append(jax.eval_shape(lambda state=state: state))
+    learned.append(ravel_pytree(state.params)[0])
+  assert jax.tree.structure(shapes[0]) == jax.tree.structure(shapes[1])
+  assert np.isfinite(learned[1]).all() and (learned[0] != learned[1]).any()

@@ -12,13 +12,14 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec as P
 
+from playground.envs.base import State
 from playground.errors import CheckpointError, ConfigError
-from playground.hardware.mesh import jit_on_mesh
+from playground.hardware.mesh import jit_on_mesh, make_mesh
 from playground.learning import sac
 from playground.learning.checkpoints import Checkpoint, CheckpointStore, find_checkpoints
 from playground.learning.learner import Learner
 from playground.learning.sac import SAC
-from tests.dummy import SMALL_SAC, numbers, point_learner
+from tests.dummy import SMALL_SAC, PointTask, numbers, point_learner
 
 PREFILL = 4  # steps of 16 environments that make up min_replay_size
 MODEL: dict[str, Any] = {}
@@ -63,23 +64,45 @@ def test_transitions_are_what_the_environments_did() -> None:
   _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], example))
   steps = jax.vmap(jax.vmap(unravel))(rows)
   position, after = steps.obs["state"], steps.next_obs["state"]
-  np.testing.assert_array_equal(position[1:], after[:-1])
-  cut = np.arange(25) == 19
-  np.testing.assert_array_equal(steps.truncation, np.broadcast_to(cut[:, None], (25, 16)))
-  np.testing.assert_array_equal(steps.discount, 1 - steps.truncation)
+  goes_on = np.arange(1, 25) != 20
+  np.testing.assert_array_equal(position[1:][goes_on], after[:-1][goes_on])
+  np.testing.assert_array_equal(position[20], position[0])
+  np.testing.assert_array_equal(steps.nonfinite, 0)
+  np.testing.assert_array_equal(steps.discount, 1)
   moved = position + 0.1 * steps.action
-  np.testing.assert_allclose(after[~cut], moved[~cut], atol=1e-6)
-  np.testing.assert_array_equal(after[19], position[0])
+  np.testing.assert_allclose(after, moved, atol=1e-6)
   np.testing.assert_allclose(steps.reward, -np.linalg.norm(moved, axis=-1), atol=1e-6)
+
+
+class Dying(PointTask):
+  """Terminates in every third step."""
+
+  def post_step(self, data: Any, info: Any, action: jax.Array) -> State:
+    state = super().post_step(data, info, action)
+    return state.replace(done=(state.info["age"] % 3 == 0).astype(jnp.float32))
+
+
+@pytest.mark.parametrize("length", [2, 3, 20])
+def test_what_comes_after_a_termination_is_worth_nothing_whatever_the_time(length: int) -> None:
+  learner = SAC(Dying(episode_length=length), SMALL_SAC, make_mesh(1))
+  transition = jax.jit(learner._collect)
+  state, discounts = learner.init(jax.random.PRNGKey(0), MODEL), []
+  for i in range(6):
+    env_state, _, step = transition(state, jax.random.PRNGKey(i), MODEL)
+    np.testing.assert_allclose(step.next_obs["state"], step.obs["state"] + 0.1 * step.action, atol=1e-6)
+    np.testing.assert_array_equal(step.nonfinite, 0)
+    discounts.append(step.discount)
+    state = state.replace(env_state=env_state)
+  np.testing.assert_array_equal(np.array(discounts).T, [[1, 1, 0, 1, 1, 0]] * 16)
 
 
 def test_a_step_that_went_nan_teaches_the_critics_nothing() -> None:
   state = trained(3, point_learner(SMALL_SAC, nan_at=3))
   assert np.isfinite(state.replay.data).all()
-  reward, discount, truncation = np.moveaxis(np.asarray(state.replay.data)[2, :, -3:], -1, 0)
+  reward, discount, nonfinite = np.moveaxis(np.asarray(state.replay.data)[2, :, -3:], -1, 0)
   assert (reward == 0).all()
   assert (discount == 0).all()
-  assert (truncation == 1).all()
+  assert (nonfinite == 1).all()
 
 
 def test_a_bad_gradient_is_left_out() -> None:
@@ -113,7 +136,8 @@ def save(folder: Path, learner: Learner, *states: Any) -> list[Path]:
   store = CheckpointStore(folder / "checkpoints")
   for i, state in enumerate(states):
     policy, rest = learner.split(state)
-    store.save(10 * (i + 1), policy, rest, {"update": i}, lambda state=state: learner.experience(state))
+    meta = {"update": i, "wall_clock_s": 0.0, "env": "Point", "config": {}}
+    store.save(10 * (i + 1), policy, rest, meta, lambda state=state: learner.experience(state))
   store.close()
   return find_checkpoints(folder)
 

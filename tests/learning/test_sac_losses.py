@@ -36,8 +36,8 @@ def test_losses_and_gradients_equal_brax(batched: bool) -> None:
   params = ours.init(jax.random.PRNGKey(0)).replace(log_alpha=jnp.asarray(-0.7))
   target_q = ours.init(jax.random.PRNGKey(1)).q
   obs, next_obs, action = draw(B, OBS), draw(B, OBS), jnp.tanh(draw(B, ACTIONS))
-  reward, discount, truncation = draw(B), 1 - flags(0.3), flags(0.3)
-  batch = Transition({"state": obs}, {"state": next_obs}, action, reward, discount, truncation)  # pyright: ignore
+  reward, discount, masked = draw(B), 1 - flags(0.3), flags(0.3)
+  batch = Transition({"state": obs}, {"state": next_obs}, action, reward, discount, masked)  # pyright: ignore
   keys = jax.random.split(jax.random.PRNGKey(2))
   noise = jnp.stack([jax.random.normal(key, (B, ACTIONS)) for key in keys])
 
@@ -49,7 +49,7 @@ def test_losses_and_gradients_equal_brax(batched: bool) -> None:
 
   @jax.jit
   def expected() -> dict[str, tuple[jax.Array, Any]]:
-    extras = {"state_extras": {"truncation": truncation}, "policy_extras": {}}
+    extras = {"state_extras": {"truncation": masked}, "policy_extras": {}}
     data = types.Transition(obs, action, reward, discount, next_obs, extras=extras)  # pyright: ignore
     alpha_loss, critic_loss, actor_loss = map(jax.value_and_grad, brax_losses.make_losses(theirs, 0.5, 0.97, ACTIONS))
     alpha, policy = jnp.exp(params.log_alpha), params.policy

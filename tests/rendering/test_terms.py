@@ -12,9 +12,15 @@ import yaml
 from playground import registry
 from playground.randomization import Randomizer
 from playground.rendering.batch import BatchRenderer, View
+from tests.test_randomization import events
 
 DRAWS = 3
-PANDA = yaml.safe_load((Path(__file__).parents[2] / "configs/randomization/panda_vision.yaml").read_text())["terms"]
+PANDA = [
+  event["params"]
+  for event in yaml.safe_load(
+    (Path(__file__).parents[2] / "configs/randomization/panda_vision.yaml").read_text()
+  ).values()
+]
 CARTPOLE = [  # what the Panda's list lacks: a lamp that hangs somewhere, a lens, a material
   {"field": "light_pos", "target": "all", "operation": "add", "range": [-2.0, 2.0]},
   {"field": "light_castshadow", "target": "all", "operation": "set", "distribution": "bernoulli", "mean": 0.5},
@@ -33,7 +39,7 @@ def test_every_term_is_seen(task: str, camera: str, terms: list[dict[str, Any]])
   model = env.mj_model
   qpos = model.keyframe("low_home").qpos.copy() if model.nkey else model.qpos0.copy()
   qpos[1] += 0.2  # the arm lower, so that all of its materials are in the picture; the pole leans
-  randomizers = [Randomizer(model, [term]) for term in terms]
+  randomizers = [Randomizer(model, events(term)) for term in terms]
   fields = {field for randomizer in randomizers for field in randomizer.fields}
   nominal = {field: jnp.asarray(getattr(model, field)) for field in fields}
   models = [nominal]

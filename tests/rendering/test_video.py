@@ -1,4 +1,9 @@
+import contextlib
 import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +27,17 @@ XML = """
     <body name="goal" mocap="true"><geom size=".05" contype="0" conaffinity="0"/></body>
   </worldbody>
 </mujoco>"""
+
+
+# A run that renders for minutes.
+ENDLESS = """
+import sys
+import numpy as np
+from playground import registry
+from playground.rendering.video import render_video
+model = registry.load("PendulumSwingup").mj_model
+render_video(model, np.zeros((20_000, model.nq)), sys.argv[1], dt=0.02)
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -163,6 +179,40 @@ def test_a_crash_of_the_renderer_does_not_reach_the_run(monkeypatch: pytest.Monk
   assert len(said) == 1 and "bogus" in said[0]
 
 
-def test_qpos_of_another_model_is_refused(tmp_path: Path, model: Any):
+def test_the_renderer_dies_with_a_run_that_is_killed(tmp_path: Path, needs_gl: str):
+  scratch = tmp_path / "tmp"
+  scratch.mkdir()
+  run = subprocess.Popen(
+    [sys.executable, "-c", ENDLESS, str(tmp_path / "videos/a.mp4")],
+    env={**os.environ, "TMPDIR": str(scratch), "JAX_PLATFORMS": "cpu"},
+  )
+  try:
+    until(lambda: any("ffmpeg" in command for command in commands(scratch).values()))  # it draws and encodes
+    assert list(scratch.iterdir())
+  finally:
+    run.kill()
+    run.wait()
+  until(lambda: not commands(scratch) and not list(scratch.iterdir()))
+  assert not (tmp_path / "videos").exists()
+
+
+def commands(folder: Path) -> dict[int, str]:
+  """The processes whose command names a folder, by id."""
+  found = {}
+  for process in Path("/proc").glob("[0-9]*/cmdline"):
+    with contextlib.suppress(OSError):
+      found[int(process.parent.name)] = process.read_text().replace("\0", " ")
+  return {pid: command for pid, command in found.items() if str(folder) in command}
+
+
+def until(true: Callable[[], bool], timeout_s: float = 60.0) -> None:
+  end = time.monotonic() + timeout_s
+  while not true():
+    assert time.monotonic() < end
+    time.sleep(0.05)
+
+
+def test_qpos_of_another_model_is_refused(tmp_path: Path, model: Any, monkeypatch: pytest.MonkeyPatch):
+  monkeypatch.setattr(video, "find_gl", lambda: "egl")
   with pytest.raises(ValueError, match=r"\[T, 7\]"):
-    video.save_trajectory(tmp_path / "t.npz", model, np.zeros((5, 3)))
+    render_video(model, np.zeros((5, 3)), tmp_path / "a.mp4", dt=0.02)

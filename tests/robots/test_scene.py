@@ -1,11 +1,13 @@
 """Scenes: terrain, collision variants, contact sensors and their errors."""
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
 
 from playground.errors import ConfigError, UnknownNameError
-from playground.robots.scene import COLLISIONS, build_scene
+from playground.robots.scene import COLLISIONS, build_scene, find_mjcf
 
 LEG_GEOMS = ("hip", "thigh1", "thigh2", "thigh3", "calf1", "calf2")
 
@@ -82,14 +84,32 @@ def test_floor_contact_sensors_come_before_those_of_the_robots_parts() -> None:
 
 
 def test_a_robot_without_geoms_for_full_collisions() -> None:
-  with pytest.raises(ConfigError, match="collision=full_self: robot=t1 has geoms for the feet only"):
+  with pytest.raises(ConfigError, match="collision=full_self: t1 has geoms for the feet only"):
     build_scene("t1", collision="full_self")
+
+
+def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  ours = find_mjcf("spot")
+  monkeypatch.chdir(tmp_path)  # a path of that form would come first
+  assert ours.is_file() and find_mjcf("playground/robots/spot/spot.xml") == ours == find_mjcf(str(ours))
+  other = tmp_path / "ball.xml"
+  other.write_text(
+    '<mujoco><worldbody><body name="ball"><freejoint/><geom name="skin" size="0.1" contype="0"/></body></worldbody>'
+    "</mujoco>"
+  )
+  model = build_scene(str(other), floor_contacts=["skin"]).compile()
+  assert (model.geom(0).name, model.sensor(0).name) == ("floor", "skin_floor_found")
+  other.write_text("<mujoco><wordbody/></mujoco>")
+  with pytest.raises(ConfigError, match=r"ball\.xml is not an MJCF that MuJoCo reads: .*unrecognized element"):
+    build_scene(str(other))
 
 
 @pytest.mark.parametrize(
   ("robot", "options", "message"),
   [
-    ("go2", {}, "robot='go2' is unknown: choose from "),
+    ("go2", {}, "env.robot.mjcf=go2 does not exist: give the path of a file, or <package>/<path> of an installed"),
+    ("playground/robots/go1/go2.xml", {}, "does not exist"),
+    ("no_such_package/go1.xml", {}, "does not exist"),
     ("go1", {"terrain": "flatt"}, "Did you mean 'flat'?"),
     ("go1", {"collision": "full_selv"}, "Did you mean 'full_self'?"),
     ("go1", {"floor_contacts": ["FX"]}, "floor_contacts='FX' is unknown"),

@@ -1,7 +1,5 @@
 """Terrains: their shape, where robots start on them, and contacts with them in MJX."""
 
-import inspect
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,11 +14,9 @@ from playground.config import compose
 from playground.envs.physics import mjx
 from playground.errors import ConfigError
 from playground.robots.scene import ROBOTS, build_scene
-from playground.robots.terrain import HALF_EXTENT, POINTS, START, TERRAINS, add_terrain
+from playground.robots.terrain import HALF_EXTENT, POINTS, START, add_terrain
 
-DEFAULTS = yaml.safe_load((Path(__file__).parents[2] / "configs/env/_terrain.yaml").read_text())["scene"]
 ROBOT_NAMES = sorted(path.stem for path in ROBOTS.glob("*/*.xml") if path.stem == path.parent.name)
-UNEVEN = [name for name in TERRAINS if name != "flat"]
 
 
 def heights(terrain: str, **parameters: Any) -> np.ndarray:
@@ -140,28 +136,26 @@ def test_refusals(terrain: str, parameters: dict[str, Any], message: str) -> Non
 # On the command line
 
 
-def test_yaml_has_the_defaults() -> None:
-  parameters = {name: inspect.signature(TERRAINS[name]).parameters for name in UNEVEN}
-  defaults = {name: {key: p.default for key, p in own.items() if key != "spec"} for name, own in parameters.items()}
-  assert defaults | {"terrain": "flat"} == DEFAULTS
-
-
 def ground(*overrides: str) -> mujoco.MjModel:
   return registry.build(compose(["env=joystick", "robot=go1", *overrides]).env).mj_model
 
 
 def test_terrain_is_chosen_by_its_short_name() -> None:
-  model = ground("terrain=stairs", "env.scene.stairs.step_height=0.05")
+  model = ground("terrain=stairs", "env.scene.terrain_params={step_height: 0.05}")
   assert model.geom_type[0] == mujoco.mjtGeom.mjGEOM_HFIELD
   np.testing.assert_allclose(model.hfield_size[0, 2], 0.05 * 23)
   assert ground().geom_type[0] == mujoco.mjtGeom.mjGEOM_PLANE
 
 
-def test_parity_takes_white_noise_for_rough() -> None:
-  rough, noise = ground("terrain=rough"), ground("terrain=white_noise")
-  parity = ground("terrain=rough", "env.parity=true")
-  np.testing.assert_array_equal(parity.hfield_data, noise.hfield_data)
-  assert np.any(rough.hfield_data != noise.hfield_data)
+def test_parameters_are_those_of_the_terrain() -> None:
+  with pytest.raises(ConfigError, match="'step_height' is no parameter of terrain=rough"):
+    ground("terrain=rough", "env.scene.terrain_params={step_height: 0.05}")
+
+
+def test_0_2_0_takes_white_noise_for_rough() -> None:
+  configs: list[Any] = [registry.config(f"{prefix}Go1JoystickRoughTerrain") for prefix in ("", "v020/")]
+  assert [config.scene.terrain for config in configs] == ["rough", "white_noise"]
+  assert np.any(heights("rough") != heights("white_noise"))
 
 
 def test_a_terrain_of_no_use_to_the_task() -> None:

@@ -39,4 +39,17 @@ def test_the_old_handlers_come_back() -> None:
   with Interrupts():
     assert signal.getsignal(signal.SIGTERM) is not before
   assert signal.getsignal(signal.SIGTERM) is before
-  assert [exit_code(s) for s in (signal.SIGINT, signal.SIGTERM)] == [130, 143]
+  assert [exit_code(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == [130, 143, 129]
+
+
+def test_a_hang_up_saves_unless_it_is_ignored() -> None:
+  with Interrupts() as interrupts:
+    interrupts.start_saving()
+    os.kill(os.getpid(), signal.SIGHUP)
+    assert interrupts.signum == signal.SIGHUP
+  before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as `nohup` does
+  try:
+    with Interrupts():
+      os.kill(os.getpid(), signal.SIGHUP)
+  finally:
+    signal.signal(signal.SIGHUP, before)

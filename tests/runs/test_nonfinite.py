@@ -1,5 +1,6 @@
 """Runs whose numbers go NaN or infinite: counted, dumped, kept out of what learns, and replayed."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from playground.cli.replay import replay
 from playground.config import compose
 from playground.learning.checkpoints import find_checkpoints
+from playground.runs.job import NonfiniteError
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.runs.helpers import TASK, resume
@@ -52,6 +54,27 @@ def test_nan_is_counted_dumped_and_kept_out(
   RunDirectory(run).set_status("running")
   assert resume(run) == 0
   assert list((run / "nan_dump").iterdir()) == [dump], "one dump a run, however often it is resumed"
+
+
+@pytest.mark.parametrize("agent", ["ppo", "sac"])
+def test_too_many_rejected_gradient_steps_stop_the_run(tmp_path: Path, cache: Path, agent: str) -> None:
+  run = tmp_path / "run"
+  config = compose([*TASK, f"agent={agent}", f"run_dir={run}"])
+  config.agent.reward_scaling = math.inf  # which composing refuses
+  with pytest.raises(NonfiniteError, match=r"(\d+) of \1 gradient steps before step .* on_nonfinite.max_fraction=0.01"):
+    train(config)
+  assert RunDirectory(run).status["status"] == "failed"
+
+
+def test_a_run_says_how_many_gradient_steps_it_left_out(
+  tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+  config = compose([*TASK, "on_nonfinite.max_fraction=1", f"run_dir={tmp_path / 'run'}"])
+  config.agent.reward_scaling = math.inf
+  assert train(config) == 0
+  left_out = np.nansum(pd.read_csv(tmp_path / "run/metrics.csv")["training/nonfinite_updates"].to_numpy())
+  assert left_out > 0
+  assert f"{left_out:.0f} gradient steps were NaN or infinite and left out" in " ".join(capsys.readouterr().out.split())
 
 
 def test_too_many_nan_stop_the_run(tmp_path: Path, cache: Path, refused: Callable[..., str]) -> None:

@@ -1,7 +1,12 @@
+import errno
+import fcntl
 import json
 import math
 import os
+import shutil
+import socket
 import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -10,7 +15,7 @@ import numpy as np
 import pytest
 
 from playground.errors import CheckpointError
-from playground.runs.files import replacing
+from playground.runs.files import is_locked, lock_holder, replacing
 from playground.runs.provenance import git_state
 from playground.runs.run_dir import RunDirectory
 
@@ -80,6 +85,41 @@ def test_manifest_has_versions_merges_timings_and_keeps_earlier_starts(tmp_path:
   assert [start["seed"] for start in run.manifest["earlier_starts"]] == [1, 2]
 
 
+def test_a_run_has_one_writer(tmp_path: Path):
+  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  code = f"""
+import time
+from playground.runs.run_dir import RunDirectory
+with RunDirectory({str(run.path)!r}).recorded():
+  print("locked", flush=True)
+  time.sleep(60)
+"""
+  other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+  assert other.stdout and other.stdout.readline() == "locked\n"
+  before = (run.path / "status.json").read_bytes()
+  with pytest.raises(CheckpointError) as error, run.recorded():
+    pytest.fail("two writers")
+  assert f"{run.path} is being written by process {other.pid} on {socket.gethostname()}:" in str(error.value)
+  assert (run.path / "status.json").read_bytes() == before
+  other.kill()
+  other.wait()
+  with run.locked():  # what a killed process leaves is no lock
+    assert lock_holder(run.path / "run.lock") == f"process {os.getpid()} on {socket.gethostname()}"
+    with run.locked():
+      assert is_locked(run.path / "run.lock")
+    assert is_locked(run.path / "run.lock"), "the inner block has not given it back"
+  assert not is_locked(run.path / "run.lock")
+
+
+def test_a_file_system_without_locks_locks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+  def flock(*_: object) -> None:
+    raise OSError(errno.ENOSYS, "Function not implemented")
+
+  monkeypatch.setattr(fcntl, "flock", flock)
+  with RunDirectory.create(tmp_path / "run", CONFIG).locked():
+    pass
+
+
 def test_status_keeps_the_first_start_and_refuses_other_words(tmp_path: Path):
   run = RunDirectory.create(tmp_path / "run", CONFIG)
   run.set_status("running")
@@ -89,6 +129,33 @@ def test_status_keeps_the_first_start_and_refuses_other_words(tmp_path: Path):
   assert run.status["started"] == started and run.status["pid"] == os.getpid()
   with pytest.raises(ValueError, match="status must be"):
     run.set_status("done")  # pyright: ignore[reportArgumentType]
+
+
+def test_what_the_system_denies_is_one_sentence(tmp_path: Path):
+  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  with pytest.raises(CheckpointError) as error, run.recorded():
+    raise OSError(errno.ENOSPC, "No space left on device", str(run.metrics_csv))
+  sentence = f"{run.path} cannot be written: No space left on device ({run.metrics_csv}). resume={run.path} goes on"
+  assert str(error.value).startswith(sentence)
+  assert (run.status["status"], run.status["reason"]) == ("failed", str(error.value))
+
+
+def test_a_status_that_cannot_be_written_hides_no_error(tmp_path: Path):
+  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  with pytest.raises(CheckpointError, match="the cause"), run.recorded():
+    shutil.rmtree(run.path)
+    raise CheckpointError("the cause")
+  assert not run.path.exists()
+
+
+@pytest.mark.parametrize(
+  "content", ["", "{", "[]", "5", "null", '"text"', '{"status": 5}', "\0", "\ufeff{}", "[" * 10_000, '{"status": []}']
+)
+def test_a_damaged_record_is_one_sentence(tmp_path: Path, content: str):
+  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  (run.path / "status.json").write_text(content)
+  with pytest.raises(CheckpointError, match=r"status\.json is damaged \(.*\): move it away to go on without it\.$"):
+    run.status  # noqa: B018
 
 
 def test_summary_is_strict_json(tmp_path: Path):

@@ -52,6 +52,72 @@ def test_what_a_kill_left_is_dropped(tmp_path: Path, torn: str):
   assert path.read_text() == "step,a,b\n10,1.0,\n20,2.0,5.0\n30,3.0,\n"
 
 
+ROWS = "step,a,b\n10,1.0,\n20,2.0,5.0\n30,nan,-inf\n"
+
+
+@pytest.mark.parametrize(
+  ("content", "rebuilt"),
+  [
+    ("\ufeff" + ROWS, ROWS),
+    (ROWS.partition("\n")[2], ROWS),
+    (ROWS.replace("step", "stop"), ROWS),
+    (ROWS.replace("a,b", "a,c"), ROWS),
+    (ROWS.replace("20,", '"20,'), ROWS),
+    (ROWS.replace("2.0,", '2.0",'), ROWS),
+    (ROWS.replace("\n", "\r\n"), ROWS),
+    (ROWS.replace("2.0", "2.x"), ROWS.replace("2.0", "")),
+    (ROWS.replace("20,2.0", "2O,2.0"), ROWS.replace("20,2.0,5.0\n", "")),
+    (ROWS.replace("20,2.0", "20;2.0"), ROWS.replace("20,2.0,5.0\n", "")),
+    (ROWS.replace("20,2.0,5.0\n", "\0\0\0\n\n"), ROWS.replace("20,2.0,5.0\n", "")),
+    (ROWS.replace("a,b", '"a,b'), ROWS),
+    ("\udcff\udc80\n", "step,a,b\n"),
+  ],
+)
+def test_a_damaged_file_is_kept_aside_and_rebuilt(tmp_path: Path, content: str, rebuilt: str):
+  path = tmp_path / "metrics.csv"
+  said: list[str] = []
+  for aside in ("metrics_damaged.csv", "metrics_damaged_2.csv"):
+    path.write_bytes(content.encode(errors="surrogateescape"))
+    tracker = CsvTracker(path, ["step", "a", "b"], said.append)
+    tracker.truncate_after(30)
+    assert path.read_text() == rebuilt
+    assert (tmp_path / aside).read_bytes() == content.encode(errors="surrogateescape")
+    assert f"{path} is damaged" in said[-1]
+    assert f"kept as {aside}, {rebuilt.count(chr(10)) - 1} rows" in said[-1]
+    assert tracker.columns == ["step", "a", "b"]
+
+
+def test_a_file_of_an_earlier_version_without_its_header_is_kept_aside(tmp_path: Path):
+  """Nobody knows the names of its columns."""
+  path = tmp_path / "metrics.csv"
+  path.write_text(ROWS.partition("\n")[2])
+  CsvTracker(path, notify=lambda _: None)
+  assert path.read_text() == "step\n10\n20\n30\n"
+  assert (tmp_path / "metrics_damaged.csv").read_text() == ROWS.partition("\n")[2]
+  path.write_text(ROWS.replace("step", "stop"))
+  CsvTracker(path, notify=lambda _: None)
+  assert path.read_text() == ROWS
+
+
+def test_rows_that_are_gone_are_said_to_be(tmp_path: Path):
+  run, said = RunDirectory.create(tmp_path / "run", CONFIG), []
+  for content in (None, "", ROWS.partition("30")[0]):
+    if content is not None:
+      run.metrics_csv.write_text(content)
+    make_trackers(CONFIG, run, 30, said.append)
+    assert "metrics.csv has no row of step 30, where the run goes on: rows before it are lost." in said.pop()
+  run.metrics_csv.write_text(ROWS)
+  make_trackers(CONFIG, run, 30, said.append)
+  assert said == []
+
+
+def test_a_column_that_came_after_the_checkpoint_stays(tmp_path: Path):
+  path = tmp_path / "metrics.csv"
+  path.write_text(ROWS)
+  assert CsvTracker(path, ["step", "a"]).columns == ["step", "a", "b"]
+  assert list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.parametrize("torn", ["", "20,2.0,7.0\n", "2", "10,1.0,9.0"])
 def test_resume_repeats_the_rows_after_the_checkpoint(tmp_path: Path, torn: str):
   straight, killed = CsvTracker(tmp_path / "a.csv"), CsvTracker(tmp_path / "b.csv")

@@ -1,11 +1,16 @@
 """Whole runs: what they leave behind, and that nothing that ends one early changes what comes out."""
 
+import contextlib
+import errno
 import math
 import os
+import pty
+import resource
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,9 +22,12 @@ import pandas as pd
 import pytest
 
 from playground.config import compose
+from playground.hardware.setup import setup
+from playground.learning import checkpoints
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
 from playground.learning.loop import schedule
 from playground.runs import train as train_module
+from playground.runs.files import is_locked
 from playground.runs.run_dir import RunDirectory
 from playground.runs.start import Start
 from playground.runs.train import cut_short, train
@@ -31,10 +39,11 @@ LONG = [*TASK, f"agent.num_timesteps={STEPS - 10}", "agent.num_evals=5"]  # a ch
 COMMAND = [sys.executable, "-c", "from playground.cli.run import main; main()"]
 
 
-def start(run: Path, cache: Path, *overrides: str) -> "subprocess.Popen[str]":
+def start(run: Path, cache: Path, *overrides: str, resumed: bool = False) -> "subprocess.Popen[str]":
   """Starts `playground-run` in a process of its own."""
   log = run.with_suffix(".log").open("w")
-  args = [*COMMAND, *LONG, f"run_dir={run}", f"hardware.cache_dir={cache}", *overrides]
+  what = [f"resume={run}"] if resumed else [*LONG, f"run_dir={run}"]
+  args = [*COMMAND, *what, f"hardware.cache_dir={cache}", *overrides]
   env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
   return subprocess.Popen(args, stdout=log, stderr=subprocess.STDOUT, text=True, env=env)
 
@@ -217,12 +226,115 @@ def test_a_damaged_checkpoint_is_passed_over(whole: Path, copy: Path, capsys: py
   assert f"{newest} is damaged" in said
   assert "Falling back to the checkpoint before it." in said
   assert f"training state of {before}" in said
+  assert newest.with_name(f"damaged_{newest.name}").is_dir()
   assert_same_result(copy, whole)
+
+
+@pytest.mark.parametrize("what", ["open files", "shape", "newer"])
+def test_a_checkpoint_that_is_not_damaged_is_never_passed_over(
+  what: str, copy: Path, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]
+) -> None:
+  """Going on from an older one would throw its training away."""
+  newest, *_ = find_checkpoints(copy)
+  if what == "open files":
+    monkeypatch.setattr(checkpoints, "_RETRY_AFTER_S", ())
+    monkeypatch.setattr(Checkpoint, "_arrays", lambda *_: (_ for _ in ()).throw(OSError(errno.EMFILE, "Too many")))
+    expected = f"{newest} cannot be read now"
+  elif what == "shape":
+    config = (copy / "config.yaml").read_text()
+    (copy / "config.yaml").write_text(config.replace("num_envs: 8", "num_envs: 16"))
+    expected = f"{newest} does not fit this run"
+  else:
+    meta = newest / "meta/metadata"
+    meta.write_text(meta.read_text().replace(checkpoints.FORMAT, "playground-run/9"))
+    expected = f"{newest} was written by a newer version"
+  before = sorted(os.listdir(copy / "checkpoints"))
+  assert expected in refused(f"resume={copy}")
+  assert sorted(os.listdir(copy / "checkpoints")) == before
+  assert last_row(copy) == int(newest.name)
 
 
 def test_a_run_killed_after_its_last_checkpoint_ends_with_the_same_result(whole: Path, copy: Path) -> None:
   assert resume(copy) == 0
   assert_same_result(copy, whole)
+
+
+def test_damaged_metrics_are_rebuilt(whole: Path, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  metrics = copy / "metrics.csv"
+  damaged = metrics.read_text().partition("\n")[2].replace("\n", '\n"', 1)
+  metrics.write_text(damaged)
+  assert resume(copy) == 0
+  assert "its header is missing): it is kept as metrics_damaged.csv, 101 rows are rebuilt." in capsys.readouterr().out
+  assert (copy / "metrics_damaged.csv").read_text() == damaged
+  assert_same_result(copy, whole)
+
+
+# What the system denies
+
+
+def test_a_terminal_that_is_gone(whole: Path, cache: Path, tmp_path: Path) -> None:
+  """A closed window, a lost connection: nothing can be printed any more, and the run is saved."""
+  run = tmp_path / "run"
+  ours, theirs = pty.openpty()
+  args = [*COMMAND, *LONG, f"run_dir={run}", f"hardware.cache_dir={cache}"]
+  code = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execvp(sys.argv[1], sys.argv[1:])"
+  env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+  terminal: Any = {"stdin": theirs, "stdout": theirs, "stderr": theirs, "start_new_session": True}
+  process = subprocess.Popen([sys.executable, "-c", code, *args], env=env, **terminal)
+  os.close(theirs)
+  reader = threading.Thread(target=_read_all, args=(ours,), daemon=True)
+  reader.start()
+  until = time.monotonic() + 240
+  while last_row(run) < STEPS // 4:
+    assert process.poll() is None and time.monotonic() < until
+    time.sleep(0.01)
+  os.close(ours)
+  assert process.wait(60) == 129
+  assert RunDirectory(run).status["status"] == "preempted"
+  assert Checkpoint(find_checkpoints(run)[0]).step == last_row(run)
+  assert resume(run) == 0
+  assert_same_result(run, whole)
+
+
+def _read_all(handle: int) -> None:
+  with contextlib.suppress(OSError):
+    while os.read(handle, 4096):
+      pass
+
+
+def test_a_disk_that_is_full(whole: Path, cache: Path, tmp_path: Path) -> None:
+  """Here every file may have 12 KB, which metrics.csv needs more of."""
+  run = tmp_path / "run"
+  process = start(run, cache)
+  resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (12_000, resource.RLIM_INFINITY))
+  assert process.wait(240) == 2
+  said = run.with_suffix(".log").read_text()
+  assert (
+    said.splitlines()[-1] == f"error: {run} cannot be written: File too large. resume={run} goes on from what is saved."
+  )
+  assert "Traceback" not in said
+  assert RunDirectory(run).status["status"] == "failed"
+  assert resume(run) == 0
+  assert_same_result(run, whole)
+
+
+def test_a_folder_that_is_removed_in_the_middle(whole: Path, cache: Path, tmp_path: Path) -> None:
+  run = tmp_path / "run"
+  process = start(run, cache)
+  until = time.monotonic() + 240
+  while last_row(run) < STEPS // 4:
+    assert process.poll() is None and time.monotonic() < until
+    time.sleep(0.01)
+  process.send_signal(signal.SIGSTOP)  # or it writes into the folder between the last removal and the folder's own
+  assert last_row(run) < STEPS - BATCH
+  shutil.rmtree(run)
+  process.send_signal(signal.SIGCONT)
+  assert process.wait(60) == 2
+  said = run.with_suffix(".log").read_text()
+  assert said.splitlines()[-1].startswith(f"error: {run}")
+  assert "cannot be written" in said
+  assert "Traceback" not in said
+  assert not run.exists()
 
 
 # What is refused
@@ -242,6 +354,34 @@ def test_a_run_directory_is_not_used_twice(whole: Path, refused: Callable[..., s
   assert f"resume={whole}" in sentence
   assert f"init_from={whole}" in sentence
   assert RunDirectory(whole).status["status"] == "finished"
+
+
+def test_two_do_not_resume_one_run(whole: Path, copy: Path, cache: Path, refused: Callable[..., str]) -> None:
+  first = start(copy, cache, resumed=True)
+  lock = copy / "run.lock"
+  try:
+    until = time.monotonic() + 60
+    while not is_locked(lock):
+      assert time.monotonic() < until
+      time.sleep(0.01)
+    assert f"{copy} is being written by process {first.pid} on " in refused(f"resume={copy}")
+  finally:
+    assert first.wait(120) == 0, copy.with_suffix(".log").read_text()
+  assert_same_result(copy, whole)
+
+
+def test_a_run_that_another_process_finished_meanwhile_is_not_done_again(
+  whole: Path, copy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+  """It was looked at before the other process gave its lock back."""
+
+  def finish(config: Any) -> Any:
+    shutil.copy(whole / "status.json", copy / "status.json")
+    return setup(config)
+
+  monkeypatch.setattr(train_module, "setup", finish)
+  assert resume(copy) == 0
+  assert "is finished: nothing to resume" in capsys.readouterr().out
 
 
 def test_a_finished_run_is_not_resumed(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -321,7 +461,7 @@ def test_a_run_whose_fresh_starts_end_every_episode_early_says_so() -> None:
   """Spot's commands last 201 control steps: a policy of such a run has never seen one change."""
 
   def said(*overrides: str) -> list[str]:
-    agent = compose(["env=SpotFlatTerrainJoystick", *overrides]).agent
+    agent = compose(["env=SpotFlatTerrainJoystick", "agent=ppo_paper", *overrides]).agent
     updates = math.ceil(agent.num_timesteps / 163_840)
     return cut_short(agent, 1000, schedule(updates, agent.num_evals, agent.num_resets_per_eval, 3), 163_840)
 

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 given = dict(arg.split("=", 1) for arg in sys.argv[1:])
-run = Path((given.get("resume") or given["run_dir"]).strip("'"))
+run = Path((given.get("resume") or given["run_dir"])[1:-1].replace("\\'", "'").replace("\\${", "${"))
 again = "resume" in given
 seed = int((run / "config.yaml").read_text()) if again else int(given["seed"])
 (run / "config.yaml").write_text(str(seed))

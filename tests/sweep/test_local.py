@@ -9,6 +9,7 @@ from playground.config import compose_settings
 from playground.errors import ConfigError, HardwareError
 from playground.sweep import local
 from playground.sweep.local import LocalLauncher, make_slots, pick
+from playground.sweep.mps import MultiProcessService
 from tests.sweep.helpers import make_sweep, run, starts, statuses
 
 
@@ -88,6 +89,22 @@ def test_a_service_that_cannot_be_had(tmp_path: Path, service: Path, monkeypatch
   with pytest.raises(HardwareError, match=r"is not on PATH: leave launcher\.mps out\.$"):
     run(sweep, *shared)
   assert statuses(sweep) == {0: "queued"}
+
+
+def test_sockets_lie_in_a_folder_of_this_user_alone(tmp_path: Path, service: Path) -> None:
+  pipes = Path(MultiProcessService(tmp_path).environment["CUDA_MPS_PIPE_DIRECTORY"])
+  MultiProcessService(tmp_path)
+  pipes.chmod(0o777)
+  with pytest.raises(HardwareError, match=rf"{pipes} is not a folder of yours alone"):
+    MultiProcessService(tmp_path)
+  pipes.rmdir()
+  (tmp_path / "elsewhere").mkdir(mode=0o700)
+  pipes.symlink_to(tmp_path / "elsewhere")
+  try:
+    with pytest.raises(HardwareError, match=rf"{pipes} is not a folder of yours alone"):
+      MultiProcessService(tmp_path)
+  finally:
+    pipes.unlink()
 
 
 def test_more_gpus_than_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 from playground.benchmark.worker import Facts
 from playground.config import RunConfig, compose
 from playground.errors import PlaygroundError
+from playground.interpreter import PYTHON
 from playground.learning.algorithms import algorithm
 from playground.learning.sac import SACConfig
 from playground.runs.run_dir import RunDirectory
@@ -47,7 +47,7 @@ def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
   """Runs `playground-run` in a process of its own; raises RunFailedError with its last line."""
   signal.signal(signal.SIGTERM, lambda *_: None)  # the run gets it, too, and saves: this process waits for that
   env = {key: value for key, value in os.environ.items() if key not in without}
-  command = [sys.executable, "-W", "ignore", "-c", "from playground.cli.run import main; main()", *overrides]
+  command = [*PYTHON, "-W", "ignore", "-c", "from playground.cli.run import main; main()", *overrides]
   done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=env)
   if done.returncode:
     lines = (done.stderr or done.stdout).strip().splitlines()

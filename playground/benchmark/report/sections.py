@@ -63,11 +63,12 @@ def _paper_table(evidence: Evidence, notes: Notes, lines: Sequence[dict[str, str
     theirs = f"{paper:,.0f} ± {float(line[f'{agent}_sps_ci95']):,.0f}"
     same = {"benchmark": "throughput", "task": task, "agent": agent, "who": "ours", "setting": ""}
     earlier = {**same, "benchmark": "compare"}  # measured beside the peer only
-    ours = evidence.best(**same, quantity=SPEED) or evidence.best(**earlier, quantity=SPEED)
+    published = {**same, "agent": f"{agent}_paper"}  # where the paper's set is not our default
+    ours = next(filter(None, (evidence.best(**of, quantity=SPEED) for of in (published, same, earlier))), None)
     if ours is None:
       rows.append([task, theirs, NOT_MEASURED, "", "", "", "", "", ""])
       continue
-    of_it = {**same, **{name: ours[name] for name in ("backend", "device", "commit")}}
+    of_it = {**same, **{name: ours[name] for name in ("agent", "backend", "device", "commit")}}
     compiling = evidence.best(**of_it, quantity="compile_s")
     seeds = str(len(ours.rows)) if ours["seed"] else "1"
     compile_s = f"{compiling.mean:.1f}" if compiling else ""

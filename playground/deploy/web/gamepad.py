@@ -6,10 +6,11 @@ browser's local storage, and that is what viser can read.
 
 import dataclasses
 import html
-import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
 
+import msgspec
 import viser
 
 _ENTRY = "playground-gamepad"
@@ -26,6 +27,13 @@ _OFTEN, _SELDOM = 0.03, 0.5  # s between two looks, with a gamepad and without
 _PATIENCE = 5.0  # s for a browser's answer
 
 
+class _Note(msgspec.Struct):
+  """What the script writes."""
+
+  axes: Annotated[list[Annotated[float, msgspec.Meta(ge=-2.0, le=2.0)]], msgspec.Meta(min_length=3)]
+  pressed: list[bool]
+
+
 @dataclasses.dataclass(frozen=True)
 class Pad:
   """What a gamepad of the standard layout says.
@@ -40,10 +48,13 @@ class Pad:
 
   @classmethod
   def read(cls, note: str) -> "Pad":
-    """Reads what the script wrote."""
-    said = json.loads(note)
-    left_x, left_y, right_x = [-x if abs(x) > _DEADBAND else 0.0 for x in said["axes"][:3]]
-    return cls((left_y, left_x, right_x), frozenset(i for i, down in enumerate(said["pressed"]) if down))
+    """Reads what the script wrote; anything else is a gamepad that nobody touches."""
+    try:
+      said = msgspec.json.decode(note, type=_Note)
+    except msgspec.MsgspecError:
+      return cls()
+    left_x, left_y, right_x = [-x if abs(x) > _DEADBAND else 0.0 for x in said.axes[:3]]
+    return cls((left_y, left_x, right_x), frozenset(i for i, down in enumerate(said.pressed) if down))
 
 
 class Gamepads:

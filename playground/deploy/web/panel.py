@@ -105,7 +105,8 @@ class Panel:
       self._add_key("Pause", "space", self._toggle_pause)
       self.speed = self._gui.add_slider("Speed", 0.05, 2.0, 0.05, 1.0, hint="simulated seconds in one")
       self.speed.on_update(lambda _: setattr(session, "speed", self.speed.value))
-      self.push_speed = self._gui.add_slider("Push, m/s", 0.1, 3.0, 0.1, 0.5, hint="which the robot gains at once")
+      most = max(0.5, session.push_speed)
+      self.push_speed = self._gui.add_slider("Push, m/s", 0.1, most, 0.1, 0.5, hint="which the robot gains at once")
       self.push = self._add_button("Push", "P", self._push)
       self.reset = self._add_button("Begin anew", "R", session.reset)
 
@@ -113,13 +114,24 @@ class Panel:
     session = self._session
     if session.terrain is not None:
       self.terrain = self._gui.add_dropdown("Terrain", tuple(TERRAINS), initial_value=session.terrain)
-      self.terrain.on_update(lambda _: self._ask(lambda name=self.terrain.value: session.choose_terrain(name)))
+      self.terrain.on_update(lambda _: self._choose_terrain(self.terrain.value))
     if choices := session.choices():
       self._choices = choices
       self.checkpoint = self._gui.add_dropdown("Checkpoint", tuple(choices), initial_value=self._chosen(choices))
-      self.checkpoint.on_update(
-        lambda _: self._ask(lambda label=self.checkpoint.value: session.choose_checkpoint(self._choices[label]))
-      )
+      self.checkpoint.on_update(lambda _: self._choose_checkpoint(self.checkpoint.value))
+
+  def _choose_terrain(self, name: str) -> None:
+    if name in TERRAINS:
+      self._ask(lambda: self._session.choose_terrain(name))
+    elif self._session.terrain is not None:  # no entry of the menu, which only a client that is no browser sends
+      self.terrain.value = self._session.terrain
+
+  def _choose_checkpoint(self, label: str) -> None:
+    if label in self._choices:
+      choice = self._choices[label]
+      self._ask(lambda: self._session.choose_checkpoint(choice))
+    else:
+      self.checkpoint.value = self._chosen(self._choices)
 
   def _steer(self, sticks: Sequence[float]) -> None:
     """Sets the command from sticks in [-1, 1], whose ends are those of the sliders."""

@@ -1,15 +1,14 @@
 """The viewer in the browser: a server, and the loop that lets time pass."""
 
-import socket
 import time
 
-import viser
 from rich.console import Console
 
 from playground.deploy.session import Session
+from playground.deploy.web.gate import Gate, need_port
 from playground.deploy.web.panel import Panel
 from playground.deploy.web.view import View
-from playground.errors import ConfigError, PlaygroundError
+from playground.errors import PlaygroundError
 from playground.runs.interrupts import noted_signals
 
 _FRAME = 1 / 30  # s between two pictures: more than a browser without a GPU can draw
@@ -28,7 +27,8 @@ class Watch:
     """
     need_port(host, port)
     self.session = session
-    self.server = viser.ViserServer(host, port, label="playground", verbose=False)
+    gate = Gate(host, port)
+    self.server, self.url = gate.server, gate.url
     self.panel = Panel(self.server, session)
     self._view = View(self.server)
     self._now = time.perf_counter()
@@ -58,22 +58,13 @@ class Watch:
     self.server.stop()
 
 
-def need_port(host: str, port: int) -> None:
-  """Raises ConfigError where nothing can be served."""
-  try:
-    socket.create_server((host, port)).close()
-  except (OSError, OverflowError) as error:
-    reason = getattr(error, "strerror", None) or str(error)
-    raise ConfigError(f"--web cannot listen on --host={host} --port={port}: {reason}; try another port.") from None
-
-
 def watch(session: Session, host: str, port: int, console: Console) -> None:
   """Serves a session until it is interrupted."""
-  watching = Watch(session, host, port)
-  console.print("Watch it there; ctrl+c here ends it.")
-  try:
-    with noted_signals() as told:
+  with noted_signals() as told:
+    watching = Watch(session, host, port)
+    try:
+      console.print(f"Watch it at {watching.url} (ctrl+c here ends it).", soft_wrap=True)
       while not told.is_set():
         watching.frame()
-  finally:
-    watching.close()
+    finally:
+      watching.close()

@@ -20,8 +20,7 @@ class BallInCup(SuiteTask):
 
   Observation [8]: displacements of cup and ball (x and z of each) m, their velocities m/s.
 
-  An episode starts at rest, the ball anywhere about the cup (or in it) where it does not touch, as in DM Control. In
-  Playground 0.2.0, and here with `env.parity=true`, it always hangs on its string.
+  An episode starts at rest, the ball anywhere about the cup (or in it) where it does not touch, as in DM Control.
   """
 
   derived = ("site_xpos", "xpos")
@@ -38,8 +37,6 @@ class BallInCup(SuiteTask):
     return {"state": {"position": 4, "velocity": 4}}
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    if self.parity:
-      return {}
     tries = jax.random.uniform(rng, (_TRIES, 2), minval=_LOW, maxval=_HIGH)
     free = self._clearance(tries) > 0
     return {"qpos": jnp.concatenate([jnp.zeros(2), tries[jnp.argmax(free)]])}  # the first that is free

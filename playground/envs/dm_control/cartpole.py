@@ -2,16 +2,15 @@
 
 import functools
 import operator
-from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from playground.envs.base import State
 from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
 from playground.envs.physics import PhysicsData
 from playground.errors import ConfigError
+from playground.mdp.context import StepContext
 from playground.mdp.tolerance import tolerance
 
 _SLIDER, _HINGE = 0, 1
@@ -23,10 +22,6 @@ class Cartpole(SuiteTask):
   Observation [5]: cart position m, cos and sin of the pole's angle, cart velocity m/s, pole velocity rad/s. The dense
   reward is the product of upright, centered, small_control and small_velocity, the sparse one of cart_in_bounds and
   angle_in_bounds.
-
-  The initial positions and velocities are drawn independently; Playground 0.2.0 draws several of them from one key, so
-  that they are functions of each other (when swinging up, the cart's velocity in m/s is its position in m), and with
-  `env.parity=true` so does this.
   """
 
   derived = ("xmat",)
@@ -43,11 +38,7 @@ class Cartpole(SuiteTask):
     return {"state": {"cart_position": 1, "pole_cos": 1, "pole_sin": 1, "velocity": 2}}
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    keys = jax.random.split(rng, 3)
-    cart_key, pole_key, velocity_key = keys
-    if self.parity:
-      cart_key, pole_key = keys[1:] if self._swing_up else keys[:2]
-      velocity_key = keys[1]
+    cart_key, pole_key, velocity_key = jax.random.split(rng, 3)
     if self._swing_up:
       cart = 0.01 * jax.random.normal(cart_key)
       pole = jnp.pi + 0.01 * jax.random.normal(pole_key)
@@ -86,9 +77,6 @@ class CartpoleVision(Cartpole):
 
   The reward of a step is 0.1 less small penalties (pole and cart off the middle, motion, action), so that 25 is the
   most of 250 steps. An episode ends when the pole lies, or the cart is 3 m out.
-
-  A control step is `env.ctrl_dt`. Playground 0.2.0 sets the same 0.02 s after its base class has read the task's 0.01:
-  with `env.parity=true` a step is one physics step, and an episode half as long.
   """
 
   def __init__(self, config: Any):
@@ -96,8 +84,6 @@ class CartpoleVision(Cartpole):
     super().__init__(config)
     if config.swing_up or config.sparse:
       raise ConfigError("env.swing_up and env.sparse must be false here: a hanging pole ends the episode.")
-    if self.parity:
-      self.dt, self.n_substeps = self.sim_dt, 1
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
     (x, _), (x_speed, angle_speed) = data.qpos, data.qvel
@@ -111,7 +97,7 @@ class CartpoleVision(Cartpole):
     }
     return sum(terms.values(), jnp.zeros(())), terms
 
-  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
-    state = super().evaluate(data, info, action)
-    failed = (jnp.abs(data.qpos[_SLIDER]) > 3) | (jnp.abs(data.qpos[_HINGE]) > jnp.pi / 2)
-    return state.replace(done=jnp.maximum(state.done, failed))
+
+def pole_fallen(c: StepContext) -> jax.Array:
+  """The pole lies, or the cart is 3 m out."""
+  return (jnp.abs(c.data.qpos[_SLIDER]) > 3) | (jnp.abs(c.data.qpos[_HINGE]) > jnp.pi / 2)

@@ -37,8 +37,8 @@ class CheetahRun(SuiteTask):
     joints = jax.random.uniform(jax.random.split(rng)[1], low.shape, minval=low, maxval=high)
     return {"qpos": jnp.concatenate([jnp.zeros(_ROOT), joints])}
 
-  def settle(self, data: PhysicsData, model: mjx.Model | None) -> PhysicsData:
-    data = self.physics.step(self.mjx_model if model is None else model, data, data.ctrl, _SETTLING_STEPS)
+  def settle(self, data: PhysicsData, model: mjx.Model) -> PhysicsData:
+    data = self.physics.step(model, data, data.ctrl, _SETTLING_STEPS)
     return data.replace(time=jnp.zeros_like(data.time))
 
   def observe(self, data: PhysicsData) -> jax.Array:

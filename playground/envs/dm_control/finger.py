@@ -17,9 +17,6 @@ class Finger(SuiteTask):
 
   Observation [9]: angles of the finger's joints rad, tip of the spinner from its hinge (x, z) m, velocities of both
   joints and the hinge rad/s, log(1 + force in N) on the fingertip's top and bottom.
-
-  The hinge's initial angle is drawn independently; Playground 0.2.0 draws it from the key of the finger's angles, so
-  that it is in proportion to the proximal joint's, and with `env.parity=true` so does this.
   """
 
   derived = ("sensordata",)
@@ -32,7 +29,7 @@ class Finger(SuiteTask):
     _, finger_key, _, hinge_key = jax.random.split(rng, 4)
     low, high = self.mj_model.jnt_range[:2].T
     finger = jax.random.uniform(finger_key, (2,), minval=low, maxval=high)
-    hinge = jax.random.uniform(finger_key if self.parity else hinge_key, minval=-jnp.pi, maxval=jnp.pi)
+    hinge = jax.random.uniform(hinge_key, minval=-jnp.pi, maxval=jnp.pi)
     return {"qpos": jnp.append(finger, hinge)}
 
   def observe(self, data: PhysicsData) -> jax.Array:
@@ -63,8 +60,7 @@ class FingerTurn(Finger):
   """Turns the body until its tip is in the target: reward 1 there, else 0.
 
   Observation [12]: that of `Finger`, the target from the hinge (x, z) and how far the tip is outside the target
-  (negative inside), all m. The first one shows the target that was drawn; in Playground 0.2.0 and with
-  `env.parity=true` it shows the model's default.
+  (negative inside), all m.
   """
 
   def __init__(self, config: Any):

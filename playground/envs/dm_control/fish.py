@@ -17,9 +17,6 @@ class FishSwim(SuiteTask):
 
   Observation [24]: uprightness (cosine of the tilt), seven joint angles rad, mouth to target in the mouth's frame m,
   velocities m/s and rad/s. The reward is (7 in_target + upright) / 8.
-
-  The first observation shows the target that was drawn; in Playground 0.2.0 and with `env.parity=true` it shows the
-  model's default.
   """
 
   derived = ("xmat", "geom_xpos", "geom_xmat")

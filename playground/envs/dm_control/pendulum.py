@@ -10,7 +10,7 @@ from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
 from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
 
-_UPRIGHT = math.cos(math.radians(8))
+UPRIGHT = math.cos(math.radians(8))
 
 
 class PendulumSwingup(SuiteTask):
@@ -19,9 +19,7 @@ class PendulumSwingup(SuiteTask):
   Observation [3]: sine and cosine of the pole's angle, its velocity rad/s. The reward is 1 within 8 degrees of upright,
   else 0.
 
-  An episode starts at rest, anywhere on the circle; Playground 0.2.0 starts on one half of it. There, a cosine that
-  rounding took above 1 earns nothing, too. With `env.parity=true` both are so here. What 0.2.0 sets for this task's
-  training never applies, for it misspells the name: `agent=ppo_v020` and `sac_v020` are as it trains.
+  An episode starts at rest, anywhere on the circle.
   """
 
   derived = ("xmat",)
@@ -30,19 +28,17 @@ class PendulumSwingup(SuiteTask):
     """Loads the model. `config`: see `configs/env/PendulumSwingup.yaml`."""
     super().__init__(config, load_spec("pendulum").compile())
     self._pole = self.mj_model.body("pole").id
-    self._upright = (_UPRIGHT, 1.0 if self.parity else math.inf)
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:
     return {"state": {"pole_sin": 1, "pole_cos": 1, "velocity": 1}}
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    low = 0.0 if self.parity else -jnp.pi
-    return {"qpos": jax.random.uniform(jax.random.split(rng)[1], (1,), minval=low, maxval=jnp.pi)}
+    return {"qpos": jax.random.uniform(jax.random.split(rng)[1], (1,), minval=-jnp.pi, maxval=jnp.pi)}
 
   def observe(self, data: PhysicsData) -> jax.Array:
     axis = data.xmat[self._pole, :, 2]
     return jnp.stack([axis[0], axis[2], data.qvel[0]])
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    return tolerance(data.xmat[self._pole, 2, 2], self._upright), {}
+    return tolerance(data.xmat[self._pole, 2, 2], (UPRIGHT, math.inf)), {}

@@ -15,9 +15,6 @@ class Reacher(SuiteTask):
 
   Observation [6]: joint angles rad, target from the fingertip (x, y) m, joint velocities rad/s. The reward is 1 while
   fingertip and target touch, else 0. An episode starts at rest, with arm and target anywhere.
-
-  The first observation shows the target that was drawn; in Playground 0.2.0 and with `env.parity=true` it shows the
-  model's default. The wrist has its limit on both backends, which 0.2.0 leaves no room for in Warp (`njmax` 0).
   """
 
   derived = ("geom_xpos",)

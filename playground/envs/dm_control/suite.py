@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import mujoco
 
 from playground.envs.base import Env, State
-from playground.envs.physics import PhysicsData, mjx
+from playground.envs.physics import DERIVED_FIELDS, PhysicsData, mjx
 from playground.errors import ConfigError
+from playground.mdp.context import StepContext
+from playground.mdp.managers import RewardManager, TerminationManager
 from playground.mdp.tolerance import tolerance
 
 Terms = dict[str, jax.Array]
@@ -39,10 +41,25 @@ def small_control(action: jax.Array) -> jax.Array:
 
 
 class SuiteTask(Env):
-  """A task of the suite (paper, Appendix A): the action is `ctrl`, and only numbers that are not finite end it early.
+  """A task of the suite (paper, Appendix A): the action is `ctrl`.
 
-  A domain says how an episode starts, what is observed and what is rewarded.
+  A domain says how an episode starts, what is observed and what is rewarded. The terms of `env.rewards` are added to
+  that reward, those of `env.terminations` end an episode; they read `c.data`, `c.action` and `c.env.mj_model`.
   """
+
+  episode_info = ("last_act", "last_last_act")
+  robot = None
+
+  def __init__(self, config: Any, mj_model: mujoco.MjModel):
+    """Binds the terms; raises ConfigError for an event of another mode than startup."""
+    for name, entry in (config.get("events") or {}).items():
+      if entry is not None and entry.get("mode") != "startup":
+        raise ConfigError(f"env.events.{name}.mode={entry.get('mode')}: tasks of this suite have startup events only.")
+    self.rewards, self.terminations = RewardManager(config.rewards), TerminationManager(config.terminations)
+    added = [*self.rewards.terms, *self.terminations.terms]
+    if self.rewards.terms or any(not term.func.__module__.startswith("playground.") for term in added):
+      self.derived = DERIVED_FIELDS  # which a term may read
+    super().__init__(config, mj_model)
 
   @abc.abstractmethod
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
@@ -57,11 +74,10 @@ class SuiteTask(Env):
     """The reward in [0, 1] and the terms it is made of, which are logged as `reward/<name>`."""
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
-    fields = self.initial(rng)
-    # 0.2.0 moves a target only after the forward pass: its first observation shows the model's default target.
-    late = {"mocap_pos": fields.pop("mocap_pos")} if self.parity and "mocap_pos" in fields else {}
-    data = self.physics.forward(self.mjx_model if model is None else model, self.physics.make(**fields))
-    state = self.evaluate(self.settle(data, model).replace(**late), {}, jnp.zeros(self.action_size))
+    model = self.mjx_model if model is None else model
+    data = self.settle(self.physics.forward(model, self.physics.make(**self.initial(rng))), model)
+    nothing = jnp.zeros(self.action_size)
+    state = self.post_step(data, {"last_act": nothing, "last_last_act": nothing} if self.rewards.terms else {}, nothing)
     zero = jnp.zeros(())
     return state.replace(reward=zero, done=zero, metrics={name: zero for name in state.metrics})
 
@@ -77,15 +93,19 @@ class SuiteTask(Env):
     joints = jax.random.uniform(joints_key, low.shape, minval=low, maxval=high)
     return jnp.concatenate([jnp.zeros(2), angle, joints])
 
-  def settle(self, data: PhysicsData, model: mjx.Model | None) -> PhysicsData:
+  def settle(self, data: PhysicsData, model: mjx.Model) -> PhysicsData:
     """Lets the initial state come to rest, where a task needs that."""
     return data
 
-  def control(self, state: State, action: jax.Array) -> jax.Array:
+  def action_to_ctrl(self, state: State, action: jax.Array) -> jax.Array:
     return action
 
-  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     reward, terms = self.reward(data, action)
-    done = ~(jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all())
-    metrics = {f"reward/{name}": value for name, value in terms.items()}
-    return State(data, self.observe(data), reward, done.astype(jnp.float32), metrics, dict(info))
+    c = StepContext(self, data, info, action)  # pyright: ignore[reportArgumentType]  # it has the parts that terms read
+    more, ended = self.rewards.compute(c), self.terminations.compute(c)
+    metrics = {f"reward/{name}": value for name, value in (terms | more).items()}
+    metrics |= {f"termination/{name}": value.astype(jnp.float32) for name, value in ended.items()}
+    after = {**info, "last_act": action, "last_last_act": info["last_act"]} if self.rewards.terms else dict(info)
+    reward = sum(more.values(), reward)
+    return State(data, self.observe(data), reward, c.terminated.astype(jnp.float32), metrics, after)

@@ -20,9 +20,6 @@ class Swimmer(SuiteTask):
 
   Observation [4 links + 1]: joint angles rad, nose to target in the head's frame (x, y) m, velocities of each link,
   head to tail, in its own frame (x, y m/s, z rad/s). The reward is 1 in the target, 0.1 half a metre from its edge.
-
-  The first observation shows the target that was drawn; in Playground 0.2.0 and with `env.parity=true` it shows the
-  model's default.
   """
 
   derived = ("sensordata",)

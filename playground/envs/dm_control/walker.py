@@ -19,9 +19,6 @@ class Walker(SuiteTask):
   Observation [24]: orientation of the seven bodies (cos and sin of their pitch), height of the torso m, velocities m/s
   and rad/s. The reward is stand (3 parts standing, 1 part upright), with a speed to reach times (5 move + 1) / 6. An
   episode starts in any pose at any pitch, which may reach into the floor, as in the original suite.
-
-  With `env.parity=true`, as in Playground 0.2.0, the torso's uprightness stands in place of its height. The
-  orientations tell that already, while nothing tells how far the floor is.
   """
 
   derived = ("sensordata", "xpos", "xmat")
@@ -42,8 +39,7 @@ class Walker(SuiteTask):
 
   def observe(self, data: PhysicsData) -> jax.Array:
     orientations = data.xmat[self._torso :, 0, ::2]  # x and z axis of every body along x
-    height = data.xmat[self._torso, 2, 2] if self.parity else data.xpos[self._torso, 2]
-    return jnp.concatenate([orientations.ravel(), height[None], data.qvel])
+    return jnp.concatenate([orientations.ravel(), data.xpos[self._torso, 2:], data.qvel])
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
     standing = tolerance(data.xpos[self._torso, 2], (_STAND_HEIGHT, math.inf), margin=_STAND_HEIGHT / 2)

@@ -1,136 +1,137 @@
 """A Panda that picks up a cube with a hand that moves in a plane."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from playground.envs.base import State
-from playground.envs.manipulation.episodes import begin_anew
-from playground.envs.manipulation.pick import Pick
-from playground.envs.manipulation.tabletop import Info, is_finite, logged, outside, total
+from playground.envs.manipulation.arm import ArmTask
 from playground.envs.physics import PhysicsData, mjx
+from playground.envs.task import InitialState
 from playground.mdp import delays
+from playground.mdp.arms import ArmContext
 from playground.mdp.progress import progress
 from playground.robots.panda.kinematics import forward_kinematics, inverse_kinematics, within_limits
 
 _WORKSPACE = jnp.array([[0.25, -0.32, 0.02], [0.77, 0.32, 0.5]])  # m, where the tip may be sent
-_BEHIND = 0.03  # m, by which cube and target are nearer to the base than the tip at the start
-_TARGET_HEIGHT, _LIFTED = 0.2, 0.05  # m
+_BEHIND = 0.03  # m, by which cube and goal are nearer to the base than the tip at the start
+_GOAL_HEIGHT = 0.2  # m
 _GRIP_STEP = 0.02  # m: two steps close the open fingers
 
 
-class PickCubeCartesian(Pick):
-  """Lifts a cube to a target above the middle of where it may lie (paper, appendix "Manipulation").
+class PickCubeCartesian(ArmTask):
+  """Lifts a cube to a goal above the middle of where it may lie (paper, appendix "Manipulation").
 
   Actions: where the hand's tip goes along y and z, in parts of `action_scale`, and whether the fingers close (below 0)
   or open. Inverse kinematics turn the tip's place into the joints' targets; the hand keeps its attitude and joint 7 its
-  angle. The reward is what the weighted sum of the terms gains over its best so far in the episode, which success ends.
-  In some episodes the cube is in the hand from the first step on, to show what is to be had.
-
-  Beside those of `ArmTask` the defaults differ from Playground 0.2.0 as follows; `env.parity=true` has its ways:
-  - The cube starts on the floor (0.2.0: 3 cm inside it, from where it jumps up).
-  - Where the arm cannot reach, or only beyond its joints' limits, the hand's place stays as it is (0.2.0 moves it on,
-    away from the hand, and knows no limits).
-  - The hand that starts with the cube stays where it is (0.2.0 calls it back in the same step).
-  - The gripper's delayed actions are those of the episode, and before it the closing of fingers that hold the cube at
-    the start, the opening of others (0.2.0: those of the episode before).
+  angle. The reward is what the terms' total gains over its best so far in the episode. Some episodes begin with the
+  cube in the hand.
   """
 
-  def __init__(self, config: Any, scene: str = "panda_single_cube_camera"):
+  # `first_step`: no step was made since the reset.
+  episode_info = (*ArmTask.episode_info, "first_step", "best_reward", "current_pos", "no_solution", "action_history")
+
+  def __init__(self, config: Any):
     """Builds the scene. `config`: see `configs/env/PandaPickCubeCartesian.yaml`."""
-    super().__init__(config, scene, keyframe="low_home", body="box", obstacle="floor")
+    super().__init__(config)
+    self._tip, self._attitude = forward_kinematics(self.robot.init_ctrl[:7])
     guide = self.mj_model.key("picked")
     self._guide_qpos, self._guide_ctrl = jnp.array(guide.qpos), jnp.array(guide.ctrl)
-    self._tip, self._attitude = forward_kinematics(self._home_ctrl[:7])
-    self._guide_tip = self._tip if self.parity else forward_kinematics(self._guide_ctrl[:7])[0]
+    self._guide_tip, _ = forward_kinematics(self._guide_ctrl[:7])
 
   @property
   def action_size(self) -> int:
     return 3
 
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": super().observation_parts["state"] | {"no_solution": 1, "last_act": 3}}
-
-  def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
-    rng, box_key = jax.random.split(rng)
+  def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
+    initial = super().initial_state(key, model)
     x = self._tip[0] - _BEHIND
-    reach = self.config.reset.box_y
-    y = jax.random.uniform(box_key, minval=-reach, maxval=reach)
-    target = jnp.stack([x, jnp.zeros(()), jnp.array(_TARGET_HEIGHT)])
-    box = jnp.stack([x, y, jnp.zeros(()) if self.parity else self._home_qpos[11]])
-    info = {
-      "rng": rng,
-      "target_pos": target,
+    qpos = initial.qpos.at[self.robot.free_joint("box")].set(jnp.stack([x, jnp.zeros(()), self.box_height]))
+    return initial.replace(qpos=qpos, mocap_pos=jnp.stack([x, jnp.zeros(()), jnp.array(_GOAL_HEIGHT)])[None])
+
+  @property
+  def box_height(self) -> jax.Array:
+    """Height of the cube's centre at the start, m."""
+    return self.robot.init_qpos[self.robot.free_joint("box")][2]
+
+  def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
+    return super().first_info(data, key, model) | {
+      "first_step": jnp.ones((), bool),
       "best_reward": jnp.zeros(()),
       "current_pos": self._tip,
-      "newly_reset": jnp.zeros((), bool),
-      "last_act": jnp.zeros(3),
       "no_solution": jnp.zeros(()),
       "action_history": jnp.zeros(self.config.gripper_delay + 1),
-      "action_delay": jnp.zeros((), jnp.int32),
+      "action_delay": delays.draw_delay(key, (0, self.config.gripper_delay)),
     }
-    return self._start({"qpos": self._home_qpos.at[9:12].set(box), "mocap_pos": target[None]}, info, model)
 
-  def disturb(self, state: State) -> State:
-    """Begins an episode, in some of them with the cube in the hand, and draws the gripper's delay."""
-    rng, delay_key = jax.random.split(state.info["rng"])
-    rng, guide_key = jax.random.split(rng)
-    first = state.data.time == 0
-    guided = first & jax.random.bernoulli(guide_key, self.config.guide_probability)
-    start = {"reached_box": 0.0, "best_reward": 0.0, "last_act": jnp.zeros(3)}
-    start["current_pos"] = jnp.where(guided, self._guide_tip, self._tip)
-    if not self.parity:  # the fingers were told before what they are seen to do: a late one must not let the cube fall
-      start["action_history"] = jnp.full_like(state.info["action_history"], jnp.where(guided, -1.0, 0.0))
-    state = begin_anew(state, **start)
-    delay = delays.draw_delay(delay_key, (0, self.config.gripper_delay))
-    qpos = jnp.where(guided, self._guide_qpos, state.data.qpos)
-    ctrl = jnp.where(guided, self._guide_ctrl, state.data.ctrl)
-    info = state.info | {"rng": rng, "newly_reset": first, "action_delay": delay}
-    return state.replace(data=state.data.replace(qpos=qpos, ctrl=ctrl), info=info)
+  def pre_step(self, state: State) -> State:
+    """Puts the cube into the hand before the first step of some episodes."""
+    state = super().pre_step(state)
+    rng, key = jax.random.split(state.info["rng"])
+    guided = state.info["first_step"] & jax.random.bernoulli(key, self.config.guide_probability)
+    choose = lambda guide, own: jnp.where(guided, guide, own)
+    data = state.data.replace(
+      qpos=choose(self._guide_qpos, state.data.qpos), ctrl=choose(self._guide_ctrl, state.data.ctrl)
+    )
+    info = {"rng": rng, "current_pos": choose(self._guide_tip, state.info["current_pos"])}
+    # The fingers hold the cube because they were told to close: a late command must not let it fall.
+    info["action_history"] = choose(-1.0, state.info["action_history"])
+    return state.replace(data=data, info=state.info | info)
 
-  def control(self, state: State, action: jax.Array) -> jax.Array:
+  def action_to_ctrl(self, state: State, action: jax.Array) -> jax.Array:
     action, _ = self._delayed(state.info, action)
     _, joints, solved = self._plan(state.data.ctrl, state.info, action)
     arm = jnp.where(solved, joints, state.data.ctrl[:7])
     fingers = state.data.ctrl[7] + jnp.where(action[2] < 0, -_GRIP_STEP, _GRIP_STEP)
-    return jnp.clip(jnp.append(arm, fingers), *self._ctrl_range)
+    return jnp.clip(jnp.append(arm, fingers), *self.robot.ctrl_range)
 
-  def evaluate(self, data: PhysicsData, info: Info, action: jax.Array) -> State:
+  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     action, history = self._delayed(info, action)
     # From the servos' new targets this is the plan that they came from: joint 7 is the same, and so is the branch.
     tip, _, solved = self._plan(data.ctrl, info, action)
-    info = self._reach(data, info)
-    place, measures = data.xpos[self._moved], self._measures(data, info)
-    terms = self._terms(data, info) | {
-      "action_rate": jnp.linalg.norm(action - info["last_act"]),
-      "no_solution": 1 - solved.astype(jnp.float32),
-      "lifted": (place[2] > _LIFTED).astype(jnp.float32),
-      "success": measures["success"],
-    }
-    rewards = self._weigh(terms)
-    gain, best = progress(total(rewards), info["best_reward"])
-    reward = jnp.where(info["newly_reset"], 0.0, gain)  # what the start itself is worth is no progress
+    info = {**info, "no_solution": 1 - solved.astype(jnp.float32)}
+    state = super().post_step(data, info, action)
+    gain, best = progress(state.reward, info["best_reward"])
+    reward = jnp.where(info["first_step"], 0.0, gain)  # what the start itself is worth is no progress
+    return state.replace(
+      reward=reward,
+      info=state.info
+      | {
+        "first_step": jnp.zeros((), bool),
+        "best_reward": best,
+        "current_pos": self._tip_after(info["current_pos"], tip, solved),
+        "action_history": history,
+      },
+    )
 
-    out_of_bounds = outside(place) | (place[2] < 0)
-    done = out_of_bounds | ~is_finite(data) | (measures["success"] > 0)
-    info |= {"best_reward": best, "last_act": action, "action_history": history, "no_solution": terms["no_solution"]}
-    info["current_pos"] = tip if self.parity else jnp.where(solved, tip, info["current_pos"])
-    metrics = logged(rewards) | {"out_of_bounds": out_of_bounds.astype(jnp.float32)} | measures
-    return State(data, self._observe(data, info), reward, done.astype(jnp.float32), metrics, info)
+  def next_info(self, c: ArmContext, key: jax.Array) -> dict[str, Any]:
+    return super().next_info(c, key) | {"action_delay": delays.draw_delay(key, (0, self.config.gripper_delay))}
 
-  def _observe(self, data: PhysicsData, info: Info) -> jax.Array:
-    return jnp.concatenate([super()._observe(data, info), info["no_solution"][None], info["last_act"]])
+  def _tip_after(self, before: jax.Array, planned: jax.Array, solved: jax.Array) -> jax.Array:
+    return jnp.where(solved, planned, before)
 
-  def _delayed(self, info: Info, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+  def _is_solved(self, joints: jax.Array) -> jax.Array:
+    return within_limits(joints)
+
+  def _delayed(self, info: Mapping[str, Any], action: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The action with the gripper's part of some steps ago, and the history of that part."""
     history = delays.push(info["action_history"], action[2])
     return action.at[2].set(delays.delayed(history, info["action_delay"])), history
 
-  def _plan(self, ctrl: jax.Array, info: Info, action: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+  def _plan(
+    self, ctrl: jax.Array, info: Mapping[str, Any], action: jax.Array
+  ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Where the tip is to go, the joint angles for it, and whether the arm can do that."""
     step = self._action_scale * jnp.array([0.0, action[0], action[1]])
     tip = jnp.clip(info["current_pos"] + step, *_WORKSPACE)
     joints = inverse_kinematics(tip, self._attitude, ctrl[6], near=ctrl[:7])
-    return tip, joints, jnp.isfinite(joints).all() if self.parity else within_limits(joints)
+    return tip, joints, self._is_solved(joints)
+
+
+class PickCubeCartesianVision(PickCubeCartesian):
+  """Lifts a cube to the goal's height (paper, section IV-C and appendix C.6); `env.vision` says what is seen."""
+
+  def goal_distance(self, c: ArmContext) -> jax.Array:
+    return jnp.abs(c.to_goal[2])

@@ -8,99 +8,105 @@ import jax.numpy as jnp
 from mujoco.mjx._src.math import quat_integrate
 
 from playground.envs.base import State
-from playground.envs.manipulation.in_hand import InHand
+from playground.envs.manipulation.in_hand import HandTask
 from playground.envs.physics import PhysicsData, mjx
-from playground.mdp.hand_rewards import position_error, rotation_error
-from playground.mdp.hands import Context
-from playground.mdp.pushes import Wrenches
+from playground.envs.task import InitialState
+from playground.mdp.hands import HandContext
 from playground.mdp.rotations import uniform_quat
 
+_BONUS = "success"  # the reward term that is not times dt
 _SPIN = (1.0, 5.0)  # rad/s about each axis: how fast a new goal turns away from the last
 _SLOWER = 0.8  # factor on the spin in each step
 _TURN = 2.0  # control steps' worth of turning in each step
 
 
-class Reorient(InHand):
+class Reorient(HandTask):
   """Turns the cube to the goal's orientation, again and again (paper, Section IV-C.1 and Appendix C.4).
 
-  Within `success_threshold` of the goal the task pays `success_reward`, and the goal turns on: it spins, slower and
-  slower, to another orientation. Its motion is that of Playground 0.2.0; the paper says only that a new goal is at
-  least 90 degrees from the last.
-
-  The defaults differ from Playground 0.2.0 as in `InHand`, and as follows; `env.parity=true` has its ways:
-  - a goal turns by at least `goal.min_turn` (0.2.0: mostly, but as little as 50 degrees);
-  - the tracked cube is turned by at most `noise.pose.angle` rad, as in the paper (0.2.0 adds that much noise to each
-    entry of the quaternion: about three times the angle);
-  - the strengths of a push's force and torque are independent (0.2.0: one draw).
+  Within `success_threshold` of the goal the task pays the reward term `success`, once and not times `ctrl_dt`, and the
+  goal turns on: it spins, slower and slower, to another orientation, at least `goal.min_turn` away. Its motion is that
+  of Playground 0.2.0; the paper says only that a new goal is at least 90 degrees from the last.
 
   Metrics of an evaluation: `rotations` is the number of goals reached before failure, the cube dropped or no goal
-  within `stuck_after` (the paper's real trials), `success` whether there was any; `rotation_error_deg` and
-  `position_error_cm` are means over the episode.
+  within `stuck_after` (the paper's real trials), `success_count` that of all goals reached, `success` whether there was
+  any; `steps_since_last_success` is of the last step, `rotation_error_deg` and `position_error_cm` are means over the
+  episode.
   """
 
   summaries: ClassVar[Mapping[str, str]] = {
     "success": "max",
+    "success_count": "last",
+    "steps_since_last_success": "last",
     "rotation_error_deg": "mean",
     "position_error_cm": "mean",
   }
-  forgotten = (*InHand.forgotten, "goal_spin", "steps_since_success", "stuck")
-  draws = (("goal",), *InHand.draws, Wrenches.keys)
+  episode_info = (*HandTask.episode_info, "goal_spin", "steps_since_success", "success_count", "stuck")
 
   def __init__(self, config: Any):
-    """Builds the task, as `InHand`, from `configs/env/LeapCubeReorient.yaml`."""
+    """Builds the task, as `HandTask`, from `configs/env/LeapCubeReorient.yaml`."""
     super().__init__(config)
     self._goal_pos = jnp.array(self.mj_model.key("home").mpos)
-    self._min_turn: float = 0.0 if self.parity else config.goal.min_turn
+    self._min_turn: float = config.goal.min_turn
     self._threshold: float = config.success_threshold
-    self._success_reward: float = config.success_reward
     self._stuck_steps = round(config.stuck_after / self.dt)
-    pushes = {name: config.pushes[name] for name in ("enable", "velocity", "angular_velocity", "duration", "interval")}
-    self._pushes = Wrenches(**pushes, root=self.hand.cube, dt=self.dt, parity=self.parity)
 
-  def _start(self, keys: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    goal = {"mocap_pos": self._goal_pos[None], "mocap_quat": uniform_quat(keys["goal"])[None]}
-    return super()._start(keys) | goal
+  def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
+    goal = {"mocap_pos": self._goal_pos[None], "mocap_quat": uniform_quat(key)[None]}
+    return super().initial_state(key, model).replace(**goal)
 
-  def _start_info(self, keys: Mapping[str, jax.Array], model: mjx.Model) -> dict[str, jax.Array]:
-    own = {
+  def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
+    return super().first_info(data, key, model) | {
       "goal_spin": jnp.zeros(3),
       "steps_since_success": jnp.zeros((), jnp.int32),
+      "success_count": jnp.zeros((), jnp.int32),
       "stuck": jnp.zeros((), bool),
     }
-    return own | self._pushes.start(keys, self.hand.cube_mass(model))
 
-  def disturb(self, state: State) -> State:
-    state = super().disturb(state)
-    data, changed = self._pushes.act(state.data, state.info)
-    return state.replace(data=data, info=state.info | changed)
+  def reached(self, c: HandContext) -> jax.Array:
+    """Returns whether the cube is at the goal, bool."""
+    return c.rotation_error < self._threshold
 
-  def evaluate(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
-    state = super().evaluate(data, info, action)
-    info = state.info
-    success = rotation_error(self._context(data, info, action)) < self._threshold
-    waited = jnp.where(success, 0, info["steps_since_success"] + 1)
-    stuck = info["stuck"] | (waited > self._stuck_steps)
-    rng, key = jax.random.split(info["rng"])
-    spin = jnp.where(success, new_spin(key, self._min_turn, self.dt), _SLOWER * info["goal_spin"])
-    goal = quat_integrate(data.mocap_quat[0], spin, jnp.array(_TURN * self.dt))
-    reached = success.astype(jnp.float32)
-    bonus = self._success_reward * reached
-    return state.replace(
-      data=data.replace(mocap_quat=goal[None]),
-      reward=state.reward + bonus,
-      metrics=state.metrics | {"reward/success": bonus, "success": reached, "rotations": reached * ~stuck},
-      info=info | {"rng": rng, "goal_spin": spin, "steps_since_success": waited, "stuck": stuck},
-    )
+  def next_info(self, c: HandContext, key: jax.Array) -> dict[str, Any]:
+    spin = jnp.where(self.reached(c), new_spin(key, self._min_turn, self.dt), _SLOWER * c.info["goal_spin"])
+    return self._counts(c) | {"goal_spin": spin}
 
-  def _measure(self, now: Context) -> dict[str, jax.Array]:
+  def _counts(self, c: HandContext) -> dict[str, jax.Array]:
+    success = self.reached(c)
+    waited = jnp.where(success, 0, c.info["steps_since_success"] + 1)
     return {
-      "rotation_error_deg": jnp.rad2deg(rotation_error(now)),
-      "position_error_cm": 100 * position_error(now),
+      "steps_since_success": waited,
+      "success_count": c.info["success_count"] + success,
+      "stuck": c.info["stuck"] | (waited > self._stuck_steps),
     }
+
+  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+    state = super().post_step(data, info, action)
+    goal = quat_integrate(data.mocap_quat[0], state.info["goal_spin"], jnp.array(_TURN * self.dt))
+    return state.replace(data=data.replace(mocap_quat=goal[None]))
+
+  def total(self, rewards: Mapping[str, jax.Array]) -> jax.Array:
+    bonus = rewards.get(_BONUS, jnp.zeros(()))
+    return super().total({**rewards, _BONUS: jnp.zeros(())}) + bonus
+
+  def measure(self, c: HandContext) -> dict[str, jax.Array]:
+    counts, reached = self._counts(c), success(c)
+    return {
+      "success": reached,
+      "success_count": counts["success_count"].astype(jnp.float32),
+      "steps_since_last_success": counts["steps_since_success"].astype(jnp.float32),
+      "rotations": reached * ~counts["stuck"],
+      "rotation_error_deg": jnp.rad2deg(c.rotation_error),
+      "position_error_cm": 100 * c.position_error,
+    }
+
+
+def success(c: HandContext) -> jax.Array:
+  """1 in a step in which the cube is within `env.success_threshold` of the goal's orientation."""
+  return c.env.reached(c).astype(jnp.float32)
 
 
 def new_spin(key: jax.Array, min_turn: float, dt: float) -> jax.Array:
-  """A goal's angular velocity in its own frame right after it was reached, rad/s [3].
+  """Returns a goal's angular velocity in its own frame right after it was reached, rad/s [3].
 
   Args:
     key: random key.

@@ -26,8 +26,8 @@ def test_the_reward_falls_with_the_distance_to_the_target(
 ) -> None:
   angle = 2 * np.arcsin(distance / 4)  # both arms in line, 2 m: a chord between tip and target
   data = state_at(dense, qpos=[angle, 0])
-  np.testing.assert_allclose(dense.evaluate(data, {}, jnp.zeros(1)).reward, reward, rtol=1e-4, atol=1e-9)
-  assert sparse.evaluate(data, {}, jnp.zeros(1)).reward == (distance < 0.2)
+  np.testing.assert_allclose(dense.post_step(data, {}, jnp.zeros(1)).reward, reward, rtol=1e-4, atol=1e-9)
+  assert sparse.post_step(data, {}, jnp.zeros(1)).reward == (distance < 0.2)
 
 
 def test_observation(dense: Acrobot) -> None:

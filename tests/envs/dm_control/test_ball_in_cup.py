@@ -22,7 +22,7 @@ def env() -> Any:
 @pytest.mark.parametrize(("x", "z", "reward"), [(0, 0, 1), (0.024, -0.024, 1), (0.026, 0, 0), (0, -0.026, 0)])
 def test_the_ball_in_the_cup_is_rewarded(env: Any, x: float, z: float, reward: float) -> None:
   data = state_at(env, qpos=[0.1, 0.2, 0.1 + x, 0.2 + IN_THE_CUP + z], qvel=[1, 2, 3, 4])
-  state = env.evaluate(data, {}, jnp.zeros(2))
+  state = env.post_step(data, {}, jnp.zeros(2))
   assert state.reward == reward
   np.testing.assert_allclose(state.obs, [*data.qpos, 1, 2, 3, 4], rtol=1e-6)
 
@@ -50,4 +50,4 @@ def test_clearance_is_that_of_the_collision_test(env: Any) -> None:
 
 
 def test_the_ball_hangs_in_0_2_0() -> None:
-  assert load_task("BallInCup", {"parity": True}).initial(jax.random.PRNGKey(0)) == {}
+  assert load_task("v020/BallInCup").initial(jax.random.PRNGKey(0)) == {}

@@ -18,7 +18,7 @@ def cheetah() -> CheetahRun:
 @pytest.mark.parametrize(("speed", "reward"), [(-3, 0), (0, 0), (2.5, 0.25), (10, 1), (12, 1)])
 def test_reward_is_the_speed(cheetah: CheetahRun, speed: float, reward: float) -> None:
   data = state_at(cheetah, qpos=[7, 0.5, 0.1, *[0.0] * 6], qvel=[speed, *[0.0] * 8])
-  state = cheetah.evaluate(data, {}, jnp.ones(6))
+  state = cheetah.post_step(data, {}, jnp.ones(6))
   np.testing.assert_allclose(state.reward, reward, atol=1e-6)
   np.testing.assert_allclose(cheetah.observe(data), [0.5, 0.1, *[0] * 6, speed, *[0] * 8], atol=1e-6)
 

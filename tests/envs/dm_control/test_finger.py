@@ -27,7 +27,7 @@ def turn() -> FingerTurn:
 @pytest.mark.parametrize(("velocity", "reward"), [(-15.0, 1), (-30.0, 1), (-14.9, 0), (0.0, 0), (20.0, 0)])
 def test_spinning_fast_one_way_is_rewarded(spin: FingerSpin, velocity: float, reward: float) -> None:
   data = state_at(spin, qvel=[0, 0, velocity])
-  assert spin.evaluate(data, {}, NO_ACTION).reward == reward
+  assert spin.post_step(data, {}, NO_ACTION).reward == reward
 
 
 def test_observation(spin: FingerSpin) -> None:
@@ -40,10 +40,8 @@ def test_observation(spin: FingerSpin) -> None:
 
 def test_touch_is_felt(spin: FingerSpin) -> None:
   poses = [[-0.2, 0.09, -2.32], [0.66, -0.69, 1.31], [0.44, -0.44, 3.08], [-1.57, 0.0, 0.0]]
-  forward = jax.jit(jax.vmap(lambda qpos: spin.physics.forward(spin.mjx_model, spin.physics.make(qpos=qpos))))
-  touch = np.asarray(jax.vmap(spin.observe)(forward(jnp.array(poses)))[:, -2:])
+  touch = np.array([spin.observe(state_at(spin, qpos=pose))[-2:] for pose in poses])
   assert (touch > 0.5).tolist() == [[True, False], [False, True], [True, True], [False, False]]
-  np.testing.assert_allclose(touch, [spin.observe(state_at(spin, qpos=pose))[-2:] for pose in poses], atol=1e-3)
 
 
 @pytest.mark.parametrize(("name", "radius"), [("FingerTurnEasy", 0.07), ("FingerTurnHard", 0.03)])
@@ -51,7 +49,7 @@ def test_the_tip_in_the_target_is_rewarded(name: str, radius: float) -> None:
   env = load_task(name)
   for gap in (0.0, 0.9 * radius, 1.1 * radius, 0.2):
     data = state_at(env, mocap_pos=[HINGE + np.array([gap, 0, REACH])])  # the tip points up
-    state = env.evaluate(data, {}, NO_ACTION)
+    state = env.post_step(data, {}, NO_ACTION)
     np.testing.assert_allclose(state.obs[9:], [gap, REACH, gap - radius], atol=1e-6)
     assert state.reward == (gap < radius)
 
@@ -62,19 +60,9 @@ def test_models_differ_where_the_tasks_do(spin: FingerSpin, turn: FingerTurn) ->
   assert turn.mj_model.site("target").size[0] == 0.07
 
 
-def test_first_observation_shows_the_target(turn: FingerTurn) -> None:
-  state = jax.jit(jax.vmap(turn.reset))(jax.random.split(jax.random.PRNGKey(0), 8))
-  target = state.data.mocap_pos[:, 0] - HINGE
-  assert isinstance(state.obs, jax.Array)
-  np.testing.assert_allclose(state.obs[:, 9:11], target[:, [0, 2]], atol=1e-6)
-  np.testing.assert_allclose(target[:, 1], 0, atol=1e-7)
-  np.testing.assert_allclose(jnp.linalg.norm(target, axis=1), REACH, atol=1e-6)
-  assert target.std(0)[0] > 0.04
-
-
-@pytest.mark.parametrize("parity", [False, True])
-def test_initial_angles(parity: bool) -> None:
-  env = load_task("FingerTurnEasy", {"parity": parity})
+@pytest.mark.parametrize("name", ["FingerTurnEasy", "v020/FingerTurnEasy"])
+def test_initial_angles(name: str) -> None:
+  env = load_task(name)
   fields = jax.jit(jax.vmap(env.initial))(jax.random.split(jax.random.PRNGKey(0), 2000))
   target = fields["mocap_pos"][:, 0] - HINGE
   angles = np.column_stack([fields["qpos"], np.arctan2(target[:, 0], target[:, 2])])
@@ -82,4 +70,4 @@ def test_initial_angles(parity: bool) -> None:
   np.testing.assert_allclose(np.abs(angles).max(0), limits, rtol=0.02)
   assert (np.abs(angles) <= limits).all()
   correlation = np.corrcoef(angles.T) - np.eye(4)
-  assert (correlation[0, 2] > 0.99) if parity else (np.abs(correlation).max() < 0.1)
+  assert (correlation[0, 2] > 0.99) if name.startswith("v020") else (np.abs(correlation).max() < 0.1)

@@ -36,7 +36,7 @@ STANDING = [  # pose, standing, upright
 @pytest.mark.parametrize(("qpos", "standing", "upright"), STANDING)
 def test_standing(tasks: dict[str, Humanoid], qpos: np.ndarray, standing: float, upright: float) -> None:
   for name, factor in [("HumanoidStand", 1), ("HumanoidWalk", 1 / 6), ("HumanoidRun", 1 / 6)]:  # at rest
-    state = tasks[name].evaluate(state_at(tasks[name], qpos=qpos), {}, REST)
+    state = tasks[name].post_step(state_at(tasks[name], qpos=qpos), {}, REST)
     np.testing.assert_allclose(state.reward, standing * upright * factor, atol=1e-5)
 
 
@@ -54,7 +54,7 @@ def test_moving_in_any_direction(
   tasks: dict[str, Humanoid], name: str, velocity: tuple[float, float], move: float
 ) -> None:
   data = state_at(tasks[name], qpos=pose(), qvel=[*velocity, *[0.0] * 25])
-  state = tasks[name].evaluate(data, {}, REST)
+  state = tasks[name].post_step(data, {}, REST)
   np.testing.assert_allclose(state.reward, move, atol=1e-5)
   np.testing.assert_allclose(state.metrics["reward/move"], move, atol=1e-5)
 
@@ -62,7 +62,7 @@ def test_moving_in_any_direction(
 def test_control_costs_a_fifth_at_most(tasks: dict[str, Humanoid]) -> None:
   env = tasks["HumanoidStand"]
   data = state_at(env, qpos=pose())
-  rewards = [env.evaluate(data, {}, jnp.full(21, action)).reward for action in (0.5, -1, 2)]
+  rewards = [env.post_step(data, {}, jnp.full(21, action)).reward for action in (0.5, -1, 2)]
   np.testing.assert_allclose(rewards, [0.95, 0.8, 0.8], atol=1e-6)
 
 

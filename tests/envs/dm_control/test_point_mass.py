@@ -22,7 +22,7 @@ def env() -> Any:
 )
 def test_reward(env: Any, distance: float, action: list[float], near: float, small: float) -> None:
   data = state_at(env, qpos=[0.6 * distance, -0.8 * distance], qvel=[1, 2])
-  state = env.evaluate(data, {}, jnp.array(action, jnp.float32))
+  state = env.post_step(data, {}, jnp.array(action, jnp.float32))
   np.testing.assert_allclose(state.metrics["reward/near_target"], near, rtol=1e-5)
   np.testing.assert_allclose(state.metrics["reward/small_control"], small, rtol=1e-6)
   np.testing.assert_allclose(state.reward, near * small, rtol=1e-5)

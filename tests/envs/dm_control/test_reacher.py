@@ -18,7 +18,7 @@ def test_touching_the_target_is_rewarded(name: str) -> None:
   for gap in (0.0, TASKS[name] + FINGER - 1e-4, TASKS[name] + FINGER + 1e-4, 0.2):
     # The arm is stretched out along y; heights do not count.
     data = state_at(env, qpos=[np.pi / 2, 0], qvel=[3, 4], mocap_pos=[[gap, 0.24, 0.5]])
-    state = env.evaluate(data, {}, jnp.zeros(2))
+    state = env.post_step(data, {}, jnp.zeros(2))
     np.testing.assert_allclose(state.obs, [np.pi / 2, 0, gap, 0, 3, 4], atol=1e-6)
     assert state.reward == (gap < TASKS[name] + FINGER)
 

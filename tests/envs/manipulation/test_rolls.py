@@ -33,22 +33,25 @@ def test_structure_and_types_stay(name: str) -> None:
   first = jax.eval_shape(env.reset, KEYS[0])
   second = jax.eval_shape(env.step, first, jnp.zeros(env.action_size))
   assert (jax.tree.map(lambda obs: obs.shape[-1], first.obs), env.action_size) == SIZES[name]
+  parts = {group: sum(sizes.values()) for group, sizes in env.observation_parts.items()}
+  assert (parts if len(parts) > 1 else parts["state"]) == SIZES[name][0]
   assert jax.tree.structure(second) == jax.tree.structure(first)  # the keys of metrics and info
   kind = lambda x: (x.shape, x.dtype, x.weak_type)  # that of a Python number would compile the step once more
   assert jax.tree.map(kind, second) == jax.tree.map(kind, first)
   assert {"success", "position_error_cm"} <= set(first.metrics) or "turns" in first.metrics
   assert set(env.summaries) <= set(first.metrics)
+  assert set(env.episode_info) - {"observation_buffers"} <= set(first.info)
 
 
 @pytest.mark.parametrize("name", SIZES)
 def test_the_first_observation_is_of_the_start_on_the_model_given(name: str) -> None:
   """Traced only; 0.2.0 computes none."""
-  for parity in (False, True):
-    env, seen = load_task(name, {"parity": parity}), []
+  for task in (name, f"v020/{name}"):
+    env, seen = load_task(task), []
     env.physics.forward = lambda model, data, seen=seen: seen.append(model) or data
     randomised = env.mjx_model.replace(opt=env.mjx_model.opt)
     jax.eval_shape(lambda key, env=env, model=randomised: (env.reset(key), env.reset(key, model)), KEYS[0])
-    expected = [] if parity else [env.mjx_model, randomised]
+    expected = [] if task != name else [env.mjx_model, randomised]
     assert len(seen) == len(expected) and all(a is b for a, b in zip(seen, expected, strict=True))
 
 

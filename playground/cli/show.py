@@ -1,0 +1,217 @@
+"""`playground show <task>`: what a task observes, does and is paid for, term by term, and what it is trained with."""
+
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from playground import registry
+from playground.config import RunConfig, compose, format_value
+from playground.errors import ConfigError
+from playground.mdp.options import EventOptions, is_model_field
+
+if TYPE_CHECKING:
+  from playground.envs.base import Env
+
+_WIDE = 180  # columns, where no terminal says how many there are
+Row = Mapping[str, Any]
+
+
+def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_views: int = 16) -> int:
+  """Prints tables about a task, or writes what its camera sees.
+
+  Args:
+    task: a task, or `randomization=<name>` alone for what that draws.
+    overrides: as for playground-run.
+    views: instead of tables, the picture to write, of the camera's view on randomised models.
+    num_views: models in it.
+
+  Returns:
+    The exit code, 0.
+
+  Raises:
+    PlaygroundError: no such task, or one that cannot be built.
+  """
+  console = Console()
+  console = console if console.is_terminal else Console(width=_WIDE)
+  if task.startswith("randomization=") and not overrides:
+    if views:
+      raise ConfigError("--views shows a task: playground show <task> randomization=<name> --views <file>.")
+    config = compose([task])
+    console.print(_table(task.replace("=", ": "), list(_events(config.env.get("events")))))
+    return 0
+  config = compose([task if "=" in task else f"env={task}", *overrides])
+  env = registry.build(config.env)
+  if views:
+    from playground.rendering.views import save_views
+
+    console.print(f"wrote {save_views(env, config.env.events, views, num_views, config.seed)}")
+    return 0
+  for part in describe(config, env):
+    console.print(part)
+  return 0
+
+
+def describe(config: RunConfig, env: "Env") -> Iterator[RenderableType]:
+  """Yields tables: facts, observations, rewards, terminations, commands, events, hyperparameters."""
+  import jax
+
+  from playground.randomization import Randomizer
+
+  section, choices = config.resolved["env"], config.choices
+  Randomizer(env.mj_model, config.env.get("events") or {})  # an event without a target is an error before any table
+  metrics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
+  yield _facts(choices["env"], _facts_of(env, section, choices))
+  yield _table("observations", list(_observations(env)))
+  yield _table("rewards", list(_rewards(env, metrics)))
+  yield _table("terminations", [_row(term) for term in _terms(env, "terminations")])
+  yield _table("commands", [_row(term) for term in _terms(env, "commands")])
+  chosen = choices.get("randomization")
+  yield _table(f"events (randomization: {chosen})" if chosen else "events", list(_events(config.env.get("events"))))
+  origin = f"tuned/{choices['tuned']}.yaml" if choices.get("tuned") else "defaults, not tuned for this task"
+  yield _facts(f"{config.agent.name} ({origin})", _flat(config.resolved["agent"]))
+
+
+def _facts_of(env: "Env", section: Mapping[str, Any], choices: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+  yield "class", section["task"]
+  yield "what", inspect.getdoc(type(env.unwrapped)) or ""
+  yield "robot", choices.get("robot") or "its own"
+  yield "action", f"{env.action_size} in [-1, 1]"
+  ctrl = [f"[{low:g}, {high:g}]" for low, high in dict.fromkeys(map(tuple, env.mj_model.actuator_ctrlrange))]
+  yield "actuators", f"{env.mj_model.nu}, ctrl in {', '.join(ctrl)}"
+  yield "control", f"{1 / env.dt:g} Hz ({env.dt:g} s), each action applied {env.action_repeat} x"
+  yield "physics", f"{1 / env.sim_dt:g} Hz ({env.sim_dt:g} s), {env.n_substeps} per control step"
+  yield "episode", f"{env.episode_length} control steps ({env.episode_length * env.dt:g} s)"
+  renders = section.get("vision", {}).get("enable")
+  auto = "auto: warp, to render" if renders else f"auto: jax on CPU, {section['cuda_impl']} on an NVIDIA GPU"
+  yield "backend", auto if section["impl"] == "auto" else section["impl"]
+  if "reward_total" in section:
+    clip = section["reward_clip"] and f", clipped to {format_value(section['reward_clip'])}"
+    yield "reward", f"{section['reward_total']} of the terms{clip or ''}"
+  if section.get("observation_frames", 1) > 1:
+    yield "observation", f"state of {section['observation_frames']} steps, the newest first"
+  if section.get("noise_level", 1) != 1:
+    yield "noise", f"times {section['noise_level']:g}"
+
+
+def _terms(env: "Env", kind: str) -> list[Any]:
+  return getattr(getattr(env.unwrapped, kind, None), "terms", [])
+
+
+def _row(term: Any) -> dict[str, Any]:
+  """Cells that terms of all kinds have."""
+  return {
+    "name": term.name,
+    "function": function_and_source(term.func, term.name),
+    "params": _params(term.params),
+    "what": _first_line(term.func),
+  }
+
+
+def _rewards(env: "Env", metrics: Mapping[str, Any]) -> Iterator[Row]:
+  """Reward terms; those that a task computes itself have no weight."""
+  terms = _terms(env, "rewards")
+  own = [name.removeprefix("reward/") for name in metrics if name.startswith("reward/")]
+  reward = getattr(type(env.unwrapped), "reward", None)
+  for name in (name for name in own if name not in {term.name for term in terms}):
+    yield {"name": name, "function": function_and_source(reward) if reward else "the task's own"}
+  for term in terms:
+    row, what = _row(term), term.options.when
+    yield row | {"weight": f"{term.options.weight:g}", "when": _params(what or {}).replace("_", " ")}
+
+
+def _observations(env: "Env") -> Iterator[Row]:
+  """Observation terms by group, the whole group first."""
+  manager = getattr(env.unwrapped, "observations", None)
+  parts = env.observation_parts or {"state": {}}
+  sizes = env.observation_size
+  for group, names in parts.items():
+    size = sizes[group] if isinstance(sizes, Mapping) else (sizes,)
+    yield {"group": group, "size": " x ".join(map(str, size))}
+    bound = {term.name: term for term in manager.groups.get(group, ())} if manager else {}
+    for name, length in names.items():
+      yield {"name": name, "size": str(length)} | (_observation(bound[name], group) if name in bound else {})
+
+
+def _observation(term: Any, group: str) -> dict[str, Any]:
+  if group != "state" and term.name == "state":
+    return {"what": "The group state, as the policy reads it."}
+  options = term.options
+  return _row(term) | {
+    "noise": _params(options.noise or {}),
+    "scale": "" if options.scale is None else format_value(options.scale),
+    "clip": "" if options.clip is None else format_value(options.clip),
+    "delay": "" if options.delay is None else format_value(options.delay),
+    "history": "" if options.history == 1 else str(options.history),
+  }
+
+
+def _events(events: Mapping[str, Any] | None) -> Iterator[Row]:
+  """Events in the order in which they apply, within a mode."""
+  from playground.mdp.terms import bind_one
+  from playground.randomization import Term
+
+  for name, entry in (events or {}).items():
+    if entry is None:
+      continue
+    enabled = {"mode": entry.get("mode"), "enabled": "" if entry.get("enabled", True) else "no"}
+    if is_model_field(name, entry):
+      drawn = Term.parse(entry.get("params") or {}, f"env.events.{name}.params").describe()
+      what = f"{drawn['field']} {drawn['target']}: {drawn['operation']} {drawn['draw']}"
+      yield {"name": name, "function": "model_field", "params": what, **enabled}
+    else:
+      yield _row(bind_one("events", f"env.events.{name}", name, entry, EventOptions, skip=3)) | enabled
+
+
+def function_and_source(func: Callable[..., Any], known: str = "") -> str:
+  """A function's name unless it is `known`, and its file and line from the top of its package."""
+  target = inspect.unwrap(func)
+  path = Path(inspect.getsourcefile(target) or "?")
+  depth = target.__module__.count(".") + (2 if path.stem == "__init__" else 1)
+  place = f"{'/'.join(path.parts[-depth:])}:{inspect.getsourcelines(target)[1]}"
+  return place if target.__name__ == known else f"{target.__qualname__} {place}"
+
+
+def _first_line(thing: Any) -> str:
+  return next(iter((thing.__doc__ or "").strip().splitlines()), "")
+
+
+def _params(params: Mapping[str, Any]) -> str:
+  return ", ".join(f"{name} {format_value(value)}" for name, value in params.items())
+
+
+def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+  for key, value in node.items():
+    if isinstance(value, Mapping):
+      yield from _flat(value, f"{prefix}{key}.")
+    else:
+      yield f"{prefix}{key}", value
+
+
+_COLUMNS = (
+  *("group", "name", "weight", "mode", "enabled", "size", "noise", "scale", "clip", "delay", "history"),
+  *("params", "when", "what", "function"),
+)
+
+
+def _table(title: str, rows: Sequence[Row]) -> RenderableType:
+  """A table of the columns that some row has; `none` without rows."""
+  columns = [name for name in _COLUMNS if any(row.get(name) for row in rows)]
+  table = Table(box=None, padding=(0, 2, 0, 0))
+  for name in columns:
+    table.add_column(name, style="cyan" if name == "name" else None, overflow="fold", no_wrap=name in ("name", "group"))
+  for row in rows:
+    table.add_row(*(Text(str(row.get(name) or "")) for name in columns))
+  return Group(Text(title, style="bold"), table if rows else Text("none"), Text())
+
+
+def _facts(title: str, rows: Iterable[tuple[str, Any]]) -> RenderableType:
+  """A table of keys and values."""
+  table = Table(show_header=False, box=None, padding=(0, 2))
+  for key, value in rows:
+    table.add_row(Text(key, style="cyan"), Text(format_value(value)))
+  return Group(Text(title, style="bold"), table, Text())

@@ -1,0 +1,201 @@
+"""Who may talk to the viewer in the browser, and what they may say.
+
+viser answers whoever connects. A web page that the user opens elsewhere could connect, too (a websocket knows no
+same-origin policy), and anybody on the network if the viewer listens there. The gate stands before viser's own handling
+of requests and messages, in the places that `websockets` has for it.
+"""
+
+import asyncio
+import hmac
+import http
+import ipaddress
+import secrets
+import socket
+from collections.abc import Callable
+from typing import Annotated, Any
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+import viser
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from playground.errors import ConfigError
+
+_LARGEST = 2**16  # bytes of a message: cameras, sliders, the state of a gamepad
+
+_Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]  # and so not NaN
+_Text = Annotated[str, msgspec.Meta(max_length=10_000)]
+_Size = Annotated[int, msgspec.Meta(ge=0, le=100_000)]
+_Vector = tuple[_Number, _Number, _Number]
+
+
+class _Message(msgspec.Struct, tag_field="type", tag=lambda name: name.lstrip("_"), forbid_unknown_fields=True):
+  pass
+
+
+class _Value(msgspec.Struct, forbid_unknown_fields=True):
+  value: bool | _Number | _Text
+
+
+class _GuiUpdateMessage(_Message):
+  uuid: _Text
+  updates: _Value
+
+
+class _CommandTriggerMessage(_Message):
+  uuid: _Text
+
+
+class _LocalStorageGetItemResponseMessage(_Message):
+  value: _Text | None
+  error: _Text | None
+  request_uuid: _Text
+
+
+class _ViewerCameraMessage(_Message):
+  wxyz: tuple[_Number, _Number, _Number, _Number]
+  position: _Vector
+  fov: _Number
+  near: _Number
+  far: _Number
+  image_height: _Size
+  image_width: _Size
+  look_at: _Vector
+  up_direction: _Vector
+
+
+_DECODER = msgspec.msgpack.Decoder(
+  _GuiUpdateMessage | _CommandTriggerMessage | _LocalStorageGetItemResponseMessage | _ViewerCameraMessage
+)
+
+
+class Gate:
+  """The gate of one server.
+
+  Attributes:
+    server: viser's.
+    url: the address to open, with the token where one is asked for.
+  """
+
+  def __init__(self, host: str, port: int):
+    """Starts viser's server behind the gate; a token is asked for unless only this machine can connect."""
+    self._host, self._cookie = host, f"playground-{port}"
+    self._token = None if _is_loopback(host, port) else secrets.token_urlsafe(24)
+    self.server = self._start(host, port)
+    name = f"[{host}]" if ":" in host else socket.gethostname() if host in ("0.0.0.0", "::") else host
+    self.url = f"http://{name}:{self.server.get_port()}/" + (f"?token={self._token}" if self._token else "")
+
+  def check(self, request: Request) -> str:
+    """Why a request is refused, '' if it is not."""
+    if not hasattr(self, "server"):
+      return "the server has not started yet"
+    hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+    try:
+      (name,) = {urlsplit(f"//{host}").hostname for host in hosts}
+    except ValueError:
+      return "a request names one host"
+    if self._token is None and not (name in ("localhost", self._host) or _is_address_of_loopback(name)):
+      # A page elsewhere whose name was made to lead here (DNS rebinding).
+      return f"this server is for this machine alone, as {self._host}, and not as {name}"
+    if origins and [urlsplit(origin).netloc for origin in origins] != hosts:  # a browser tells it, and no page can lie
+      return f"a page of {origins[0]} may not connect"
+    if self._token is not None and not any(
+      hmac.compare_digest(t.encode(), self._token.encode()) for t in self._told(request)
+    ):
+      return "the address must be the one that the command has printed, with its token"
+    return ""
+
+  def admit(self, raw: Any) -> bytes | None:
+    """A message as viser may have it; None for one that the page does not send, or whose value cannot be."""
+    try:
+      message = _DECODER.decode(raw) if isinstance(raw, bytes) else None
+    except msgspec.MsgspecError:
+      return None
+    if message is None or (isinstance(message, _GuiUpdateMessage) and not self._fits(message)):
+      return None
+    return msgspec.msgpack.encode(message)
+
+  def _fits(self, message: _GuiUpdateMessage) -> bool:
+    """Whether a control can have the value; what menus are told their callbacks look up."""
+    handle = self.server.gui._gui_input_handle_from_uuid.get(message.uuid)  # viser has no public way from id to control
+    value = message.updates.value
+    if isinstance(handle, viser.GuiSliderHandle):
+      return isinstance(value, float) and handle.min <= value <= handle.max
+    if isinstance(handle, viser.GuiDropdownHandle):
+      return isinstance(value, str)
+    return isinstance(handle, viser.GuiCheckboxHandle | viser.GuiButtonHandle) and isinstance(value, bool)
+
+  def _told(self, request: Request) -> list[str]:
+    """Tokens in a request's address and cookies."""
+    cookies = [
+      pair.strip().partition("=") for header in request.headers.get_all("Cookie") for pair in header.split(";")
+    ]
+    told = [value for name, _, value in cookies if name == self._cookie]
+    return told + parse_qs(urlsplit(request.path).query).get("token", [])
+
+  def _start(self, host: str, port: int) -> viser.ViserServer:
+    """viser's server, which calls `serve` of `websockets` while it is made and hands on no options of it."""
+    serve, began = websockets.asyncio.server.serve, []
+
+    def guarded(*args: Any, process_request: Callable[..., Response | None], **options: Any) -> Any:
+      began.append(True)
+      options |= {"max_size": _LARGEST, "create_connection": lambda *a, **k: _Connection(self, *a, **k)}
+      return serve(*args, process_request=lambda *request: self._answer(process_request, *request), **options)
+
+    websockets.asyncio.server.serve = guarded
+    try:
+      server = viser.ViserServer(host, port, label="playground", verbose=False)
+    finally:
+      websockets.asyncio.server.serve = serve
+    if not began:
+      server.stop()
+      raise RuntimeError("This viser does not start its server through websockets.asyncio.server.serve.")
+    return server
+
+  def _answer(
+    self, process_request: Callable[..., Response | None], connection: ServerConnection, request: Request
+  ) -> Response | None:
+    if refusal := self.check(request):
+      return connection.respond(http.HTTPStatus.FORBIDDEN, f"Refused: {refusal}.\n")
+    response = process_request(connection, request)
+    if response is not None and self._token is not None:  # the page's own connection has no token in its address
+      response.headers["Set-Cookie"] = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
+    return response
+
+
+class _Connection(ServerConnection):
+  """A connection on which viser hears only what the gate admits."""
+
+  def __init__(self, gate: Gate, *args: Any, **options: Any):
+    super().__init__(*args, **options)
+    self._gate = gate
+
+  async def recv(self, decode: bool | None = None) -> Any:
+    while (message := self._gate.admit(await super().recv(decode))) is None:
+      await asyncio.sleep(0)
+    return message
+
+
+def need_port(host: str, port: int) -> None:
+  """Raises ConfigError where nothing can be served."""
+  if not host.strip():
+    raise ConfigError(f"--host={host!r} is empty: name an address of this machine, or 0.0.0.0 for all.")
+  try:
+    socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+  except (OSError, OverflowError, UnicodeError) as error:
+    reason = getattr(error, "strerror", None) or str(error)
+    raise ConfigError(f"--web cannot listen on --host={host} --port={port}: {reason}; try another port.") from None
+
+
+def _is_loopback(host: str, port: int) -> bool:
+  """Whether an address leads to this machine alone."""
+  return all(_is_address_of_loopback(found[4][0]) for found in socket.getaddrinfo(host, port))
+
+
+def _is_address_of_loopback(text: Any) -> bool:
+  try:
+    return ipaddress.ip_address(text).is_loopback
+  except ValueError:
+    return False

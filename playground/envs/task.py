@@ -1,0 +1,200 @@
+"""A task made of terms: the base of all tasks on legs, with hands and with arms."""
+
+import abc
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from flax import struct
+
+from playground.envs.base import Env, State
+from playground.envs.physics import DERIVED_FIELDS, PhysicsData, mjx
+from playground.mdp.context import StepContext
+from playground.mdp.lookup import lookup
+from playground.mdp.managers import (
+  CommandManager,
+  EventManager,
+  ObservationManager,
+  RewardManager,
+  TerminationManager,
+)
+from playground.randomization import Randomizer
+
+_MODEL_FIELDS = "model_fields"  # entry of `info`: fields of the model that events of mode reset draw
+
+
+class InitialState(struct.PyTreeNode):
+  """The simulator's state that an episode starts with; reset events replace parts of it.
+
+  Attributes:
+    qpos: shape [nq].
+    qvel: shape [nv].
+    ctrl: shape [nu]; None is where a position servo holds the joints, see `Task.rest_ctrl`.
+    mocap_pos: m, shape [nmocap, 3]; None is the model's.
+    mocap_quat: shape [nmocap, 4]; None is the model's.
+  """
+
+  qpos: jax.Array
+  qvel: jax.Array
+  ctrl: jax.Array | None = None
+  mocap_pos: jax.Array | None = None
+  mocap_quat: jax.Array | None = None
+
+
+class Task(Env):
+  """A robot in a scene whose rewards, observations, terminations, commands and events are terms of its config.
+
+  A subclass builds the scene, says what its robot is (`make_robot`) and how an action becomes `ctrl`; where it carries
+  more from step to step than actions, commands and events do, it adds that in `first_info` and `next_info`.
+
+  Attributes:
+    robot: the robot's constant facts.
+    rewards, terminations, observations, commands, events: the managers of the config's terms.
+  """
+
+  context: ClassVar[type[StepContext]] = StepContext
+  episode_info = ("last_act", "last_last_act", "observation_buffers")
+
+  def __init__(self, config: Any, spec: mujoco.MjSpec):
+    """Compiles the scene and binds the terms.
+
+    Args:
+      config: the task's ConfigDict: that of `Env`, and `rewards`, `observations`, `terminations`, `commands`, `events`,
+        `reward_total` (sum or product), `reward_clip`, `noise_level`, `observation_frames` and `observation_order`.
+      spec: the scene.
+
+    Raises:
+      UnknownNameError: a term, parameter or object of the model that does not exist.
+      ConfigError: a value that is invalid.
+    """
+    self.spec = spec
+    mj_model = spec.compile()
+    self.prepare_model(mj_model, config)
+    self.rewards = RewardManager(config.rewards)
+    self.terminations = TerminationManager(config.terminations)
+    self.observations = ObservationManager(
+      config.observations, config.noise_level, config.observation_frames, config.observation_order
+    )
+    if any(not term.func.__module__.startswith("playground.") for term in self.terms()):
+      self.derived = DERIVED_FIELDS  # another package's term may read any of them
+    super().__init__(config, mj_model)
+    self.robot = self.make_robot(mj_model, config)
+    self.commands = CommandManager(config.get("commands"), self)
+    self.events = EventManager(config.get("events"), self)
+    self._episode_models = Randomizer(mj_model, config.get("events"), "reset")
+    self.redraws = bool(self._episode_models.fields)
+    self._reward_total = lookup({"sum": "sum", "product": "product"}, config.reward_total, "env.reward_total")
+    self._reward_clip = config.reward_clip and tuple(config.reward_clip)
+
+  def terms(self) -> list[Any]:
+    """All reward, termination and observation terms."""
+    observed = [term for terms in self.observations.groups.values() for term in terms]
+    return [*self.rewards.terms, *self.terminations.terms, *observed]
+
+  def prepare_model(self, mj_model: mujoco.MjModel, config: Any) -> None:
+    """Changes the compiled model in place before it goes to the device."""
+
+  @abc.abstractmethod
+  def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> Any:
+    """Returns the robot's constant facts; terms read `c.robot`."""
+
+  def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
+    """Returns the state that reset events change: by default that of the robot's keyframe at rest."""
+    del key, model
+    return InitialState(self.robot.init_qpos, jnp.zeros(self.mj_model.nv))
+
+  @abc.abstractmethod
+  def rest_ctrl(self, initial: InitialState) -> jax.Array:
+    """Returns the `ctrl` that an episode starts with where no reset event sets it."""
+
+  def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
+    """Returns what the task carries besides actions, commands and events at the start of an episode."""
+    del data, key, model
+    return {}
+
+  def next_info(self, c: StepContext, key: jax.Array) -> dict[str, Any]:
+    """Returns the entries of `info` that the task itself changes in a step."""
+    del c, key
+    return {}
+
+  def measure(self, c: StepContext) -> dict[str, jax.Array]:
+    """Returns metrics of how well the task is done, in units that people use."""
+    del c
+    return {}
+
+  def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:
+    """Returns the physics of a start state, after a forward pass."""
+    ctrl = self.rest_ctrl(initial) if initial.ctrl is None else initial.ctrl
+    mocap = {name: getattr(initial, name) for name in ("mocap_pos", "mocap_quat")}
+    fields = {name: value for name, value in mocap.items() if value is not None}
+    return self.physics.forward(model, self.physics.make(qpos=initial.qpos, qvel=initial.qvel, ctrl=ctrl, **fields))
+
+  def model_of(self, info: Mapping[str, Any], model: mjx.Model | None) -> mjx.Model:
+    model = super().model_of(info, model)
+    return model.tree_replace(info[_MODEL_FIELDS]) if self.redraws else model  # pyright: ignore[reportReturnType]
+
+  def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
+    return info | {_MODEL_FIELDS: self._episode_models.sample(key)} if self.redraws else info
+
+  def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
+    rng, state_key, event_key, command_key, push_key, own_key, obs_key, model_key = jax.random.split(rng, 8)
+    redrawn = self.redraw({}, model_key)
+    model = self.model_of(redrawn, model)
+    initial = self.events.start(event_key, self, self.initial_state(state_key, model))
+    data = self.start_physics(model, initial)
+    nothing = jnp.zeros(self.action_size)
+    info: dict[str, Any] = {"rng": rng, "last_act": nothing, "last_last_act": nothing, **redrawn}
+    info |= self.commands.reset(command_key) | self.events.reset(push_key, model)
+    info |= self.first_info(data, own_key, model)
+    c = self.context(self, data, info, nothing, dt=0.0)
+    obs, buffers = self.observations.compute(c, obs_key)
+    info |= {"observation_buffers": buffers} if buffers else {}
+    metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: self._metrics(c, {})))
+    metrics |= {f"reward/{term.name}": jnp.zeros(()) for term in self.rewards.terms}
+    return State(data, obs, jnp.zeros(()), jnp.zeros(()), metrics, info)
+
+  def pre_step(self, state: State) -> State:
+    data, info = self.events.step(state.data, state.info)
+    return state.replace(data=data, info=info)
+
+  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+    rng, obs_key, command_key, own_key = jax.random.split(info["rng"], 4)
+    c = self.context(self, data, info, action)
+    rewards = self.rewards.compute(c)
+    obs, buffers = self.observations.compute(c, obs_key, info.get("observation_buffers"))
+    after = {**info, "rng": rng, "last_act": action, "last_last_act": info["last_act"]}
+    after |= self.commands.step(c, command_key) | self.next_info(c, own_key)
+    after |= {"observation_buffers": buffers} if buffers else {}
+    return State(data, obs, self.total(rewards), c.terminated.astype(jnp.float32), self._metrics(c, rewards), after)
+
+  def total(self, rewards: Mapping[str, jax.Array]) -> jax.Array:
+    """Returns the reward of a step from its weighted terms: clip(dt * total).
+
+    `reward_total: product` multiplies the sum of the terms of positive weight by exp(0.2 * the sum of the others).
+    """
+    if self._reward_total == "product":
+      gains, costs = (
+        sum((rewards[t.name] for t in self.rewards.terms if (t.options.weight > 0) == positive), jnp.zeros(()))
+        for positive in (True, False)
+      )
+      reward = gains * jnp.exp(0.2 * costs)
+    else:
+      reward = sum(rewards.values(), jnp.zeros(()))
+    reward = reward * self.dt
+    return jnp.clip(reward, *self._reward_clip) if self._reward_clip else reward
+
+  def _metrics(self, c: StepContext, rewards: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+    ended = {name: value.astype(jnp.float32) for name, value in self.terminations.compute(c).items()}
+    metrics = {f"reward/{name}": value for name, value in rewards.items()}
+    metrics |= {f"termination/{name}": value for name, value in ended.items()}
+    return metrics | {"fall": c.terminated.astype(jnp.float32)} | self.measure(c)
+
+  @property
+  def observation_parts(self) -> dict[str, dict[str, int]]:
+    def first() -> StepContext:
+      state = self.reset(jax.random.PRNGKey(0))
+      return self.context(self, state.data, state.info, jnp.zeros(self.action_size))
+
+    return self.observations.sizes(first)

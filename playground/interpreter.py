@@ -1,0 +1,6 @@
+"""How this package starts Python."""
+
+import sys
+
+# Never import from the current folder (-P), which may be somebody else's; PYTHONPATH holds.
+PYTHON = (sys.executable, "-P")

@@ -1,0 +1,121 @@
+"""Observation terms of arms at a table. The first line of a docstring gives frame, unit and [length].
+
+An orientation is two rows of a rotation matrix, without the quaternion's double cover.
+"""
+
+import zlib
+
+import jax
+import jax.numpy as jnp
+from mujoco.mjx._src.math import quat_to_mat
+
+from playground.limits import AtLeast0
+from playground.mdp.arms import ArmContext
+from playground.mdp.context import StepContext
+from playground.mdp.rotations import turn_at_random, two_rows
+
+
+def qpos(c: StepContext) -> jax.Array:
+  """Positions of `joints` in their order: rad, m; of a free one m and a quaternion, w first, world frame [nq]."""
+  return c.data.qpos
+
+
+def qvel(c: StepContext) -> jax.Array:
+  """Velocities of `joints`: rad/s, m/s; of a free one m/s in the world frame, then rad/s in its own [nv]."""
+  return c.data.qvel
+
+
+def action(c: StepContext) -> jax.Array:
+  """The action just applied [action_size]."""
+  return c.action
+
+
+def applied_action(c: StepContext) -> jax.Array:
+  """The action that acted in the step before, delays included (task PushCube) [action_size]."""
+  return c.carried("applied_act")
+
+
+def servo_error(c: ArmContext) -> jax.Array:
+  """Targets of the actuators minus the positions of their joints, rad, m [nu]."""
+  actuators, joints = c.robot.driven
+  return c.data.ctrl[actuators] - c.data.qpos[joints]
+
+
+def site_pos(c: ArmContext, site: str) -> jax.Array:
+  """Position of a site, world frame, m [3]."""
+  return c.site_pos(site)
+
+
+def site_axes(c: ArmContext, site: str, turn_noise: AtLeast0 = 0.0) -> jax.Array:
+  """Orientation of a site: last two rows of its rotation matrix in the world frame [6].
+
+  Args:
+    c: the step.
+    site: its name.
+    turn_noise: rad, times `env.noise_level`: the largest turn about an axis in any direction.
+  """
+  return _turned(c, c.site_axes(site), turn_noise, site)
+
+
+def body_pos(c: ArmContext, body: str) -> jax.Array:
+  """Position of a body, world frame, m [3]."""
+  return c.body_pos(body)
+
+
+def body_axes(c: ArmContext, body: str, turn_noise: AtLeast0 = 0.0) -> jax.Array:
+  """Orientation of a body: last two rows of its rotation matrix in the world frame [6]; see `site_axes`."""
+  return _turned(c, c.body_axes(body), turn_noise, body)
+
+
+def body_upvector(c: ArmContext, body: str) -> jax.Array:
+  """Third row of a body's rotation matrix in the world frame [3]."""
+  return c.body_axes(body)[2]
+
+
+def gripper_to_object(c: ArmContext) -> jax.Array:
+  """From the gripper to the object, world frame, m [3]."""
+  return c.object_pos - c.gripper_pos
+
+
+def object_to_goal(c: ArmContext) -> jax.Array:
+  """From the object to the goal, world frame, m [3]."""
+  return c.to_goal
+
+
+def goal_axes_error(c: ArmContext) -> jax.Array:
+  """First two rows of the goal's rotation matrix minus those of the object, world frame [6]."""
+  return c.goal_axes_error
+
+
+def goal_pos(c: ArmContext) -> jax.Array:
+  """Position of the goal, world frame, m [3]."""
+  return c.goal_pos
+
+
+def goal_axes(c: ArmContext) -> jax.Array:
+  """Orientation of the goal: last two rows of its rotation matrix in the world frame [6]."""
+  return two_rows(c.data.mocap_quat[0])
+
+
+def goal_to_object(c: ArmContext) -> jax.Array:
+  """From the goal to the object, world frame, m [3]."""
+  return -c.to_goal
+
+
+def no_ik_solution(c: ArmContext) -> jax.Array:
+  """1 where the inverse kinematics found no joint angles for the last action, else 0 [1]."""
+  return c.carried("no_solution")[None]
+
+
+def episode_time(c: StepContext) -> jax.Array:
+  """Share of the episode that is over [1]."""
+  return (c.data.time / (c.env.episode_length * c.env.dt))[None]
+
+
+def _turned(c: ArmContext, axes: jax.Array, max_angle: float, name: str) -> jax.Array:
+  """The last two rows of axes that a tracker sees, turned at random by up to `max_angle` rad; shape [6]."""
+  max_angle = max_angle * c.env.config.noise_level
+  if max_angle:
+    key = jax.random.fold_in(c.info["rng"], zlib.crc32(name.encode()))
+    axes = quat_to_mat(turn_at_random(key, jnp.array([1.0, 0.0, 0.0, 0.0]), max_angle)) @ axes
+  return axes[1:].ravel()

@@ -1,0 +1,352 @@
+"""Managers: each computes the terms of one kind. `playground.envs.task.Task` calls them in every step."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from playground.config.text import format_value
+from playground.envs.physics import PhysicsData
+from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.limits import MOST, Limit, at_least_0, count, span
+from playground.mdp import delays
+from playground.mdp.context import StepContext
+from playground.mdp.lookup import lookup
+from playground.mdp.options import (
+  CommandOptions,
+  EventOptions,
+  ObservationOptions,
+  RewardOptions,
+  TerminationOptions,
+  is_model_field,
+)
+from playground.mdp.terms import Term, bind, bind_one
+
+ACTOR = "state"  # the observation group that the policy reads: noisy; the other groups are exact
+Info = dict[str, Any]
+_LIMITS = {
+  "history": count(1, 1000),
+  "delay": Limit(0, 1000, whole=True, form="list", length=2, rising=True),
+  "clip": span(-MOST),
+  "scale": Limit().each,
+}
+
+
+class RewardManager:
+  """Weighted reward terms."""
+
+  def __init__(self, section: Mapping[str, Any]):
+    """Binds `env.rewards`.
+
+    Raises:
+      ConfigError, UnknownNameError: see `terms.bind`; also a condition or weight that is invalid.
+    """
+    terms = bind("rewards", section, RewardOptions)
+    for term in terms:
+      key = f"env.rewards.{term.name}"
+      for name, value in (term.options.when or {}).items():
+        if name not in ("command_above", "command_below"):
+          near = nearest(name, ("command_above", "command_below"))
+          raise UnknownNameError(f"{key}.when.{name} does not exist: choose command_above or command_below.{near}")
+        if not at_least_0().allows(value):
+          raise ConfigError(f"{key}.when.{name}={format_value(value)} must be {at_least_0()}.")
+    self.terms = [term for term in terms if term.options.weight != 0]
+
+  def compute(self, c: StepContext) -> dict[str, jax.Array]:
+    """Returns weight * value of each term, by name, each shape []."""
+    return {term.name: term.options.weight * _when(term.options.when, c, term(c)) for term in self.terms}
+
+
+def _when(condition: Mapping[str, float] | None, c: StepContext, value: jax.Array) -> jax.Array:
+  for name, bound in (condition or {}).items():
+    speed = jnp.linalg.norm(c.command)
+    value = value * (speed > bound if name == "command_above" else speed < bound)
+  return value
+
+
+class TerminationManager:
+  """Reasons to end an episode."""
+
+  def __init__(self, section: Mapping[str, Any]):
+    """Binds `env.terminations`; raises as `terms.bind`."""
+    self.terms = bind("terminations", section, TerminationOptions)
+
+  def compute(self, c: StepContext) -> dict[str, jax.Array]:
+    """Returns whether each term ends the episode, by name, each a bool of shape []."""
+    return {term.name: term(c) for term in self.terms}
+
+  def any(self, c: StepContext) -> jax.Array:
+    """Returns whether any term ends the episode, a bool of shape []."""
+    return jnp.array(list(self.compute(c).values()), bool).any()
+
+
+class ObservationManager:
+  """Concatenates the terms of each observation group. Noise, delays and history keep their state in `info`.
+
+  The entry `state: {}` of another group stands for the whole of the group `state`, as the policy reads it.
+
+  Attributes:
+    groups: the terms of each group, the group `state` first; an empty group is left out.
+  """
+
+  def __init__(
+    self,
+    section: Mapping[str, Any],
+    noise_level: float = 1.0,
+    frames: int = 1,
+    order: Mapping[str, Any] | None = None,
+  ):
+    """Binds `env.observations`.
+
+    Args:
+      section: terms by group.
+      noise_level: factor on all noise; 0 is none.
+      frames: the group `state` holds that of so many steps, newest first; 0 before the episode began.
+      order: by group, the terms that come first in its vector; the others follow in the order of the section.
+
+    Raises:
+      ConfigError, UnknownNameError: see `terms.bind`; also a key of a term with an invalid value.
+    """
+    self._level = noise_level
+    self._frames = frames
+    if not isinstance(frames, int) or frames < 1:
+      raise ConfigError(f"env.observation_frames={frames!r} must be a number of steps, 1 or more.")
+    if ACTOR not in section or section[ACTOR] is None:
+      raise ConfigError(f"env.observations has no group {ACTOR!r}, which the policy reads.")
+    self.groups: dict[str, list[Term]] = {}
+    for group in sorted(section, key=lambda name: (name != ACTOR, name)):
+      entries = {name: entry for name, entry in (section[group] or {}).items() if entry is not None}
+      first = list((order or {}).get(group) or ())
+      for name in first:
+        lookup(entries, name, f"env.observation_order.{group}")
+      terms = [_bind_observation(group, name, entries[name]) for name in dict.fromkeys([*first, *entries])]
+      if terms:
+        self.groups[group] = terms
+    for group, terms in self.groups.items():
+      _check_shared_noise(group, terms)
+    if ACTOR not in self.groups:
+      raise ConfigError(f"env.observations.{ACTOR} is empty: the policy would read nothing.")
+
+  @property
+  def keeps_past(self) -> bool:
+    """Whether `info` has an entry `observation_buffers`."""
+    return self._frames > 1 or any(_depth(term) > 1 for terms in self.groups.values() for term in terms)
+
+  def compute(self, c: StepContext, key: jax.Array, buffers: Info | None = None) -> tuple[Any, Info]:
+    """Observes.
+
+    Args:
+      c: the present step.
+      key: random key of noise and delays.
+      buffers: those that the step before returned; None at the start of an episode.
+
+    Returns:
+      The observation, a dict of vectors by group or one vector where `state` is the only group, and the buffers.
+    """
+    past: Info = {}
+    obs: dict[str, jax.Array] = {}
+    for group, terms in self.groups.items():
+      drawn: dict[str, jax.Array] = {}
+      parts = []
+      for term in terms:
+        if _is_actor(group, term):
+          parts.append(obs[ACTOR])
+          continue
+        noise_key = delay_key = key
+        if term.options.noise or term.options.delay:  # the others draw nothing
+          key, noise_key, delay_key = jax.random.split(key, 3)
+        value = self._read(term, c, noise_key, drawn)
+        if _depth(term) > 1:
+          name = f"{group}/{term.name}"
+          value, past[name] = _look_back(term, value, delay_key, None if buffers is None else buffers[name])
+        parts.append(value.ravel())
+      obs[group] = jnp.concatenate(parts)
+      if group == ACTOR and self._frames > 1:
+        empty = jnp.zeros((self._frames, obs[group].size))
+        past[group] = delays.push(empty if buffers is None else buffers[group], obs[group])
+        obs[group] = past[group].ravel()
+    return obs if len(obs) > 1 else obs[ACTOR], past
+
+  def _read(self, term: Term, c: StepContext, key: jax.Array, drawn: dict[str, jax.Array]) -> jax.Array:
+    value, options = term(c), term.options
+    kind, size = next(iter(options.noise.items())) if options.noise else (None, 0.0)
+    if kind == "same_as":
+      value = value + drawn[str(size)]
+    elif kind is not None:
+      pattern = self._level * _per_element(f"{term.name}.noise.{kind}", size, value.size)
+      if pattern.any():  # a level of 0 computes nothing
+        uniform = kind == "uniform"
+        draw = jax.random.uniform(key, value.shape) * 2 - 1 if uniform else jax.random.normal(key, value.shape)
+        drawn[term.name] = jnp.asarray(pattern) * draw
+        value = value + drawn[term.name]
+      else:
+        drawn[term.name] = jnp.zeros_like(value)
+    value = value if options.clip is None else jnp.clip(value, *options.clip)
+    return value if options.scale is None else value * _per_element(f"{term.name}.scale", options.scale, value.size)
+
+  def sizes(self, first: Callable[[], StepContext]) -> dict[str, dict[str, int]]:
+    """Returns the length of each term, by group, from a context that is only traced.
+
+    With frames the terms are those of the newest step, and `past_frames` are the others.
+    """
+    found: dict[str, dict[str, int]] = {}
+
+    def trace() -> None:
+      c = first()
+      for group, terms in self.groups.items():
+        sizes = {}
+        for term in terms:
+          actor = _is_actor(group, term)
+          sizes[term.name] = sum(found[ACTOR].values()) if actor else term(c).size * term.options.history
+        found[group] = sizes
+        if group == ACTOR and self._frames > 1:
+          found[group] = sizes | {"past_frames": (self._frames - 1) * sum(sizes.values())}
+
+    jax.eval_shape(trace)
+    return found
+
+
+def _bind_observation(group: str, name: str, entry: Any) -> Term:
+  key = f"env.observations.{group}.{name}"
+  if group != ACTOR and name == ACTOR and not dict(entry.items() if hasattr(entry, "items") else {"func": entry}):
+    return Term(name, lambda c: None, {}, ObservationOptions())
+  term = bind_one("observations", key, name, entry, ObservationOptions)
+  options = term.options
+  for field, limit in _LIMITS.items():
+    value = getattr(options, field)
+    if value is not None and not limit.allows(value):
+      raise ConfigError(f"{key}.{field}={format_value(value)} must be {limit}.")
+  noise = options.noise
+  if noise is not None:
+    kinds = ("uniform", "gaussian", "same_as")
+    if not isinstance(noise, dict) or len(noise) != 1 or next(iter(noise)) not in kinds:
+      raise ConfigError(f"{key}.noise={noise!r} must have one of the keys {', '.join(kinds)}.")
+    kind, size = next(iter(noise.items()))
+    if kind != "same_as" and not at_least_0().each.allows(size):
+      raise ConfigError(f"{key}.noise.{kind}={format_value(size)} must be {at_least_0().each}.")
+  return term
+
+
+def _check_shared_noise(group: str, terms: list[Term]) -> None:
+  seen: list[str] = []
+  for term in terms:
+    source = (term.options.noise or {}).get("same_as")
+    if source is not None and source not in seen:
+      key = f"env.observations.{group}.{term.name}.noise.same_as"
+      raise UnknownNameError(f"{key}={source} is no term with noise above it.{nearest(str(source), seen)}")
+    if term.options.noise and source is None:
+      seen.append(term.name)
+
+
+def _per_element(name: str, numbers: Any, size: int) -> np.ndarray:
+  """A number or a list of numbers for each of `size` elements; a shorter list repeats. Raises ConfigError."""
+  numbers = np.atleast_1d(numbers)
+  if size % numbers.size:
+    raise ConfigError(f"env.observations: {name} has {numbers.size} numbers, which do not divide its {size} elements.")
+  return np.tile(numbers, size // numbers.size)
+
+
+def _is_actor(group: str, term: Term) -> bool:
+  return group != ACTOR and term.name == ACTOR
+
+
+def _depth(term: Term) -> int:
+  """How many values of a term are kept."""
+  delay = term.options.delay
+  return term.options.history + (delay[1] if delay else 0)
+
+
+def _look_back(term: Term, value: jax.Array, key: jax.Array, buffer: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+  options = term.options
+  if buffer is None:  # a delayed sensor has read the start for long; a history has no past
+    depth = _depth(term)
+    buffer = delays.start(value, depth) if options.delay else jnp.zeros((depth, *value.shape), value.dtype)
+  buffer = delays.push(buffer, value)
+  start = delays.draw_delay(key, options.delay) if options.delay else 0
+  if not options.delay:
+    return buffer, buffer
+  return jax.lax.dynamic_slice_in_dim(buffer, start, options.history), buffer
+
+
+class CommandManager:
+  """Generators of commands: each is an object with `reset` and `step` (see `playground.mdp.commands`)."""
+
+  def __init__(self, section: Mapping[str, Any], env: Any):
+    """Binds `env.commands` and builds each generator with its parameters; raises as `terms.bind`."""
+    self.terms = bind("commands", section, CommandOptions, skip=0)
+    self._generators = [term() for term in self.terms]
+    for generator in self._generators:
+      generator.bind(env)
+
+  def reset(self, key: jax.Array) -> Info:
+    """Returns the entries of `info` that an episode starts with."""
+    info: Info = {}
+    for generator, k in zip(self._generators, _keys(key, self._generators), strict=True):
+      info |= generator.reset(k)
+    return info
+
+  def step(self, c: StepContext, key: jax.Array) -> Info:
+    """Returns the entries of `info` for the next step."""
+    info: Info = {}
+    for generator, k in zip(self._generators, _keys(key, self._generators), strict=True):
+      info |= generator.step(c, k)
+    return info
+
+
+class EventManager:
+  """What acts on the simulation from outside: on its start state and while it runs.
+
+  Model fields of mode `startup` are the trainers' (`playground.randomization`), which hand them to `reset` and `step`.
+  """
+
+  def __init__(self, section: Mapping[str, Any], env: Any):
+    """Binds `env.events`.
+
+    Raises:
+      ConfigError, UnknownNameError: see `terms.bind`; also an unknown mode, or a function of another mode.
+    """
+    self._resets: list[Term] = []
+    self._intervals: list[Any] = []
+    for name, entry in (section or {}).items():
+      if entry is None or is_model_field(name, entry):
+        continue
+      term = bind_one("events", f"env.events.{name}", name, entry, EventOptions, skip=3)
+      if term.options.mode not in ("reset", "interval"):
+        raise ConfigError(f"env.events.{name}.mode={term.options.mode}: only func model_field has the mode startup.")
+      if isinstance(term.func, type) != (term.options.mode == "interval"):
+        mode = "interval" if isinstance(term.func, type) else "reset"
+        raise ConfigError(f"env.events.{name}.mode={term.options.mode}: {term.func.__name__} is for mode: {mode}.")
+      if term.options.mode == "interval":
+        event = term.func(**term.params)
+        event.bind(env)
+        self._intervals.append((event, term.options.enabled))
+      elif term.options.enabled:
+        self._resets.append(term)
+
+  def start(self, key: jax.Array, env: Any, initial: Any) -> Any:
+    """Applies the reset events, in order, to the state that an episode starts with."""
+    for term, k in zip(self._resets, _keys(key, self._resets), strict=True):
+      initial = term.func(k, env, initial, **term.params)
+    return initial
+
+  def reset(self, key: jax.Array, model: Any) -> Info:
+    """Returns the entries of `info` of the interval events that an episode starts with."""
+    info: Info = {}
+    for (event, _), k in zip(self._intervals, _keys(key, self._intervals), strict=True):
+      info |= event.reset(k, model)
+    return info
+
+  def step(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
+    """Returns the physics after the interval events, and `info`."""
+    changed = dict(info)
+    for event, enabled in self._intervals:
+      if enabled:
+        data, entries = event.step(data, changed)
+        changed |= entries
+    return data, changed
+
+
+def _keys(key: jax.Array, terms: list[Any]) -> Any:
+  return jax.random.split(key, len(terms)) if terms else []

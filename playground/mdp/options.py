@@ -1,0 +1,80 @@
+"""Keys of a term in a config besides `func` and `params`, for each kind of terms.
+
+This module imports no JAX: the composition of a configuration checks keys with it.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+
+class RewardOptions(NamedTuple):
+  """Keys of a reward term.
+
+  Attributes:
+    weight: factor on the function's value; a term of weight 0 is left out.
+    when: `{command_above: x}` or `{command_below: x}`: else, by the norm of the command, the term is 0.
+  """
+
+  weight: float
+  when: Mapping[str, float] | None = None
+
+
+class TerminationOptions(NamedTuple):
+  """A termination term has no keys besides `func` and `params`."""
+
+
+class ObservationOptions(NamedTuple):
+  """Keys of an observation term, applied in this order.
+
+  Attributes:
+    noise: `{uniform: a}` adds U[-a, a), `{gaussian: s}` adds N(0, s²): one number, or one for each element (a shorter
+      list repeats). `{same_as: <term>}` adds the noise of another term of the group, of which this one is computed.
+    clip: [low, high].
+    scale: a factor, or one for each element (a shorter list repeats).
+    delay: [low, high]: the value is that of so many steps ago, drawn in every step, both ends included.
+    history: the newest value and those before it, newest first; 0 before the episode began.
+  """
+
+  noise: Mapping[str, Any] | None = None
+  clip: tuple[float, float] | None = None
+  scale: Any = None
+  delay: tuple[int, int] | None = None
+  history: int = 1
+
+
+class CommandOptions(NamedTuple):
+  """A command term has no keys besides `func` and `params`."""
+
+
+class EventOptions(NamedTuple):
+  """Keys of an event term.
+
+  Attributes:
+    mode: `startup` (a model field, drawn once an environment), `reset` (in each episode) or `interval`.
+    enabled: false switches the event off; an interval event still writes its entries of `info`.
+  """
+
+  mode: str
+  enabled: bool = True
+
+
+MODEL_FIELD = "model_field"  # the func of events that draw a field of the model
+
+
+def is_model_field(name: str, entry: Any) -> bool:
+  """Whether an entry of `env.events` draws a field of the model."""
+  return hasattr(entry, "get") and (entry.get("func") or name) == MODEL_FIELD
+
+
+OPTIONS: dict[str, type] = {
+  "rewards": RewardOptions,
+  "observations": ObservationOptions,
+  "terminations": TerminationOptions,
+  "commands": CommandOptions,
+  "events": EventOptions,
+}
+
+
+def keys(kind: str) -> tuple[str, ...]:
+  """Keys that an entry of a kind (`rewards`, ...) may have."""
+  return ("func", "params", *OPTIONS[kind]._fields)  # pyright: ignore[reportAttributeAccessIssue]

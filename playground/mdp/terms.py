@@ -1,0 +1,233 @@
+"""Terms: the named parts of a task's rewards, observations, terminations, commands and events.
+
+A term is one entry of a mapping in the task's config:
+
+```yaml
+rewards:
+  action_rate_l2: {weight: -0.01}            # the registered function of that name
+  knees: {func: joint_deviation_l1, weight: -0.1, params: {joints: [".*_knee_joint"]}}
+  mine: {func: "my_package.rewards:mine", weight: 0.5}
+  feet_slip: null                            # removes the term that the family file has
+```
+
+Every public function or class of the modules in `MODULES` is registered under its name (a class under its name in
+snake_case). Its keyword arguments are the term's `params`, its docstring is the term's help.
+"""
+
+import functools
+import importlib
+import inspect
+import re
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+from playground.config.moved import renamed_function
+from playground.config.text import format_value
+from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.limits import Limit
+from playground.trust import trusted_object
+
+# Modules whose public functions and classes are the registered terms of a kind.
+MODULES = {
+  "rewards": ("playground.mdp.rewards", "playground.mdp.hand_rewards", "playground.mdp.arm_rewards"),
+  "observations": (
+    "playground.mdp.observations",
+    "playground.mdp.hand_observations",
+    "playground.mdp.arm_observations",
+  ),
+  "terminations": ("playground.mdp.terminations", "playground.mdp.arm_terminations"),
+  "commands": ("playground.mdp.commands",),
+  "events": ("playground.mdp.events", "playground.mdp.arm_events"),
+}
+Options = TypeVar("Options", bound=tuple)
+
+
+class Term(NamedTuple):
+  """A term whose function is found and whose parameters are checked.
+
+  Attributes:
+    name: its key in the config.
+    func: the function or class.
+    params: keyword arguments of `func`.
+    options: the other keys of the entry (weight, noise, mode, ...), a NamedTuple of the kind.
+  """
+
+  name: str
+  func: Callable[..., Any]
+  params: dict[str, Any]
+  options: Any
+
+  @property
+  def source(self) -> str:
+    """File and line of the function."""
+    target = inspect.unwrap(self.func)
+    return f"{inspect.getsourcefile(target)}:{inspect.getsourcelines(target)[1]}"
+
+  def __call__(self, *args: Any) -> Any:
+    return self.func(*args, **self.params)
+
+
+@functools.cache
+def registered(kind: str) -> dict[str, Callable[..., Any]]:
+  """Functions and classes of a kind (a key of `MODULES`) by name."""
+  found: dict[str, Callable[..., Any]] = {}
+  for name in MODULES[kind]:
+    module = importlib.import_module(name)
+    for key, value in vars(module).items():
+      if not key.startswith("_") and callable(value) and getattr(value, "__module__", None) == name:
+        found[_snake_case(key) if isinstance(value, type) else key] = value
+  return found
+
+
+def bind(kind: str, section: Mapping[str, Any] | None, options: type[Options], *, skip: int = 1) -> list[Term]:
+  """Binds the terms of a section, in its order; null entries are left out.
+
+  Args:
+    kind: a key of `MODULES`, and of `env` in the config.
+    section: entry by term name.
+    options: NamedTuple of the keys that an entry may have besides `func` and `params`.
+    skip: how many leading arguments of the function are not parameters (the context, say).
+
+  Raises:
+    UnknownNameError: a key, function or parameter that does not exist.
+    ConfigError: an entry that is no mapping, a missing key or parameter, or a value of the wrong type.
+  """
+  return [
+    bind_one(kind, f"env.{kind}.{name}", name, entry, options, skip)
+    for name, entry in (section or {}).items()
+    if entry is not None
+  ]
+
+
+def bind_one(kind: str, key: str, name: str, entry: Any, options: type[Options], skip: int = 1) -> Term:
+  """Binds one term; `key` is its place in the config. See `bind`."""
+  if not hasattr(entry, "items"):
+    raise ConfigError(f"{key}={entry!r} is no mapping such as {{func: {name}, params: {{}}}}.")
+  entry = dict(entry.items())
+  fields: tuple[str, ...] = options._fields  # pyright: ignore[reportAttributeAccessIssue]
+  required = [field for field in fields if field not in options._field_defaults]  # pyright: ignore[reportAttributeAccessIssue]
+  known = ("func", "params", *fields)
+  for field in entry:
+    if field not in known:
+      raise UnknownNameError(f"{key}.{field} does not exist: a term has {', '.join(known)}.{nearest(field, known)}")
+  for field in required:
+    if entry.get(field) is None:
+      raise ConfigError(f"{key}.{field} is missing: every term of env.{kind} has one.")
+  given_func = entry.get("func")
+  if given_func is not None and not isinstance(given_func, str):
+    raise ConfigError(f"{key}.func={format_value(given_func)} must be text: a registered function or module:function.")
+  func = find(kind, given_func or name, key)
+  params = check_params(func, entry.get("params") or {}, f"{key}.params", skip)
+  hints = typing.get_type_hints(options)
+  given = {
+    field: _checked(f"{key}.{field}", plain(entry[field]), hints[field])
+    for field in fields
+    if entry.get(field) is not None
+  }
+  return Term(name, func, params, options(**given))
+
+
+def find(kind: str, name: str, key: str) -> Callable[..., Any]:
+  """Returns the registered function or the one that `module:function` names.
+
+  Raises:
+    UnknownNameError: no function of that name is registered.
+    ConfigError: `module:function` does not exist, or its package is not trusted (`playground.trust`).
+  """
+  table = registered(kind)
+  if name in table:
+    return table[name]
+  if ":" not in name:
+    renamed = renamed_function(kind, name)
+    near = f" Did you mean {renamed!r}?" if renamed else nearest(name, table)
+    raise UnknownNameError(
+      f"{key}: no function {name!r} is registered for env.{kind}; name one, or write func: module:function.{near}"
+    )
+  found = trusted_object(f"{key}.func", name)
+  if not callable(found):
+    raise ConfigError(f"{key}.func={name} is not a function.")
+  return found
+
+
+def check_params(func: Callable[..., Any], given: Any, key: str, skip: int = 1) -> dict[str, Any]:
+  """Returns a function's keyword arguments as plain values; null is the argument's default.
+
+  Raises:
+    UnknownNameError: an argument that the function does not have.
+    ConfigError: a missing argument, a number that is not finite, or a value of another type than annotated.
+  """
+  if not hasattr(given, "items"):
+    raise ConfigError(f"{key}={given!r} is no mapping of parameters.")
+  params = {name: plain(value) for name, value in given.items() if value is not None}
+  arguments = dict(list(inspect.signature(func).parameters.items())[skip if not isinstance(func, type) else 0 :])
+  arguments = {name: argument for name, argument in arguments.items() if not name.startswith("_")}
+  for name, value in params.items():
+    if name not in arguments:
+      has = f"takes {', '.join(arguments)}" if arguments else "takes no parameters"
+      raise UnknownNameError(f"{key}.{name} does not exist: {func.__name__} {has}.{nearest(name, arguments)}")
+    params[name] = _checked(f"{key}.{name}", value, _annotation(func, arguments[name]))
+  for name, argument in arguments.items():
+    if argument.default is inspect.Parameter.empty and name not in params:
+      raise ConfigError(f"{key}.{name} is missing: {func.__name__} needs it.")
+  return params
+
+
+def plain(value: Any) -> Any:
+  """Mappings as dicts, lists as tuples."""
+  if hasattr(value, "items"):
+    return {name: plain(entry) for name, entry in value.items()}
+  return tuple(plain(entry) for entry in value) if isinstance(value, list | tuple) else value
+
+
+def _annotation(func: Callable[..., Any], argument: inspect.Parameter) -> Any:
+  """A parameter's annotation; one that is text (`from __future__ import annotations`) is looked up."""
+  if not isinstance(argument.annotation, str):
+    return argument.annotation
+  return typing.get_type_hints(func, include_extras=True).get(argument.name)
+
+
+def _checked(key: str, value: Any, hint: Any) -> Any:
+  """Returns a value, whole numbers as floats where the annotation says float; unknown annotations say nothing.
+
+  Raises:
+    ConfigError: it is not of the annotated type or outside its `Limit`.
+  """
+  kinds = [kind for kind in (typing.get_args(hint) if _is_union(hint) else (hint,)) if kind is not type(None)]
+  problems = [_problem(value, kind) for kind in kinds]
+  if problems and all(problems):
+    raise ConfigError(f"{key}={format_value(value)} must be {' or '.join(dict.fromkeys(map(str, problems)))}.")
+  return _as_float(value) if any("float" in str(kind) for kind in kinds) else value
+
+
+def _is_union(hint: Any) -> bool:
+  return isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+
+
+def _as_float(value: Any) -> Any:
+  if isinstance(value, tuple):
+    return tuple(map(_as_float, value))
+  return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _problem(value: Any, hint: Any) -> Any:
+  """What a value must be that is not of this type, None if it is."""
+  limit = next((entry for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, Limit)), None)
+  kind = typing.get_args(hint)[0] if limit else hint
+  entries = typing.get_args(kind)
+  if limit is None and kind in (int, float):
+    limit = Limit(whole=kind is int)
+  if limit is None and entries == (float,):
+    limit = Limit(form="list")
+  if limit is not None:
+    return None if limit.allows(value) else limit
+  if kind in (str, bool):
+    return None if isinstance(value, kind) else {str: "text", bool: "true or false"}[kind]
+  if entries == (str,):
+    return None if isinstance(value, tuple) and all(isinstance(v, str) for v in value) else "a list of texts"
+  return None
+
+
+def _snake_case(name: str) -> str:
+  return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()

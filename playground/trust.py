@@ -1,0 +1,83 @@
+"""Which code a configuration may name: a task's class, `module:name`.
+
+A configuration may be somebody else's: that of a run, a policy or a sweep. Importing a module runs it, so the module's
+name is checked first. Trusted are this package, installed packages that register tasks (entry points of the group
+`playground.tasks`), and packages that the user names on this command line (`trust=my_package`, `--trust my_package`)
+or in Python (`trust("my_package")`).
+"""
+
+import importlib
+import importlib.metadata
+from collections.abc import Iterable
+from typing import Any
+
+from playground.config.files import ENTRY_POINTS
+from playground.errors import ConfigError, nearest
+
+_named: set[str] = set()  # by the user of this process
+
+
+def trust(*packages: str) -> None:
+  """Lets configurations name code of these packages, or modules, for the rest of this process.
+
+  Raises:
+    ConfigError: a name that no package can have.
+  """
+  for package in packages:
+    if not isinstance(package, str) or not _is_dotted_name(package):
+      raise ConfigError(f"trust={package} is not the name of a package, such as my_package or my_package.tasks.")
+  _named.update(packages)
+
+
+def trusted_object(key: str, spec: Any) -> Any:
+  """Imports the class or function that a configuration names.
+
+  Args:
+    key: where the configuration names it, for errors.
+    spec: what it says, `module:name`.
+
+  Raises:
+    ConfigError: it is of another form, does not exist, or belongs to a package that is not trusted, which is then not
+      imported.
+  """
+  module_name, _, name = str(spec).partition(":")
+  if not _is_dotted_name(module_name) or not name.isidentifier():
+    raise ConfigError(f"{key}={spec} is not of the form module:name.")
+  if not _is_trusted(module_name):
+    raise _untrusted(key, spec, module_name)
+  try:
+    module = importlib.import_module(module_name)
+  except ModuleNotFoundError as error:
+    if not f"{module_name}.".startswith(f"{error.name}."):  # the module is there, something that it needs is not
+      raise
+    raise ConfigError(f"{key}={spec}: there is no module {error.name}.") from None
+  own = [n for n, value in vars(module).items() if getattr(value, "__module__", None) == module_name]
+  if name not in vars(module):
+    raise ConfigError(f"{key}={spec}: {module_name} has no {name}.{nearest(name, own)}")
+  found = vars(module)[name]
+  home = getattr(found, "__module__", None)
+  if not isinstance(home, str) or not _is_trusted(home):  # what a trusted module imports is not its own
+    raise _untrusted(key, spec, home or name)
+  return found
+
+
+def _untrusted(key: str, spec: Any, module: str) -> ConfigError:
+  package = module.partition(".")[0]
+  known = ", ".join(sorted(_trusted()))
+  return ConfigError(
+    f"{key}={spec} is refused: a configuration may only name code of {known}, which {package} is not. If you trust it, "
+    f"add trust={package} (--trust {package} for commands other than playground-run)."
+  )
+
+
+def _is_trusted(module: str) -> bool:
+  return any(f"{module}.".startswith(f"{package}.") for package in _trusted())
+
+
+def _trusted() -> Iterable[str]:
+  registered = {point.module.partition(".")[0] for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+  return {"playground"} | registered | _named
+
+
+def _is_dotted_name(text: str) -> bool:
+  return all(part.isidentifier() for part in text.split("."))

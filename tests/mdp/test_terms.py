@@ -1,0 +1,192 @@
+"""Terms of a config: the functions that they name, what they may say, and those of the shipped tasks."""
+
+import functools
+import inspect
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+
+import playground
+from playground import registry
+from playground.errors import ConfigError, UnknownNameError
+from playground.mdp.options import CommandOptions, EventOptions, RewardOptions, is_model_field
+from playground.mdp.rewards import action_rate_l2
+from playground.mdp.terms import MODULES, Term, bind, find, registered
+from playground.trust import trust
+
+
+def rewards(section: Any) -> list[Term]:
+  return bind("rewards", section, RewardOptions)
+
+
+def test_a_terms_name_is_its_functions_name_unless_it_says_another() -> None:
+  terms = rewards(
+    {
+      "action_rate_l2": {"weight": -0.01},
+      "hips": {"func": "joint_deviation_l1", "weight": 2, "params": {"joints": ["a", "b"]}, "when": {"x": 1}},
+      "knees": {"func": "joint_deviation_l1", "weight": 0, "params": {"joints": "knees"}},
+      "feet_slip_l2": None,
+    }
+  )
+  assert [term.name for term in terms] == ["action_rate_l2", "hips", "knees"]  # in their order, without what is null
+  assert terms[0].func is action_rate_l2 and terms[0].params == {}
+  assert terms[1].func is terms[2].func
+  assert (terms[1].params, terms[1].options) == ({"joints": ("a", "b")}, RewardOptions(2, {"x": 1}))
+  assert terms[0].source.endswith(f"rewards.py:{action_rate_l2.__code__.co_firstlineno}")
+  assert rewards(None) == []
+
+
+def test_classes_are_named_in_snake_case_and_their_fields_are_parameters() -> None:
+  entry = {"func": "uniform_velocity", "params": {"max": [1, 1, 1], "min": None}}
+  (term,) = bind("commands", {"velocity": entry}, CommandOptions, skip=0)
+  assert term().max == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+  ("entry", "message"),
+  [
+    ({"weight": 1, "func": "enrgy"}, r"env\.rewards\.x: no function 'enrgy' is registered .* module:function"),
+    ({"weight": 1, "func": "action_rate"}, r"'action_rate'.*Did you mean 'action_rate_l2'\?"),
+    ({"wieght": 1}, r"env\.rewards\.x\.wieght does not exist: a term has .*Did you mean 'weight'\?"),
+    (
+      {"func": "base_height_l2", "weight": 1, "params": {"targt": 1}},
+      r"env\.rewards\.x\.params\.targt does not exist: base_height_l2 takes target\. Did you mean 'target'\?",
+    ),
+    ({"func": "action_l2", "weight": 1, "params": {"a": 1}}, "params.a does not exist: action_l2 takes no parameters"),
+  ],
+)
+def test_unknown_names(entry: Any, message: str) -> None:
+  with pytest.raises(UnknownNameError, match=message) as error:
+    rewards({"x": entry})
+  assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+  ("entry", "message"),
+  [
+    (-0.1, r"env\.rewards\.x=-0\.1 is no mapping"),
+    ({"func": "action_l2"}, r"env\.rewards\.x\.weight is missing"),
+    ({"func": "action_l2", "weight": 1, "params": 3}, "params=3 is no mapping of parameters"),
+    ({"func": "base_height_l2", "weight": 1}, r"params\.target is missing: base_height_l2 needs it"),
+    ({"func": "base_height_l2", "weight": 1, "params": {"target": None}}, r"params\.target is missing"),
+    ({"func": "base_height_l2", "weight": 1, "params": {"target": "high"}}, r"target=.* must be a number"),
+    ({"func": "base_height_l2", "weight": 1, "params": {"target": float("nan")}}, r"target=nan must be a number"),
+    ({"func": "feet_clearance", "weight": 1, "params": {"target": -0.1}}, r"target=-0\.1 must be a number above 0"),
+    ({"func": "orientation_l2", "weight": 1, "params": {"target": [0, 1]}}, r"target=.* must be 3 numbers"),
+    ({"func": "joint_deviation_l1", "weight": 1, "params": {"joints": 3}}, r"joints=3 must be text or a list of texts"),
+    ({"func": "ang_vel_xy_l2", "weight": 1, "params": {"sensor": 3}}, r"sensor=3 must be text"),
+  ],
+)
+def test_refusals(entry: Any, message: str) -> None:
+  with pytest.raises(ConfigError, match=message):
+    rewards({"x": entry})
+
+
+def test_events_need_a_mode() -> None:
+  with pytest.raises(ConfigError, match=r"env\.events\.reset_root_xy\.mode is missing"):
+    bind("events", {"reset_root_xy": {"params": {"distance": 1.0}}}, EventOptions, skip=3)
+
+
+def test_functions_of_other_packages_are_trusted_by_name_only(monkeypatch: pytest.MonkeyPatch) -> None:
+  module: Any = ModuleType("elsewhere")
+
+  def mine(c: Any, gain: "float") -> Any:  # as with `from __future__ import annotations`
+    return gain * c
+
+  mine.__module__, module.mine, module.seven = "elsewhere", mine, 7
+  monkeypatch.setitem(sys.modules, "elsewhere", module)
+  entry = {"func": "elsewhere:mine", "weight": 1.0, "params": {"gain": 2.0}}
+  with pytest.raises(ConfigError, match=r"env\.rewards\.x\.func=elsewhere:mine is refused.*trust=elsewhere"):
+    rewards({"x": entry})
+  monkeypatch.setattr("playground.trust._named", set())
+  trust("elsewhere")
+  (term,) = rewards({"x": entry})
+  assert term(3.0) == 6.0
+  with pytest.raises(ConfigError, match=r"params\.gain=.* must be a number"):
+    rewards({"x": {**entry, "params": {"gain": "much"}}})
+  with pytest.raises(ConfigError, match=r"func=elsewhere:miine: elsewhere has no miine.*Did you mean 'mine'\?"):
+    rewards({"x": {**entry, "func": "elsewhere:miine"}})
+
+
+# The shipped tasks. Their files are merged here without Hydra, which takes a second for each.
+
+ENVS = Path(playground.__file__).parents[1] / "configs/env"
+KINDS = tuple(MODULES)
+
+
+@functools.cache
+def read(name: str) -> tuple[list[str], dict[str, Any]]:
+  """The files that one inherits from, and the config with what it has of them."""
+  config = yaml.load((ENVS / f"{name}.yaml").read_text(), yaml.CSafeLoader)
+  above = [entry for entry in config.pop("defaults", []) if isinstance(entry, str) and entry != "_self_"]
+  for family in above:
+    config = merged(read(family)[1], config)
+  return above, config
+
+
+def merged(base: Any, change: Any) -> Any:
+  if not isinstance(base, dict) or not isinstance(change, dict):
+    return change
+  return base | {key: merged(base.get(key), value) for key, value in change.items()}
+
+
+def entries(task: str, kind: str) -> Iterator[tuple[str, Any]]:
+  """Terms of a task's config by name."""
+  for name, entry in (read(task)[1].get(kind) or {}).items():
+    group = (entry or {}).items() if kind == "observations" else [(name, entry)]
+    for term, own in group:
+      stands_for_a_group = kind == "observations" and term == "state" != name
+      if own is not None and not is_model_field(term, own) and not stands_for_a_group:
+        yield term, own
+
+
+@pytest.fixture(scope="module")
+def shipped() -> dict[str, dict[str, dict[str, Any]]]:
+  """Functions of all terms of the shipped tasks: by kind, name of the term, and task."""
+  found: dict[str, dict[str, dict[str, Any]]] = {kind: {} for kind in KINDS}
+  for task in registry.names():
+    for kind in KINDS:
+      for name, entry in entries(task, kind):
+        found[kind].setdefault(name, {})[task] = find(kind, entry.get("func") or name, f"{task}.{kind}.{name}")
+  return found
+
+
+@pytest.mark.parametrize("kind", ["rewards", "terminations"])
+def test_one_name_one_formula(kind: str, shipped: Any) -> None:
+  """Tasks that log a value under the same name compute the same function."""
+  assert len(shipped[kind]) > 5
+  several = {name: tasks for name, tasks in shipped[kind].items() if len(set(tasks.values())) > 1}
+  assert several == {}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_term_says_what_it_is(kind: str, shipped: Any) -> None:
+  for func in {func for tasks in shipped[kind].values() for func in tasks.values()} | set(registered(kind).values()):
+    line = (func.__doc__ or "").partition("\n")[0]
+    assert line.endswith((".", ".)", ":")) and not line.startswith(f"{func.__name__}("), f"{func}: {line!r}"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_function_is_registered_twice(kind: str) -> None:
+  table = registered(kind)
+  for module in map(sys.modules.__getitem__, MODULES[kind]):
+    for name, value in vars(module).items():
+      if inspect.isfunction(value) and value.__module__ == module.__name__ and not name.startswith("_"):
+        assert table[name] is value
+
+
+def test_a_task_inherits_from_one_family_at_most_and_that_from_none() -> None:
+  for task in registry.names():
+    families = read(task)[0]
+    assert len(families) <= 1, task
+    for family in families:
+      assert read(family)[0] == [], f"{task} inherits from {family}"
+
+
+def test_no_term_weighs_nothing() -> None:
+  assert [(t, name) for t in registry.names() for name, term in entries(t, "rewards") if not term["weight"]] == []

@@ -1,0 +1,124 @@
+"""Sweeps that lie in somebody else's folder, or are started in one: neither runs code of theirs."""
+
+import re
+from pathlib import Path
+
+import pytest
+import ray
+import yaml
+
+from playground.config import compose_settings
+from playground.errors import CheckpointError, ConfigError
+from playground.sweep.folder import SweepDirectory
+from playground.sweep.plan import settings_of
+from playground.sweep.slurm import SlurmLauncher
+from playground.sweep.worker import COMMAND
+from tests.sweep.helpers import make_sweep, run, statuses
+
+PACKAGE = Path(__file__).parents[2] / "playground"
+EVIL = "from pathlib import Path\nPath(__file__).with_name('ran').touch()\n"
+
+
+@pytest.fixture
+def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+  """The current folder has modules of libraries' names; the path exists once one of them has been imported."""
+  folder = tmp_path / "trap"
+  folder.mkdir()
+  for name in ("yaml", "numpy", "omegaconf", "hydra", "submitit", "cloudpickle"):
+    (folder / f"{name}.py").write_text(EVIL)
+  monkeypatch.chdir(folder)
+  return folder / "ran"
+
+
+def change(sweep: SweepDirectory, **content: object) -> SweepDirectory:
+  """The sweep, with other entries in its sweep.yaml."""
+  file = sweep.path / "sweep.yaml"
+  file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | content))
+  return SweepDirectory.open(sweep.path)
+
+
+def test_workers_import_nothing_from_the_current_folder(tmp_path: Path, trap: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  assert run(sweep, command=(*COMMAND, "--cfg", "job")) == 0
+  assert not trap.exists()
+
+
+@pytest.mark.slow  # starting Ray takes most of a minute on two cores
+def test_rays_workers_import_nothing_from_the_current_folder(tmp_path: Path, trap: Path) -> None:
+  assert not ray.is_initialized()
+  sweep = make_sweep(tmp_path / "sweep", 0, needs=0)
+  assert run(sweep, "launcher=ray", "launcher.cores_per_job=1") == 0
+  assert statuses(sweep) == {0: "finished"} and not trap.exists()
+
+
+def test_slurms_jobs_import_nothing_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr("shutil.which", lambda name: f"/bin/{name}")  # sbatch and srun
+  launcher = SlurmLauncher(make_sweep(tmp_path / "sweep", 0), compose_settings(["launcher=slurm"]).launcher)
+  assert re.search(r"python\S* -P -u -m submitit", launcher._executor._submitit_command_str)
+
+
+def test_python_is_started_in_one_way():
+  starts = [path for path in PACKAGE.rglob("*.py") if "sys.executable" in path.read_text()]
+  assert starts == [PACKAGE / "interpreter.py"]
+
+
+@pytest.mark.parametrize("name", ["../../outside", "/tmp/outside", "..", ".", "", "a/b", "a\nb", 3])
+def test_a_jobs_name_is_no_path(tmp_path: Path, name: object) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  with pytest.raises(CheckpointError, match=r"sweep\.yaml is damaged: .*name"):
+    change(sweep, jobs=[{"name": name, "overrides": [], "varies": {}}])
+
+
+@pytest.mark.parametrize(
+  "override",
+  [
+    *(
+      "trust=evil",
+      "hardware.cache_dir=/evil",
+      "++hardware.cache_dir=/evil",
+      "hardware.distributed.coordinator=evil:1",
+    ),
+    *("hardware.distributed={coordinator: evil}", "hydra.callbacks.x._target_=os.abort", "hydra.searchpath=[/evil]"),
+    *("+hydra/launcher=evil", "run_dir=/elsewhere", "resume=/elsewhere", "launcher=slurm", "--config-dir=/evil", "-m"),
+  ],
+)
+def test_a_job_says_nothing_that_only_a_command_line_can(tmp_path: Path, override: str) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  sweep = change(sweep, jobs=[{"name": "0", "overrides": ["seed=0", override], "varies": {"seed": 0}}])
+  with pytest.raises(ConfigError, match=r"which only a command line can|cannot be given with -m|is not an override"):
+    run(sweep)
+  assert statuses(sweep) == {0: "queued"}
+
+
+@pytest.mark.parametrize(
+  "setting",
+  [
+    *(
+      "launcher.setup=['touch ran']",
+      "launcher.parameters={wrap: x}",
+      "launcher.partition='a\nb'",
+      "search.sampler=cmaes",
+    ),
+    *("launcher.constraint='$(x)'", "launcher.address='ray://evil:1'"),
+  ],
+)
+def test_a_setting_that_may_do_harm_is_given_again(tmp_path: Path, setting: str) -> None:
+  key = setting.partition("=")[0]
+  option = {"search.sampler": "search=optuna", "launcher.address": "launcher=ray"}.get(key, "launcher=slurm")
+  sweep = change(make_sweep(tmp_path / "sweep", 0), settings=[option, "on_error=stop", setting])
+  with pytest.raises(ConfigError, match=r"(?s)sweep\.yaml says .*: give it again on this command line if you trust it"):
+    settings_of(sweep)
+  assert settings_of(sweep, [setting]).on_error == "stop"
+
+
+def test_plain_settings_hold(tmp_path: Path) -> None:
+  plain = ["launcher=slurm", "launcher.partition=gpu-8", "launcher.minutes=60", "launcher.wait=false"]
+  launcher = settings_of(change(make_sweep(tmp_path / "sweep", 0), settings=plain)).launcher
+  assert (launcher.partition, launcher.minutes, launcher.wait) == ("gpu-8", 60, False)
+
+
+@pytest.mark.parametrize("content", [None, [], "text", {"jobs": 3}, {"jobs": []}])
+def test_a_damaged_sweep_is_one_sentence(tmp_path: Path, content: object) -> None:
+  (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(content))
+  with pytest.raises(CheckpointError, match=r"sweep\.yaml is damaged"):
+    SweepDirectory.open(tmp_path)
