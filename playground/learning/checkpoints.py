@@ -106,6 +106,7 @@ class CheckpointStore:
     """
     self._folder, self._keep = Path(folder).absolute(), keep
     self._folder.mkdir(parents=True, exist_ok=True)  # Orbax does not where it is told to work alone
+    self._handle = os.open(self._folder, os.O_RDONLY)  # the folder itself, whatever takes its name
     there = _by_step(self._folder)
     damaged = {step for step in there if continued is not None and step > continued}
     returns = {step: _return_of(path) for step, path in there.items() if step not in damaged}
@@ -159,6 +160,7 @@ class CheckpointStore:
     self._thread.shutdown()
     self._manager.close()
     self._alias.remove()
+    os.close(self._handle)
 
   def _write(self, step: int, policy: Any, state: Any, meta: dict[str, Any], replay: Fetch | None) -> None:
     trees = {"policy": policy, "state": state}
@@ -196,10 +198,20 @@ class CheckpointStore:
         shutil.rmtree(path / "replay")
 
   def _save(self, step: int, items: Any) -> None:
-    if not self._folder.is_dir():  # Orbax would make it again, with nothing else in it
-      raise FileNotFoundError("it was removed")
+    self._must_be_there()
     with _quiet_threads():
       self._manager.save(step, args=items, force=True)
+    self._must_be_there()
+
+  def _must_be_there(self) -> None:
+    """Raises FileNotFoundError if the folder was removed; Orbax makes it again, with nothing else in it."""
+    with contextlib.suppress(OSError):
+      if os.path.samestat(os.fstat(self._handle), os.stat(self._folder)):
+        return
+    shutil.rmtree(self._folder, ignore_errors=True)
+    with contextlib.suppress(OSError):
+      self._folder.parent.rmdir()
+    raise FileNotFoundError("it was removed")
 
   def _link_best(self) -> None:
     """Lets `best` point to the best checkpoint, in one go; without one, or without links, there is no `best`."""
