@@ -109,7 +109,7 @@ def _value(config: RunConfig, key: str) -> Any:
     return config.choices[key]
   node: Any = config.resolved
   for part in {"terrain": "env.scene.terrain", "visuals": "video.visuals"}.get(key, key).split("."):
-    node = node[int(part)] if isinstance(node, list) else node[part] if isinstance(node, Mapping) else None
+    node = node[int(part)] if isinstance(node, list) else node.get(part) if isinstance(node, Mapping) else None
   return configs.format_value(node) if isinstance(node, list | Mapping) else node
 
 
