@@ -9,8 +9,8 @@ from typing import Any
 from ml_collections import ConfigDict
 
 from playground import registry
-from playground.benchmark.suites import tasks_of
 from playground.envs.base import Env
+from playground.paper import tasks_of
 
 
 class Suite:

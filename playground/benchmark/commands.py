@@ -10,9 +10,9 @@ from playground.benchmark.jobs import Job, Plan, probe, run_jobs
 from playground.benchmark.options import TRAINING, Measuring, OfRuns, OfTasks
 from playground.benchmark.peer import PEERS, check_peer
 from playground.benchmark.schema import Table
-from playground.benchmark.suites import tasks_of
 from playground.config import compose
 from playground.errors import ConfigError
+from playground.paper import tasks_of
 from playground.runs.files import need_folder
 
 RESULTS = Path("results/benchmarks")

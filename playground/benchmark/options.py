@@ -7,11 +7,13 @@ from typing import Any
 
 from playground.benchmark.arguments import check_amounts, option
 from playground.benchmark.jobs import Job
-from playground.benchmark.suites import check_agent, choose_tasks
 from playground.config import RunConfig, compose
-from playground.errors import ConfigError
+from playground.config.files import task_names
+from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.paper import SUITES, tasks_of
 
 TRAINING = "training_steps_per_s"
+AGENTS = ("ppo", "ppo_paper", "sac")
 QUANTITY = {  # the last row of a measurement
   "training": TRAINING,
   "environment": "env_steps_per_s",
@@ -65,7 +67,9 @@ class OfTasks(Measuring):
 
   def check(self) -> None:
     super().check()
-    check_agent(self.agent)
+    if self.agent not in AGENTS:
+      known = ", ".join(AGENTS)
+      raise UnknownNameError(f"agent={self.agent} does not exist: choose from {known}.{nearest(self.agent, AGENTS)}")
     if self.sets_devices and any(text.lstrip("+").startswith("hardware.devices=") for text in self.overrides):
       raise ConfigError(
         f"hardware.devices= is no override of {self.name}: only topology, with devices=, measures on several."
@@ -74,7 +78,14 @@ class OfTasks(Measuring):
       self.configured(task)
 
   def chosen(self) -> list[str]:
-    return choose_tasks(self.suite, self.tasks)
+    """The tasks of `suite` and `tasks`, each once; a suite's tasks that this package does not have are left out."""
+    if not self.suite and not self.tasks:
+      raise ConfigError(f"Name what to measure: tasks=CartpoleBalance,CheetahRun or suite={'|'.join(SUITES)}|all.")
+    known = task_names()
+    for name in self.tasks:
+      if name not in known:
+        raise UnknownNameError(f"Task {name!r} does not exist; `playground list` shows all.{nearest(name, known)}")
+    return list(dict.fromkeys([*self.tasks, *(n for n in tasks_of(self.suite or "all") if self.suite and n in known)]))
 
   def configured(self, task: str, *more: str) -> RunConfig:
     """A task's run; raises ConfigError for overrides that cannot be."""

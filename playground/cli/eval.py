@@ -6,9 +6,9 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from playground.benchmark.suites import paper_table
 from playground.errors import ConfigError
 from playground.learning.evaluation import make_evaluator
+from playground.paper import paper_table
 from playground.rendering.video import need_camera, need_place, render_video
 from playground.rendering.visuals import drawn_model
 from playground.runs.files import need_folder, write_json

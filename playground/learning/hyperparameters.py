@@ -6,7 +6,7 @@ Each number has its limit beside it, which composing checks (`playground.config.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.extras import need
@@ -98,6 +98,7 @@ class PPOConfig:
     0  # largest random shift of a trajectory's images in an update, pixels
   )
   network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
+  prefill_updates: ClassVar[int] = 0  # training steps that only collect
 
   @classmethod
   def from_config(cls, config: Any) -> "PPOConfig":
@@ -150,6 +151,10 @@ class SACConfig:
   def prefill_updates(self) -> int:
     """Training steps that only collect."""
     return math.ceil(self.min_replay_size / self.num_envs)
+
+  def steps_per_update(self, action_repeat: int) -> int:
+    """Control steps of one training step, over all devices."""
+    return self.num_envs * action_repeat
 
   def check(self, num_devices: int) -> None:
     """Raises ConfigError where the sizes do not go together."""

@@ -11,8 +11,8 @@ from playground.benchmark.report import Options, figures, page, run, sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.page import Block, Heading, Picture, Table, Text, to_html, to_markdown
 from playground.benchmark.schema import Table as Rows
-from playground.benchmark.suites import SUITES, paper_table
 from playground.errors import ConfigError
+from playground.paper import SUITES, paper_table
 
 REFERENCE = Path(__file__).parents[2] / "results/reference"
 ROW = {

@@ -12,11 +12,11 @@ import pytest
 import yaml
 
 from playground import registry
-from playground.benchmark.suites import paper_table
 from playground.cli import eval as eval_command
 from playground.cli.main import main
 from playground.config import compose
 from playground.learning.checkpoints import find_checkpoints
+from playground.paper import paper_table
 from playground.runs.train import train
 from tests.command import Command, caller
 from tests.dummy import Point

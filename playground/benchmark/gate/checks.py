@@ -53,8 +53,7 @@ def training_step(agent: str, overrides: tuple[str, ...], layers: tuple[int, int
   config = compose(["env=CartpoleBalance", f"agent={agent}", "env.impl=jax", *overrides])
   learner: Any = make_learner(registry.load("CartpoleBalance", config=config.env), config.agent, make_mesh(1), None)
   state = learner.init(jax.random.PRNGKey(0), {})
-  if agent == "sac":
-    state, _ = learner.train(state, {}, np.int32(learner.config.prefill_updates))
+  state, _ = learner.train(state, {}, np.int32(learner.config.prefill_updates))
 
   def ours() -> Any:
     nonlocal state

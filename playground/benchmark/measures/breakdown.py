@@ -13,9 +13,7 @@ from playground.benchmark.worker import Facts
 from playground.envs.base import PIXELS
 from playground.envs.physics import WORLDS
 from playground.envs.wrappers import Vectorize, wrap_for_training
-from playground.learning.ppo import PPO
 from playground.learning.rollout import unroll
-from playground.learning.sac import SACConfig
 
 PARTS = {  # in the order they are added
   "physics": "MJX alone under a constant ctrl",
@@ -96,8 +94,7 @@ def _train(subject: Subject, state: Any) -> Callable[[int], Any]:
     state, metrics = learner.train(state, subject.model, num_updates(count))
     return metrics
 
-  if isinstance(learner.config, SACConfig):
-    call(learner.config.prefill_updates)
+  call(1 + learner.config.prefill_updates)
   return call
 
 
@@ -142,7 +139,7 @@ def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, An
     **seeing,
     "inference": (scan(act), (state.env_state, policy), repeat),
   }
-  if isinstance(learner, PPO):
+  if hasattr(learner.config, "unroll_length"):  # the algorithm learns from whole rollouts
 
     def store(carry: Any, model: Any, key: jax.Array) -> tuple[Any, Any]:
       before, capture, policy = carry

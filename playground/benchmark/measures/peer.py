@@ -8,9 +8,9 @@ from typing import Any
 
 from playground.benchmark.measures.machine import used_memory
 from playground.benchmark.peer import PEERS
-from playground.benchmark.suites import SUITES, paper_table
 from playground.benchmark.worker import Facts
 from playground.errors import PlaygroundError
+from playground.paper import SUITES, paper_table
 
 EPOCHS = 4  # the first compiles, the second may compile again
 

@@ -13,7 +13,6 @@ from playground.config import RunConfig, compose
 from playground.errors import PlaygroundError
 from playground.interpreter import PYTHON
 from playground.learning.algorithms import algorithm
-from playground.learning.sac import SACConfig
 from playground.runs.run_dir import RunDirectory
 
 # Of the environment: they would take the place of the run's own.
@@ -64,6 +63,4 @@ def _one_update(config: RunConfig) -> int:
   """The budget (control steps) with which something is learned once."""
   settings = algorithm(config.agent.name).Config.from_config(config.agent)
   repeat = config.env.action_repeat
-  if isinstance(settings, SACConfig):
-    return (settings.prefill_updates + 1) * settings.num_envs * repeat
-  return settings.steps_per_update(repeat)
+  return (1 + settings.prefill_updates) * settings.steps_per_update(repeat)

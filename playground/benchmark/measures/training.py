@@ -9,7 +9,6 @@ from playground.benchmark.measures.machine import used_memory
 from playground.benchmark.measures.subject import Subject, alone, emit_peak, num_updates, rate
 from playground.benchmark.worker import Facts
 from playground.learning.loop import compile_program
-from playground.learning.sac import SACConfig
 from playground.runs.provenance import process_age_s
 
 
@@ -45,7 +44,7 @@ def measure(
     program = compile_program(learner, no_evaluation, partial(subject.draw, seeds[0]))
     facts.emit("trace_s", program.trace_s, "s", seed=seeds[0])
     facts.emit("compile_s", program.compile_s, "s", seed=seeds[0])
-    warm_up = 1 + (learner.config.prefill_updates if isinstance(learner.config, SACConfig) else 0)
+    warm_up = 1 + learner.config.prefill_updates
     for seed in seeds:
       model = program.model if seed == seeds[0] else subject.draw(seed)[0]
       with alone(lock):

@@ -6,7 +6,7 @@ from playground.benchmark.commands import COMPARED_CONDITIONS
 from playground.benchmark.report.evidence import Evidence, Figure
 from playground.benchmark.report.page import Block, Heading, Table, Text
 from playground.benchmark.report.sections import Notes, nothing
-from playground.benchmark.suites import paper_table
+from playground.paper import paper_table
 
 SEEN = {"episodes": "state", "pixels": "+ pictures", "inference": "+ inference", "update": "+ training"}
 PARTS = ("physics", "rendering", "inference", "policy update")  # what each of them adds, as the paper calls it

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from playground.benchmark.report import figures
 from playground.benchmark.report.evidence import Evidence, Figure
 from playground.benchmark.report.page import NOT_MEASURED, Block, Heading, Picture, Table, Text
-from playground.benchmark.suites import SUITES, paper_table
 from playground.config import compose
+from playground.paper import SUITES, paper_table
 
 TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipulation": "Manipulation"}
 SPEED = "training_steps_per_s"
