@@ -37,7 +37,7 @@ test-slow: setup
 test-rsl-rl: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[rsl-rl]'
 	@$(BIN)/python -c 'import rsl_rl, torch'
-	$(CACHES) $(BIN)/python -m pytest -q -m '' -k rsl_rl tests/adapters tests/learning tests/runs $(ARGS)
+	$(CACHES) $(BIN)/python -m pytest -q -m '' tests/adapters/test_rsl_rl.py $(ARGS)
 
 # A Slurm of one node on this machine, started and ended by the tests; without its programs they are skipped. On Debian
 # and Ubuntu: apt-get install slurmctld slurmd slurm-client munge, which `make test-slurm SUDO=sudo` (or SUDO=env) does.

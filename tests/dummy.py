@@ -1,13 +1,11 @@
 """A task without physics, so that trainers compile in seconds: move a point to the origin."""
 
-import importlib.util
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from playground.envs.base import Env, State
 from playground.envs.physics import STATE_FIELDS, PhysicsData, mjx
@@ -18,7 +16,6 @@ from playground.learning.loop import Metrics
 from playground.learning.networks import NetworkConfig, SoftNetworkConfig
 from playground.learning.ppo import PPO, PPOConfig
 from playground.learning.rollout import Step
-from playground.learning.rsl_rl import RslRlNetworkConfig, RslRlPPO, RslRlPPOConfig
 from playground.learning.sac import SAC, SACConfig
 
 
@@ -109,16 +106,8 @@ SMALL_SAC = SACConfig(
   network=SoftNetworkConfig((16, 16), q_network_layer_norm=True, value_obs_key="privileged_state"),
 )  # fmt: skip
 
-SMALL_RSL_RL = RslRlPPOConfig(
-  num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, unroll_length=10, num_minibatches=2,
-  num_updates_per_batch=4, learning_rate=3e-3, schedule="adaptive", discounting=0.95,
-  network=RslRlNetworkConfig((16, 16), (16, 16), init_noise_std=0.5),
-)  # fmt: skip
-Config = PPOConfig | SACConfig | RslRlPPOConfig
-ALGORITHMS: dict[type[Any], type[Any]] = {PPOConfig: PPO, SACConfig: SAC, RslRlPPOConfig: RslRlPPO}
-needs_rsl_rl = pytest.mark.skipif(
-  importlib.util.find_spec("rsl_rl") is None, reason="needs the extra rsl-rl: `make test-rsl-rl`"
-)
+Config = PPOConfig | SACConfig
+ALGORITHMS: dict[type[Any], type[Any]] = {PPOConfig: PPO, SACConfig: SAC}
 
 
 def point_learner(config: Config, num_devices: int = 1, **events: Any) -> Learner:

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from playground import config
 from playground.config import compose, from_saved
 from playground.errors import ConfigError, UnknownNameError
+from playground.learning.hyperparameters import config_class
 
 TUNED = ["experiment=cartpole_balance"]
 
@@ -128,16 +129,20 @@ def test_several_debug_presets():
 # What a RunConfig is
 
 
-@pytest.mark.parametrize("name", ["ppo", "sac", "rsl_rl_ppo"])
+@pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_agent_is_what_its_algorithm_reads(name: str):
-  from playground.learning.algorithms import ALGORITHMS
-
-  assert list(ALGORITHMS) == ["ppo", "sac", "rsl_rl_ppo"]
   agent = compose([f"agent={name}", "agent.num_envs=256"]).agent
-  read = ALGORITHMS[name].Config.from_config(agent)
+  read = config_class(name).from_config(agent)
   assert set(agent) - {"name"} == {field.name for field in dataclasses.fields(read)}
   assert set(agent.network) == {field.name for field in dataclasses.fields(read.network)}
   assert read.num_envs == 256
+
+
+def test_an_agent_of_an_earlier_version_is_refused(tmp_path: Path):
+  saved = compose(["env=CartpoleBalance"]).resolved
+  saved["agent"]["name"] = "rsl_rl_ppo"
+  with pytest.raises(UnknownNameError, match=r"agent.name=rsl_rl_ppo does not exist: .*RSL-RL trains through its own"):
+    from_saved(saved)
 
 
 def test_paper_values_of_go1():

@@ -107,34 +107,6 @@ def test_a_variant_without_a_set_of_its_own_takes_its_agents(agent: str):
 
 
 @pytest.mark.parametrize(
-  ("task", "differing"),
-  [
-    ("Go1JoystickFlatTerrain", {}),
-    ("BerkeleyHumanoidJoystickFlatTerrain", {}),
-    (
-      "PandaPickCube",
-      {
-        **{"unroll_length": 40, "num_minibatches": 8, "num_updates_per_batch": 4, "learning_rate": 1e-3},
-        **{"schedule": "adaptive", "discounting": 0.97, "entropy_cost": 1e-2},
-      },
-    ),
-  ],
-)
-def test_rsl_rl_has_the_settings_of_playground_020(task: str, differing: dict[str, Any]):
-  locomotion = {
-    **{"num_envs": 4096, "unroll_length": 24, "num_minibatches": 4, "num_updates_per_batch": 5},
-    **{"num_timesteps": 1000 * 4096 * 24, "learning_rate": 3e-4, "schedule": "fixed", "desired_kl": 0.01},
-    **{"max_grad_norm": 1.0, "discounting": 0.99, "gae_lambda": 0.95, "entropy_cost": 1e-3},
-    **{"vf_loss_coefficient": 1.0, "clipping_epsilon": 0.2, "clip_value_loss": True, "normalize_observations": True},
-  }
-  agent = compose([f"env={task}", "agent=rsl_rl_ppo"]).resolved["agent"]
-  assert {key: agent[key] for key in locomotion} == locomotion | differing
-  sizes = {name: agent["network"][f"{name}_hidden_layer_sizes"] for name in ("policy", "value")}
-  assert sizes == {"policy": [512, 256, 128], "value": [512, 256, 128]}
-  assert (agent["network"]["activation"], agent["network"]["init_noise_std"]) == ("elu", 1.0)
-
-
-@pytest.mark.parametrize(
   ("task", "chosen"),
   [
     ("HopperHop", ("ppo/HopperHop", "ppo_paper/HopperHop", "ppo_paper/HopperHop", "sac/HopperHop")),

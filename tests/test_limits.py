@@ -12,7 +12,7 @@ from playground.config import compose, compose_settings, config_roots, override_
 from playground.config.limits import _OF_TERMS as OF_TERMS
 from playground.config.limits import limit_of, text_depth
 from playground.errors import ConfigError
-from playground.learning.hyperparameters import CONFIGS
+from playground.learning.hyperparameters import agent_names
 from playground.limits import MOST, SEED, Limit, count, positive, span
 from playground.mdp.terms import MODULES, registered
 
@@ -52,7 +52,7 @@ def test_every_number_has_limits() -> None:
   missing = [
     f"{file}: {key}={value}"
     for file, key, value in defined()
-    if takes_a_number(value) and text_depth(key) is None and not any(limit_of(key, agent) for agent in CONFIGS)
+    if takes_a_number(value) and text_depth(key) is None and not any(limit_of(key, agent) for agent in agent_names())
   ]
   assert not missing, "give these a limit, where they are defined or in playground/config/limits.py, or say text"
 

@@ -11,13 +11,12 @@ from typing import Any, get_type_hints
 from playground.config.schema import wrong_type
 from playground.config.text import format_value, join
 from playground.errors import ConfigError, nearest
-from playground.learning.hyperparameters import CONFIGS
+from playground.learning.hyperparameters import config_class
 from playground.limits import MOST, SEED, SHARE, Limit, at_least_0, count, positive, span
 from playground.mdp.options import OPTIONS
 
 _PRECISIONS = ("default", "high", "highest", "bfloat16", "tensorfloat32", "float32")
 _CHOICES = {
-  "agent.schedule": ("fixed", "adaptive"),
   "env.impl": ("auto", "jax", "warp"),
   "env.vision.image": ("rgb", "gray", "depth", "segmentation"),
   "hardware.platform": ("auto", "cpu", "gpu"),
@@ -32,7 +31,7 @@ _XLA_SWITCH = re.compile(r"--xla_\w+(=(true|false|-?\d+(\.\d+)?))?")
 _XLA_PLACES = ("dir", "path", "file", "dump", "load", "cache", "option", "override", "_to", "_from")  # in flags' names
 # Text (or null, as everywhere), lists of texts, and lists of such lists.
 _TEXTS = {
-  0: "run_dir resume init_from sweep_dir curriculum.start_at video.camera agent.network.value_obs_key "
+  0: "run_dir resume init_from sweep_dir curriculum.start_at video.camera "
   "hardware.cache_dir hardware.kind hardware.distributed.coordinator "
   "tracking.wandb.entity tracking.wandb.group tracking.wandb.name "
   "launcher.address launcher.partition launcher.account launcher.qos launcher.constraint "
@@ -105,7 +104,7 @@ def limit_of(key: str, agent: str | None = None) -> Limit | None:
   """The limit of a dotted key's numbers, None if there is none; `agent` is the algorithm's name."""
   section, _, name = key.partition(".")
   if section == "agent":
-    return _of_agent(CONFIGS[agent], name) if agent in CONFIGS else None
+    return _of_agent(config_class(agent), name) if agent else None
   table, name = (_ENV, name) if section == "env" else (_RUN, key)
   return next((limit for patterns, limit in table.items() if _matches(name, patterns)), None)
 

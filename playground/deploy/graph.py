@@ -32,7 +32,6 @@ def policy_graph(
   inputs: Mapping[str, tuple[int, ...]],
   activation: str,
   normalization: tuple[np.ndarray, np.ndarray] | None,
-  squashed: bool = True,
   cnn: CNNConfig | None = None,
 ) -> onnx.ModelProto:
   """Builds the graph of a deterministic policy.
@@ -44,7 +43,6 @@ def policy_graph(
     inputs: shapes of the observation's entries that it reads, in its order: pictures, then the vector.
     activation: of the hidden layers, as in `agent.network.activation`.
     normalization: mean and deviation of the vector, [n] each; None if the actor sees it as it is.
-    squashed: whether the output is mean and deviation of actions before tanh; else it is their mean, to be clipped.
     cnn: what is done with pictures, if there are any.
 
   Returns:
@@ -77,7 +75,7 @@ def policy_graph(
   for i, name in enumerate(layers):
     kernel, bias = np.asarray(params[name]["kernel"]), np.asarray(params[name]["bias"])
     last = i == len(layers) - 1
-    if last and squashed:  # mean and deviation of the actions before they are squashed: the mean is the mode
+    if last:  # mean and deviation of the actions before they are squashed: the mean is the mode
       kernel, bias = kernel[:, : len(bias) // 2], bias[: len(bias) // 2]
     graph.apply("Gemm", graph.constant(kernel), graph.constant(bias))
     if not last:
@@ -86,10 +84,7 @@ def policy_graph(
         norm = params[f"LayerNorm_{i}"]
         scale_and_bias = graph.constant(norm["scale"]), graph.constant(norm["bias"])
         graph.apply("LayerNormalization", *scale_and_bias, epsilon=_LAYER_NORM_EPSILON)
-  if squashed:
-    graph.apply("Tanh")
-  else:
-    graph.apply("Clip", graph.constant(-1.0), graph.constant(1.0))
+  graph.apply("Tanh")
   graph.nodes[-1].output[0] = OUTPUT
   kinds = {entry: TensorProto.UINT8 if entry in pictures else TensorProto.FLOAT for entry in inputs}
   sources = [helper.make_tensor_value_info(names[entry], kinds[entry], [1, *inputs[entry]]) for entry in inputs]

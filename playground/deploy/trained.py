@@ -61,7 +61,7 @@ def export_policy(trained: Trained, state: State | None = None) -> ExportedPolic
   policy, agent, networks = jax.device_get(trained.policy), trained.config.agent, trained.learner.networks
   params, seen = networks.mlp(policy.params.policy, policy.normalizer if agent.normalize_observations else None)
   inputs = networks.policy_inputs
-  model = policy_graph(params, inputs, agent.network.activation, seen, networks.squashed, networks.cnn)
+  model = policy_graph(params, inputs, agent.network.activation, seen, networks.cnn)
   content = model.SerializeToString()
   origin = {
     "run": trained.run_dir.path.absolute().name,

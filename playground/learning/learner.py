@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -54,7 +54,6 @@ class Learner(abc.ABC):
   """An algorithm for one task, as the loop wants it: functions jitted over a mesh of devices.
 
   Attributes:
-    Config: the algorithm's hyperparameters, a dataclass with `from_config` and `check`.
     steps_per_update: control steps of one training step, over all devices.
     init: (key, model fields) -> state.
     train: (state, model fields, number of training steps) -> (state, metrics); takes the state's buffers over.
@@ -62,8 +61,6 @@ class Learner(abc.ABC):
       takes the state's buffers over.
     copy: (state) -> state in buffers of its own.
   """
-
-  Config: ClassVar[Any]
 
   def __init__(self, env: Env, config: Any, mesh: Mesh, networks: Actor, steps_per_update: int, spec: Any):
     """Takes the task and its networks.

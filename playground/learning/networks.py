@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,11 +30,8 @@ class Actor:
   among them (`pixels/...`, [..., H, W, C] uint8) are read by actor and critic alike, by CNNs of their own.
 
   Attributes:
-    squashed: whether actions are squashed into [-1, 1] by tanh; else they are clipped.
     cnn: the layers that pictures go through; None without pictures.
   """
-
-  squashed: ClassVar[bool] = True
 
   def __init__(
     self,

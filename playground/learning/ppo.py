@@ -30,8 +30,6 @@ from playground.learning.rollout import NonfiniteCapture, repeat_unroll, unroll
 class PPO(Learner):
   """The algorithm for one task."""
 
-  Config = PPOConfig
-
   def __init__(self, env: Env, config: PPOConfig, mesh: Mesh, network_precision: str | None = None):
     """Args:
       env: the task.
@@ -48,7 +46,7 @@ class PPO(Learner):
       raise ConfigError(
         f"agent.augment_pixels={config.augment_pixels} shifts pictures, and the task has none: set it to 0."
       )
-    super().__init__(env, config, mesh, networks, config.steps_per_update(env.action_repeat), TrainState(**SPEC))
+    super().__init__(env, config, mesh, networks, config.steps_per_update * env.action_repeat, TrainState(**SPEC))
     clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm else optax.identity()
     self.optimizer = optax.chain(clip, optax.adam(config.learning_rate))
     self.loss = partial(

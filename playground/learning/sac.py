@@ -40,8 +40,6 @@ class SACState(TrainState):
 class SAC(Learner):
   """The algorithm for one task."""
 
-  Config = SACConfig
-
   def __init__(self, env: Env, config: SACConfig, mesh: Mesh, network_precision: str | None = None):
     """Args:
       env: the task.
@@ -55,7 +53,7 @@ class SAC(Learner):
     config.check(mesh.size)
     networks = SoftActorCritic(env.observation_size, env.action_size, config.network, network_precision)
     spec = SACState(**SPEC, target_q=SPEC["params"], replay=REPLAY_SPEC)
-    super().__init__(env, config, mesh, networks, config.steps_per_update(env.action_repeat), spec)
+    super().__init__(env, config, mesh, networks, config.steps_per_update * env.action_repeat, spec)
     if config.prefill_updates * self.steps_per_update >= config.num_timesteps:
       raise ConfigError(
         f"agent.num_timesteps={config.num_timesteps} is over before agent.min_replay_size={config.min_replay_size} "

@@ -17,6 +17,7 @@ from playground.hardware.setup import Hardware, setup
 from playground.learning.algorithms import algorithm
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
+from playground.learning.hyperparameters import config_class
 from playground.learning.learner import Learner
 from playground.learning.loop import Loop, Mark, compile_program, longest_stretch, schedule
 from playground.randomization import Randomizer
@@ -74,14 +75,13 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
 def _train_locked(config: "RunConfig", interrupts: Interrupts, began_s: float, start: Start, hardware: Hardware) -> int:
   """One run, new or to resume, that no other process writes."""
   preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
-  algorithm_class = algorithm(config.agent.name)
-  agent = algorithm_class.Config.from_config(config.agent)
+  agent = config_class(config.agent.name).from_config(config.agent)
   agent.check(hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
   need_camera(drawn, config.video.camera, "video.camera")
   draw = partial(model_sampler(env, config, agent.num_envs, agent.num_eval_envs), config.seed)
-  learner = algorithm_class(env, agent, hardware.mesh, hardware.network_precision)
+  learner = algorithm(config.agent.name)(env, agent, hardware.mesh, hardware.network_precision)
   start.notices += learner.notices()
   if hardware.mesh.size > 1:
     start.notices.append(describe_division(config.agent, hardware.mesh.size))

@@ -3,6 +3,10 @@
 # torch is in an extra, which the type checker may not find
 # pyright: reportMissingImports=false
 
+import re
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +16,6 @@ import pytest
 from playground.envs.base import State
 from playground.envs.c_physics import on_c_physics
 from playground.errors import ConfigError
-from playground.learning.rsl_rl import RslRlPPOConfig
 from playground.registry import load
 from tests.dummy import Point
 
@@ -105,6 +108,17 @@ def test_rsl_rls_own_runner_trains(env: VecEnv, capsys: pytest.CaptureFixture[st
   assert all((a != b).any() for a, b in zip(before, runner.alg.actor.parameters(), strict=True))
 
 
+def test_the_script_of_the_page_trains(tmp_path: Path) -> None:
+  page = (Path(__file__).parents[2] / "docs/rsl-rl.md").read_text(encoding="utf-8")
+  (script,) = re.findall(r"^```python\n(.*?)^```$", page, re.S | re.M)
+  small = '"CartpoleBalance", 4, 2'
+  assert script.count('"Go1JoystickFlatTerrain", 4096, 1000') == 1
+  (tmp_path / "train_rsl_rl.py").write_text(script.replace('"Go1JoystickFlatTerrain", 4096, 1000', small))
+  done = subprocess.run([sys.executable, "train_rsl_rl.py"], cwd=tmp_path, capture_output=True, text=True)
+  assert done.returncode == 0, done.stdout + done.stderr
+  assert list((tmp_path / "logs").glob("*.pt"))
+
+
 def test_groups_of_go1() -> None:
   obs = vec_env(on_c_physics(load("Go1JoystickFlatTerrain")), 2).get_observations()
   assert {name: tuple(group.shape) for name, group in obs.items()} == {"policy": (2, 48), "critic": (2, 123)}
@@ -130,9 +144,3 @@ def test_pictures_are_refused() -> None:
 
   with pytest.raises(ConfigError, match="RSL-RL gets no pictures from here"):
     group_entries(Camera())
-
-
-def test_several_devices_are_refused() -> None:
-  with pytest.raises(ConfigError, match=r"trains on one device and not on 2: give hardware.devices=1"):
-    RslRlPPOConfig(num_timesteps=1).check(2)
-  RslRlPPOConfig(num_timesteps=1).check(1)

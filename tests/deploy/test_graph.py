@@ -85,7 +85,7 @@ def test_same_actions_from_pictures_and_a_vector(cnn: CNNConfig) -> None:
   obs["pixels/eye"][0] = 7 + obs["pixels/eye"][0] // 128  # next to no contrast
   obs |= {"state": rng.normal(scale=3, size=(5, 3, OBS)).astype(np.float32)}
   layers, normalization = nets.mlp(policy, normalizer)
-  model = policy_graph(layers, nets.policy_inputs, "elu", normalization, nets.squashed, nets.cnn)
+  model = policy_graph(layers, nets.policy_inputs, "elu", normalization, nets.cnn)
   assert ends(model) == {
     "pixels_eye": [1, 17, 12, 3], "pixels_left_hand": [1, 8, 9, 1], "obs": [1, OBS], "continuous_actions": [1, ACTIONS],
   }  # fmt: skip
@@ -105,7 +105,7 @@ def test_pictures_alone_are_obs() -> None:
   keys = {"policy_obs_key": "", "value_obs_key": "", "estimated_obs_key": "state"}  # of which the policy needs none
   nets = ActorCritic(sizes, ACTIONS, NetworkConfig((8,), (4,), **keys, cnn=CNNS[0]))
   layers, normalization = nets.mlp(trained(nets)[0], nets.init_normalizer())
-  model = policy_graph(layers, nets.policy_inputs, "swish", normalization, nets.squashed, nets.cnn)
+  model = policy_graph(layers, nets.policy_inputs, "swish", normalization, nets.cnn)
   assert ends(model) == {"obs": [1, 9, 8, 3], "continuous_actions": [1, ACTIONS]}
   assert model.graph.input[0].type.tensor_type.elem_type == onnx.TensorProto.UINT8
   obs = {"state": jnp.zeros((2, OBS)), "pixels/eye": jnp.ones((2, 9, 8, 3), jnp.uint8)}

@@ -1,5 +1,7 @@
 """Training as a whole, with every algorithm, on a task that compiles in seconds."""
 
+import subprocess
+import sys
 from functools import cache
 from typing import Any
 
@@ -17,19 +19,15 @@ from playground.learning.loop import Loop, Program, compile_program, schedule
 from tests.dummy import (
   ALGORITHMS,
   SMALL_PPO,
-  SMALL_RSL_RL,
   SMALL_SAC,
   Config,
   PointTask,
   Recorder,
-  needs_rsl_rl,
   numbers,
   point_learner,
 )
 
-RSL_RL = pytest.param(SMALL_RSL_RL, id="rsl_rl_ppo", marks=needs_rsl_rl)
-JITTED = [pytest.param(SMALL_PPO, id="ppo"), pytest.param(SMALL_SAC, id="sac")]
-every_algorithm = pytest.mark.parametrize("config", [*JITTED, RSL_RL])
+every_algorithm = pytest.mark.parametrize("config", [SMALL_PPO, SMALL_SAC], ids=["ppo", "sac"])
 
 
 @cache
@@ -57,9 +55,8 @@ def run(
   [
     (SMALL_PPO, 150, ("training/total_loss", "training/approx_kl", "training/grad_norm")),
     (SMALL_SAC, 1500, ("training/critic_loss", "training/entropy", "training/grad_norm")),
-    pytest.param(SMALL_RSL_RL, 30, ("training/value_loss", "training/learning_rate"), marks=needs_rsl_rl),
   ],
-  ids=["ppo", "sac", "rsl_rl_ppo"],
+  ids=["ppo", "sac"],
 )
 def test_it_learns_and_reports(config: Config, updates: int, names: tuple[str, ...]) -> None:
   hooks = Recorder()
@@ -92,7 +89,7 @@ def test_an_interrupted_run_goes_on_bit_for_bit(config: Config) -> None:
   np.testing.assert_equal([*kept, *second.rows], whole.rows)
 
 
-@pytest.mark.parametrize("config", JITTED)
+@every_algorithm
 def test_a_training_call_of_any_length_is_one_program(config: Config) -> None:
   learner, _ = built(config)
   model: dict[str, Any] = {}
@@ -158,3 +155,8 @@ def test_a_mean_over_nothing_is_left_out(config: Config) -> None:
   assert row["training/episodes"] == 0
   assert not [name for name in row if name.startswith("training/episode_")]
   assert not any(np.isnan(value) for value in row.values())
+
+
+def test_no_torch_is_imported() -> None:
+  code = "import sys, playground.runs.train, playground.cli.main; assert not {'torch', 'rsl_rl'} & set(sys.modules)"
+  subprocess.run([sys.executable, "-c", code], check=True)

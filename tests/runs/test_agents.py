@@ -19,7 +19,7 @@ from playground.learning.loop import Loop
 from playground.runs.job import Job
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
-from tests.dummy import Point, needs_rsl_rl
+from tests.dummy import Point
 
 FAST = ["env=CartpoleBalance", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv"]
 STEPS = 1600
@@ -33,7 +33,7 @@ def point() -> Iterator[None]:
     yield
 
 
-@pytest.fixture(scope="module", params=["ppo", "sac", pytest.param("rsl_rl_ppo", marks=needs_rsl_rl)])
+@pytest.fixture(scope="module", params=["ppo", "sac"])
 def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
   """A run that nothing happens to."""
   run = tmp_path_factory.mktemp(request.param) / "run"

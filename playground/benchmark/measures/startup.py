@@ -12,7 +12,7 @@ from playground.benchmark.worker import Facts
 from playground.config import RunConfig, compose
 from playground.errors import PlaygroundError
 from playground.interpreter import PYTHON
-from playground.learning.algorithms import algorithm
+from playground.learning.hyperparameters import config_class
 from playground.runs.run_dir import RunDirectory
 
 # Of the environment: they would take the place of the run's own.
@@ -61,6 +61,5 @@ def facts_of(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 def _one_update(config: RunConfig) -> int:
   """The budget (control steps) with which something is learned once."""
-  settings = algorithm(config.agent.name).Config.from_config(config.agent)
-  repeat = config.env.action_repeat
-  return (1 + settings.prefill_updates) * settings.steps_per_update(repeat)
+  settings = config_class(config.agent.name).from_config(config.agent)
+  return (settings.prefill_updates + 1) * settings.steps_per_update * config.env.action_repeat

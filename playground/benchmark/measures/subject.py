@@ -24,6 +24,7 @@ from playground.envs.wrappers import ModelFields
 from playground.hardware.scaling import scale_envs
 from playground.hardware.setup import Hardware, setup
 from playground.learning.algorithms import algorithm
+from playground.learning.hyperparameters import config_class
 from playground.learning.learner import Learner
 from playground.runs.train import model_sampler
 
@@ -47,11 +48,10 @@ class Subject:
     hardware = setup(config.hardware)
     if config.hardware.scale_envs:
       config, _ = scale_envs(config, hardware.mesh.size)
-    algorithm_class = algorithm(config.agent.name)
-    settings = algorithm_class.Config.from_config(config.agent)
+    settings = config_class(config.agent.name).from_config(config.agent)
     env = registry.load(task, config=config.env)
     draw = model_sampler(env, config, settings.num_envs, settings.num_eval_envs)
-    learner = algorithm_class(env, settings, hardware.mesh, hardware.network_precision)
+    learner = algorithm(config.agent.name)(env, settings, hardware.mesh, hardware.network_precision)
     facts.update(
       backend=env.impl,
       devices=hardware.mesh.size,
