@@ -127,15 +127,3 @@ def _end_last_row(file: BinaryIO) -> None:
 def commit_of(git: Mapping[str, Any] | None) -> str:
   """The column `commit` for what `git_state` says."""
   return "" if git is None else git["commit"][:7] + "+" * git["dirty"]
-
-
-def mean_and_ci95(values: Iterable[float]) -> tuple[float, float | None]:
-  """Mean, and half the width of its 95 % confidence interval (Student's t); None from one value."""
-  import numpy as np
-  from scipy.special import stdtrit
-
-  sample = np.asarray(list(values), float)
-  if len(sample) < 2:
-    return float(sample.mean()), None
-  error = sample.std(ddof=1) / np.sqrt(len(sample))
-  return float(sample.mean()), float(stdtrit(len(sample) - 1, 0.975) * error)

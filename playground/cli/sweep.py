@@ -7,7 +7,7 @@ from rich.console import Console
 from playground.config import is_of_command
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.plan import settings_of
-from playground.sweep.results import write_result
+from playground.sweep.report import write_result
 from playground.sweep.runner import run_sweep
 from playground.sweep.view import status_table
 from playground.sweep.worker import job_command

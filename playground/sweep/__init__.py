@@ -11,10 +11,10 @@ Everything about a sweep lies in files, so whatever runs it may die, and the sam
 
   plan      command line -> jobs, composed and checked
   folder    those files
-  worker    one job in one process: what a launcher starts, on whatever machine
+  worker    one job in one process: started by a launcher, on whatever machine
   local, slurm, ray     launchers: where and when a worker starts
-  runner    the loop that hands jobs to a launcher and waits for them
-  search    Optuna in place of every combination
-  view      what one sees meanwhile
-  results, report       the table, the curves and the page
+  runner    the loop that hands jobs to a launcher and waits for them; measurements of `playground-bench` use it, too
+  search    Optuna instead of every combination
+  view      the output meanwhile
+  report    tables, curves and the page
 """

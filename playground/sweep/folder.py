@@ -5,16 +5,16 @@ import dataclasses
 import datetime
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal
 
 import yaml
 
-from playground.config import format_value
+from playground.config import RunConfig, format_value, is_of_command
 from playground.config.text import first_line
-from playground.errors import CheckpointError, nearest
+from playground.errors import CheckpointError, ConfigError, nearest
 from playground.runs.files import is_locked, lock_holder, locking, read_json, write_json, write_text
 from playground.runs.run_dir import RunDirectory
 
@@ -42,6 +42,42 @@ class Job:
   varies: dict[str, Any]
   needs: int | None = None
   steps: int | None = None
+
+  @classmethod
+  def of_run(cls, number: int, overrides: Sequence[str], varying: Sequence[str], config: RunConfig) -> "Job":
+    """A run as a job.
+
+    Args:
+      number: its place in the sweep.
+      overrides: its command line.
+      varying: the keys in which jobs differ.
+      config: its configuration.
+
+    Raises:
+      ConfigError: it takes several machines.
+    """
+    varies = {key: _value(config, key) for key in varying}
+    own = {text.partition("=")[0].lstrip("+~") for text in overrides}  # a listed job says less than others
+    named = {key: value for key, value in varies.items() if key in own}
+    words = [str(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={v}" for k, v in named.items()]
+    text = re.sub(r"[^A-Za-z0-9._=+-]+", "-", "_".join(words or [config.name]))[:80].strip("-.")
+    if config.hardware.distributed.enable:
+      raise ConfigError("hardware=multi_node cannot be given with -m: a job of a sweep runs on one machine.")
+    needs = 0 if config.hardware.platform == "cpu" else config.hardware.devices
+    stages = [stage.agent.num_timesteps for stage in config.stages]
+    steps = sum(stages) if stages else config.agent.num_timesteps
+    kept = [text for text in overrides if not is_of_command(text)]
+    return cls(f"{number:03d}_{text}", kept, varies, needs, int(steps))
+
+
+def _value(config: RunConfig, key: str) -> Any:
+  """A job's value of a key or group."""
+  if key in config.choices:
+    return config.choices[key]
+  node: Any = config.resolved
+  for part in {"terrain": "env.scene.terrain", "visuals": "video.visuals"}.get(key, key).split("."):
+    node = node[int(part)] if isinstance(node, list) else node.get(part) if isinstance(node, Mapping) else None
+  return format_value(node) if isinstance(node, list | Mapping) else node
 
 
 @dataclasses.dataclass(frozen=True)

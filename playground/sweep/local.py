@@ -15,12 +15,13 @@ from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.mps import MultiProcessService, control_program
 from playground.sweep.worker import COMMAND
 
+ALL = "all"
 MEMORY_FRACTION = 0.9  # of a GPU, shared among its slots; the rest is for Warp and the driver
 
 
 @dataclasses.dataclass(frozen=True)
 class Slot:
-  """Room for one job: a share of a GPU (None without one) and CPU cores."""
+  """Room for one job: a share of a GPU (None without one, `ALL` those that this process sees) and CPU cores."""
 
   number: int
   gpu: str | None
@@ -45,15 +46,18 @@ def pick(free: Sequence[Slot], needs: int | None) -> list[Slot] | None:
 
 
 class LocalLauncher:
-  """See `launchers.Launcher`."""
+  """See `runner.Launcher`."""
 
   outlives = False
 
-  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
+  def __init__(
+    self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND, slots: Sequence[Slot] = ()
+  ):
+    """As of every launcher; `slots` are used instead of those that `config` makes of this machine."""
     self.check(config, sweep.jobs)
-    self._gpus = visible_gpus()[: config.gpus]
     self._mps = MultiProcessService(sweep.path) if config.mps else None
-    self.slots = make_slots(self._gpus, config.slots_per_gpu, sorted(os.sched_getaffinity(0)), config.cores_per_job)
+    cores = sorted(os.sched_getaffinity(0))
+    self.slots = slots or make_slots(visible_gpus()[: config.gpus], config.slots_per_gpu, cores, config.cores_per_job)
     self._sweep = sweep
     self._config = config
     self._command = tuple(command)
@@ -85,12 +89,13 @@ class LocalLauncher:
     for name in [name for name in self._taken if not self._at_work(name)]:
       del self._taken[name]
     taken = {slot for slots in self._taken.values() for slot in slots}
-    slots = pick([slot for slot in self.slots if slot not in taken], job.needs if self._gpus else 0)
+    free = [slot for slot in self.slots if slot not in taken]
+    slots = pick(free, 0 if self.slots[0].gpu is None else job.needs)
     if slots is None:
       return False
     gpus = [slot.gpu for slot in slots if slot.gpu is not None] if job.needs != 0 else []
     cores = [core for slot in slots for core in slot.cores]
-    where = f"GPU {','.join(gpus)}" if gpus else f"cores {','.join(map(str, cores))}"
+    where = f"GPU {','.join(gpus)}" if gpus else f"cores {','.join(map(str, cores))}" if cores else ""
     limits = ["--grace", str(self._config.grace)]
     limits += [] if self._config.timeout is None else ["--timeout", str(self._config.timeout)]
     folder = self._sweep.folder(job)
@@ -134,7 +139,7 @@ class LocalLauncher:
 
   def _environment(self, gpus: Sequence[str]) -> dict[str, str]:
     """What a job must know of its place; without GPUs none is visible."""
-    env = os.environ | {"CUDA_VISIBLE_DEVICES": ",".join(gpus)}
+    env = dict(os.environ) if ALL in gpus else os.environ | {"CUDA_VISIBLE_DEVICES": ",".join(gpus)}
     shared = self._config.slots_per_gpu
     if gpus and shared > 1:
       env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION / shared:.3f}"

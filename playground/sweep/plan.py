@@ -2,16 +2,15 @@
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from playground import config as configs
 from playground.config import RunConfig, Section
 from playground.errors import ConfigError
 from playground.sweep.folder import Job, SweepDirectory
-from playground.sweep.launchers import launcher_class
+from playground.sweep.runner import launcher_class
 
 ROOT = Path("results/sweeps")
 
@@ -51,7 +50,7 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
     name = _name(overrides, composed)
     varying = configs.varying(*sets)
     jobs = [
-      make_job(number, job, varying, config)
+      Job.of_run(number, job, varying, config)
       for number, (job, config) in enumerate(zip(combinations, composed, strict=True))
     ]
   lines = [line for line in lines if not configs.is_of_command(line)]
@@ -75,42 +74,6 @@ def _lines(overrides: Sequence[str]) -> tuple[list[str], Section, list[list[str]
   if listed and chosen.search.name != "grid":
     raise ConfigError("A search draws from what one job may be: its sweep file cannot list jobs.")
   return settings, chosen, [configs.with_default_experiment(one) for one in configs.with_listed(lines, listed)]
-
-
-def make_job(number: int, overrides: Sequence[str], varying: Sequence[str], config: RunConfig) -> Job:
-  """A job of a sweep.
-
-  Args:
-    number: its place.
-    overrides: its command line.
-    varying: the keys in which jobs differ.
-    config: what it is composed to.
-
-  Raises:
-    ConfigError: it takes several machines.
-  """
-  varies = {key: _value(config, key) for key in varying}
-  own = {text.partition("=")[0].lstrip("+~") for text in overrides}  # a listed job says less than others
-  named = {key: value for key, value in varies.items() if key in own}
-  said = [str(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={v}" for k, v in named.items()]
-  words = re.sub(r"[^A-Za-z0-9._=+-]+", "-", "_".join(said or [config.name]))[:80].strip("-.")
-  if config.hardware.distributed.enable:
-    raise ConfigError("hardware=multi_node cannot be given with -m: a job of a sweep runs on one machine.")
-  needs = 0 if config.hardware.platform == "cpu" else config.hardware.devices
-  stages = [stage.agent.num_timesteps for stage in config.stages]
-  steps = sum(stages) if stages else config.agent.num_timesteps
-  kept = [text for text in overrides if not configs.is_of_command(text)]
-  return Job(f"{number:03d}_{words}", kept, varies, needs, int(steps))
-
-
-def _value(config: RunConfig, key: str) -> Any:
-  """What a job has for a key or group."""
-  if key in config.choices:
-    return config.choices[key]
-  node: Any = config.resolved
-  for part in {"terrain": "env.scene.terrain", "visuals": "video.visuals"}.get(key, key).split("."):
-    node = node[int(part)] if isinstance(node, list) else node.get(part) if isinstance(node, Mapping) else None
-  return configs.format_value(node) if isinstance(node, list | Mapping) else node
 
 
 def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:

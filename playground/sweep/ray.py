@@ -27,7 +27,7 @@ _PACKAGES = Path(__file__).parents[2]
 
 
 class RayLauncher:
-  """See `launchers.Launcher`."""
+  """See `runner.Launcher`."""
 
   outlives = False
   _owned = False  # whether the connection, of which a process has one, was made here
@@ -42,7 +42,7 @@ class RayLauncher:
 
   @staticmethod
   def check(config: Section, jobs: Sequence[Job]) -> None:
-    """See `launchers.Launcher`; connects to the cluster, or starts one, until `close` or the end of the process."""
+    """See `runner.Launcher`; connects to the cluster, or starts one, until `close` or the end of the process."""
     if not ray.is_initialized():
       address = config.address or os.environ.get("RAY_ADDRESS")
       try:

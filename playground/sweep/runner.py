@@ -1,7 +1,7 @@
-"""The loop of a sweep: hands jobs to a launcher, waits for them, and writes the result.
+"""The loop over jobs: hands them to a launcher, waits for them, and shows how they stand.
 
-All it knows it reads from the sweep's folder. Killed and started again it goes on with what is missing, jobs that are
-still at work included.
+Sweeps and benchmarks (`benchmark/jobs.py`) run on it. All it knows it reads from the jobs' folders. Killed and started
+again it does what is missing and waits for jobs that are still at work.
 """
 
 import contextlib
@@ -9,15 +9,14 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from rich.console import Console
 
 from playground.config import Section, check_saved_job
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
-from playground.sweep.launchers import Launcher, launcher_class
-from playground.sweep.results import write_result
+from playground.sweep.report import write_result
 from playground.sweep.view import View
 from playground.sweep.worker import COMMAND
 
@@ -28,22 +27,68 @@ POLL_S = 0.3
 MAX_CODE = 100  # exit codes above are signals'
 
 
+class Launcher(Protocol):
+  """Starts workers. The result of a job is in its folder; a launcher only knows whether it may still change.
+
+  Attributes:
+    outlives: whether jobs go on when the process that started them ends.
+  """
+
+  outlives: bool
+
+  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
+    """Takes a sweep, its section `launcher` and the command that runs a job's overrides; raises as `check`."""
+
+  @staticmethod
+  def check(config: Section, jobs: Sequence[Job]) -> None:
+    """Raises PlaygroundError for missing software, invalid settings and jobs that can never start; writes nothing."""
+
+  def start(self, job: Job) -> bool:
+    """Starts a job, or returns False because there is no room for it now."""
+    ...
+
+  def busy(self, job: Job) -> bool:
+    """Whether the job may still start or is at work, as far as this launcher can see."""
+    ...
+
+  def kill(self) -> None:
+    """Ends all jobs at once, saved or not."""
+
+  def close(self) -> None:
+    """Waits for the jobs that do not outlive this process, and frees what the launcher holds."""
+
+
+def launcher_class(name: str) -> type[Launcher]:
+  """The class for `launcher.name`; raises ConfigError where its package is not installed."""
+  if name == "slurm":
+    from playground.sweep.slurm import SlurmLauncher
+
+    return SlurmLauncher
+  if name == "ray":
+    from playground.sweep.ray import RayLauncher
+
+    return RayLauncher
+  from playground.sweep.local import LocalLauncher
+
+  return LocalLauncher
+
+
 def run_sweep(
   sweep: SweepDirectory, settings: Section, command: Sequence[str] = COMMAND, console: Console | None = None
 ) -> int:
-  """Does what is missing of a sweep, and writes its result.
+  """Runs the unfinished jobs of a sweep and writes its result.
 
   Args:
     sweep: on disk.
     settings: how it is run (`configs/sweep.yaml`).
-    command: what jobs are run with.
-    console: for what is shown.
+    command: takes the jobs' overrides.
+    console: takes the output.
 
   Returns:
     How many jobs failed, 100 at most, or 130 or 143 when interrupted.
 
   Raises:
-    PlaygroundError: it cannot be run like this, or another process runs it.
+    PlaygroundError: the settings are invalid here, or another process runs the sweep.
   """
   for job in sweep.jobs:
     check_saved_job(job.name, job.overrides)
@@ -53,11 +98,11 @@ def run_sweep(
       from playground.sweep.search import Search
 
       search = Search(sweep, settings.search, view.print)
+    wait = settings.launcher.get("wait", True)
     make_launcher = launcher_class(settings.launcher.name)
     with contextlib.closing(make_launcher(sweep, settings.launcher, command)) as launcher:
-      runner = Runner(sweep, launcher, view, settings, search)
-      code = runner.run()
-    if runner.waited:
+      code = Runner(sweep, launcher, view, search, settings.on_error == "stop", wait).run()
+    if wait:
       write_result(sweep, view.print)
     if search:
       view.print(search.best())
@@ -65,96 +110,110 @@ def run_sweep(
 
 
 class Runner:
-  """See `run_sweep`."""
+  """Runs the unfinished jobs of a sweep."""
 
   def __init__(
-    self, sweep: SweepDirectory, launcher: Launcher, view: View, settings: Section, search: "Search | None" = None
-  ):
+    self, sweep: SweepDirectory, launcher: Launcher, view: View, search: "Search | None" = None,
+    stop_on_error: bool = False, wait: bool = True, seconds: float | None = None,
+  ):  # fmt: skip
+    """Args:
+    sweep: the jobs, on disk.
+    launcher: starts them.
+    view: shows them.
+    search: adds jobs while others run.
+    stop_on_error: one failed job stops the others.
+    wait: if not, jobs are only started.
+    seconds: when jobs are asked to stop; None is never.
+    """
     self._sweep = sweep
     self._launcher = launcher
     self._view = view
-    self._stop_on_error = settings.on_error == "stop"
     self._search = search
+    self._stop_on_error = stop_on_error
+    self._wait = wait
+    self._deadline = None if seconds is None else time.monotonic() + seconds
     self._signum: int | None = None
     self._kill = False
     self._stopping = False
-    self.waited = settings.launcher.get("wait", True)
 
   def run(self) -> int:
-    """The whole of it; see `run_sweep`."""
-    sweep, launcher = self._sweep, self._launcher
+    """Returns the exit code; see `run_sweep`."""
+    sweep, launcher, view = self._sweep, self._launcher, self._view
     sweep.stop_file.unlink(missing_ok=True)
     self._states = sweep.states()
     self._open = [job for job in sweep.jobs if self._at_work(job)]
     left = [job for job in sweep.jobs if job not in self._open and self._states[job.name].status != "finished"]
     self._queue = deque(left)
     self._states |= {job.name: JobState() for job in left}
-    self._view.know(self._states)
-    finished = sum(state.status == "finished" for state in self._states.values())
-    already = f", {finished} finished already" if finished else ""
-    already += f", {len(self._open)} at work" if self._open else ""
-    what = f"Search of {self._search.trials} trials" if self._search else f"Sweep of {len(sweep.jobs)} jobs"
-    self._view.print(f"{what} in {sweep.path}{already}")
-    with on_signals(self._interrupt), self._view as view:
-      while self._queue or self._open or self._may_search():
-        self._start_some()
-        if not self.waited or (self._signum is not None and launcher.outlives):
-          break
-        self._look()
-        view.update(self._states)
-        if self._queue or self._open:
-          time.sleep(POLL_S)
-      view.update(self._states, now=True)
+    view.begin(self._states, len(self._open), self._search and self._search.trials)
+    with on_signals(self._interrupt), view:
+      try:
+        while (self._queue or self._open or self._may_search()) and not (self._signum and launcher.outlives):
+          self._react()
+          self._start_some()
+          if not self._wait:
+            break
+          self._look()
+          view.update(self._states)
+          if self._queue or self._open:
+            time.sleep(POLL_S)
+        view.update(self._states, now=True)
+      except BaseException:
+        if not launcher.outlives:  # `close` waits for the jobs
+          sweep.stop_file.touch()
+        raise
     if self._signum is not None:
-      self._view.print(self._last_words())
+      view.print(f"{'Its jobs go on by themselves; ' if launcher.outlives else 'Interrupted: '}{view.again}.")
       return 128 + self._signum
-    if not self.waited:
-      self._view.print(f"Submitted; `playground sweep status|collect {sweep.path}` shows what becomes of it.")
+    if not self._wait:
+      view.print(f"Submitted; `playground sweep status|collect {sweep.path}` shows what becomes of it.")
       return 0
     return min(self._failed(), MAX_CODE)
 
-  def _start_some(self) -> None:
-    """Starts what there is room for."""
-    while self._queue and not self._stopping and self._launcher.start(self._queue[0]):
-      self._open.append(self._queue.popleft())
-    while self._may_search() and not self._queue and (job := self._search.ask(len(self._open))):  # pyright: ignore
-      self._states[job.name] = JobState()
-      if not self._launcher.start(job):
-        self._queue.append(job)
-      else:
-        self._open.append(job)
-
-  def _look(self) -> None:
-    """Reads how the open jobs stand, and acts on those that ended and on signals."""
-    for job in list(self._open):
-      busy = self._launcher.busy(job)  # before its state is read, since the last thing a worker does is to write it
-      state = self._sweep.folder(job).state()
-      if not busy and state.status not in ENDED and not self._sweep.folder(job).locked():
-        state = JobState("killed", "it never came to start", state.attempt)
-        self._sweep.folder(job).write(status=state.status, reason=state.reason, attempt=state.attempt)
-      self._states[job.name] = state
-      if not busy and state.status in ENDED:
-        self._open.remove(job)
-        if self._search:
-          self._search.tell(job, self._sweep.folder(job))
+  def _react(self) -> None:
+    """Stops jobs after a failure, a signal, or when the time is up."""
     if self._stop_on_error and not self._stopping and any(s.status in FAILED for s in self._ended_now()):
-      self._view.print("on_error=stop: a job failed, the others are asked to stop.")
-      self._stop()
+      self._stop("on_error=stop: a job failed, the others are asked to stop.")
     if self._signum is not None and not self._stopping:
-      self._view.print("Interrupted: jobs are asked to stop, which saves them (once more kills them).")
+      self._stop("Interrupted: jobs are asked to stop, which saves them (once more kills them).")
+    if self._deadline is not None and not self._stopping and time.monotonic() >= self._deadline:
       self._stop()
     if self._kill:
       self._launcher.kill()
 
-  def _stop(self) -> None:
+  def _start_some(self) -> None:
+    """Starts as many jobs as there is room for."""
+    while self._queue and not self._stopping and self._launcher.start(self._queue[0]):
+      self._open.append(self._queue.popleft())
+    while self._search and self._may_search() and not self._queue and (job := self._search.ask(len(self._open))):
+      self._states[job.name] = JobState()
+      (self._open if self._launcher.start(job) else self._queue).append(job)
+
+  def _look(self) -> None:
+    """Reads how the open jobs stand."""
+    for job in list(self._open):
+      folder = self._sweep.folder(job)
+      busy = self._launcher.busy(job)  # before its state is read, since the last thing a worker does is to write it
+      state = folder.state()
+      if not busy and state.status not in ENDED and not folder.locked():
+        state = JobState("killed", "it never came to start", state.attempt)
+        folder.write(status=state.status, reason=state.reason, attempt=state.attempt)
+      self._states[job.name] = state
+      if not busy and state.status in ENDED:
+        self._open.remove(job)
+        if self._search:
+          self._search.tell(job, folder)
+
+  def _stop(self, text: str = "") -> None:
+    if text:
+      self._view.print(text)
     self._stopping = True
     self._queue.clear()
     self._sweep.stop_file.touch()
 
   def _at_work(self, job: Job) -> bool:
-    return self._states[job.name].status != "finished" and (
-      self._launcher.busy(job) or self._sweep.folder(job).locked()
-    )
+    unfinished = self._states[job.name].status != "finished"
+    return unfinished and (self._launcher.busy(job) or self._sweep.folder(job).locked())
 
   def _ended_now(self) -> list[JobState]:
     """Jobs of this start that have ended: neither open nor queued any more."""
@@ -168,10 +227,6 @@ class Runner:
     """How many jobs failed; if none did, how many did not finish."""
     states = self._states.values()
     return sum(s.status in FAILED for s in states) or sum(s.status != "finished" for s in states)
-
-  def _last_words(self) -> str:
-    again = f"the same command, or `playground sweep retry {self._sweep.path}`, goes on"
-    return f"Its jobs go on by themselves; {again}." if self._launcher.outlives else f"Interrupted: {again}."
 
   def _interrupt(self, signum: int, frame: FrameType | None) -> None:
     """SIGINT and SIGTERM ask for an end, a second one asks again."""

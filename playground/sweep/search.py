@@ -81,9 +81,7 @@ class Search:
       self._study.tell(trial, state=TrialState.FAIL)
       self._notify(f"A trial is left out: {error}")
       return None
-    from playground.sweep.plan import make_job
-
-    job = make_job(len(self._sweep.jobs), overrides, list(trial.params), config)
+    job = Job.of_run(len(self._sweep.jobs), overrides, list(trial.params), config)
     trial.set_user_attr("job", job.name)
     self._sweep.add(job)
     return job

@@ -87,7 +87,7 @@ class Queue:
 
 
 class SlurmLauncher:
-  """See `launchers.Launcher`."""
+  """See `runner.Launcher`."""
 
   outlives = True
 
@@ -112,7 +112,7 @@ class SlurmLauncher:
 
   @staticmethod
   def check(config: Section, jobs: Sequence[Job]) -> None:
-    """See `launchers.Launcher`; what it cannot give a job Slurm itself says."""
+    """See `runner.Launcher`; what it cannot give a job Slurm itself says."""
     if not config.wait and config.max_parallel is not None:
       raise ConfigError("launcher.wait=false submits all jobs at once: leave launcher.max_parallel out.")
     if config.minutes * 60 <= _notice_s(config):

@@ -39,9 +39,19 @@ class View:
     """A line above the table."""
     self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
-  def know(self, states: Mapping[str, JobState]) -> None:
-    """Takes note of how jobs stood at first, which is no news."""
+  @property
+  def again(self) -> str:
+    """How a stopped sweep goes on."""
+    return f"the same command, or `playground sweep retry {self._sweep.path}`, goes on"
+
+  def begin(self, states: Mapping[str, JobState], at_work: int, trials: int | None = None) -> None:
+    """Prints how the sweep stands; its jobs' first states are not printed later."""
     self._seen = {name: (state.status, state.attempt) for name, state in states.items()}
+    finished = sum(state.status == "finished" for state in states.values())
+    already = f", {finished} finished already" if finished else ""
+    already += f", {at_work} at work" if at_work else ""
+    what = f"Search of {trials} trials" if trials else f"Sweep of {len(self._sweep.jobs)} jobs"
+    self.print(f"{what} in {self._sweep.path}{already}")
 
   def update(self, states: Mapping[str, JobState], now: bool = False) -> None:
     """Shows what is new.

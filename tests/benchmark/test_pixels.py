@@ -11,10 +11,10 @@ import pytest
 from playground.benchmark.commands import COMPARED_CONDITIONS, Pixels
 from playground.benchmark.report import sections
 from playground.benchmark.report.evidence import Evidence
-from playground.benchmark.report.page import Table as Shown
 from playground.benchmark.report.pixels import pixels
 from playground.benchmark.schema import Table
 from playground.errors import ConfigError
+from playground.reporting.page import Table as Shown
 
 CHECKOUT = Path(__file__).parents[2]
 

@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 
 from playground.benchmark import report
-from playground.benchmark.report import Options, figures, page, run, sections
+from playground.benchmark.report import Options, page, run, sections
 from playground.benchmark.report.evidence import Evidence
-from playground.benchmark.report.page import Block, Heading, Picture, Table, Text, to_html, to_markdown
 from playground.benchmark.schema import Table as Rows
 from playground.errors import ConfigError
 from playground.paper import SUITES, paper_table
+from playground.reporting.page import Block, Picture, Table
 
 REFERENCE = Path(__file__).parents[2] / "results/reference"
 ROW = {
@@ -300,30 +300,3 @@ def test_a_folder_that_cannot_be_is_said_before_the_page_is_made(tmp_path: Path,
   (tmp_path / "file").touch()
   with pytest.raises(ConfigError, match=r"^out=.*/file/page cannot be written: .*/file is not a folder that you may"):
     run(Options(out=str(tmp_path / "file" / "page"), rows=(str(REFERENCE),)))
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_long_setting_leaves_room_for_the_drawing():
-  name = "CartpoleBalance " + " ".join(f"agent.some_long_key_{i}=64" for i in range(6))
-  drawings = [
-    figures.lines("a", {name: [(1, 2.0), (2, 4.0)], f"{name}, training": [(1, 1.0)]}, "x", "y", log=True),
-    figures.bars("a", {name: {"fixed": 1.0, "scaled": 2.0}}, "x"),
-    figures.stacked("a", {name: {"physics": 0.5, "update": 0.5}}, "x"),
-  ]
-  assert all("<svg" in drawing for drawing in drawings)
-
-
-def test_blocks_as_markdown_and_html():
-  blocks = [
-    Heading(2, "A & B"),
-    Text("run `it`"),
-    Table(["a", "b"], [["x|y", "1"]]),
-    Picture("p", "<?xml?><svg/>", "C"),
-  ]
-  assert to_markdown(blocks, "d") == (
-    "## A & B\n\nrun `it`\n\n| a | b |\n| --- | ---: |\n| x\\|y | 1 |\n\n![C](d/p.svg)\n"
-  )
-  html = to_html(blocks, "T")
-  for part in ("<h2>A &amp; B</h2>", "<code>it</code>", '<td class="n">1</td>', "<svg/>", "<figcaption>C</figcaption>"):
-    assert part in html
-  assert "<?xml" not in html

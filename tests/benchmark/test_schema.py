@@ -5,11 +5,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from playground.benchmark import schema
-from playground.benchmark.schema import COLUMNS, Table, mean_and_ci95
+from playground.benchmark.schema import COLUMNS, Table
 from playground.errors import ConfigError
 
 ROW = {"benchmark": "throughput", "task": "A", "seed": 1, "quantity": "training_steps_per_s", "value": 12.5}
@@ -111,10 +110,3 @@ def test_what_the_schema_does_not_have_is_refused(tmp_path: Path):
     table.add(ROW | {"quantity": "speed"})
   with pytest.raises(KeyError, match="colour"):
     table.add(ROW | {"colour": "red"})
-
-
-def test_interval_is_students():
-  mean, half = mean_and_ci95([1.0, 2.0, 3.0, 4.0, 5.0])
-  assert mean == 3.0 and half is not None
-  np.testing.assert_allclose(half, 2.776445 * np.sqrt(2.5 / 5), rtol=1e-6)  # t(0.975, 4 degrees of freedom)
-  assert mean_and_ci95([7.0]) == (7.0, None)

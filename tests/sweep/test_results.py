@@ -9,8 +9,7 @@ import pytest
 
 from playground.runs.files import write_json
 from playground.sweep.folder import Job, SweepDirectory
-from playground.sweep.report import mean_curve
-from playground.sweep.results import collect, group, group_keys, half_width, write_result
+from playground.sweep.report import collect, group, group_keys, mean_curve, write_result
 
 
 @pytest.fixture
@@ -48,7 +47,6 @@ def test_seeds_alone_are_one_group(tmp_path: Path) -> None:
     jobs[name] = np.nan
   groups = group(jobs, [])
   assert (groups["jobs"][0], groups["final_return"][0]) == (2, 2.0)
-  assert half_width([1.0]) is None
 
 
 def test_what_is_written(sweep: SweepDirectory) -> None:

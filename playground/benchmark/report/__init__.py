@@ -6,9 +6,9 @@ from pathlib import Path
 from playground.benchmark.arguments import option
 from playground.benchmark.report import sections
 from playground.benchmark.report.evidence import Evidence
-from playground.benchmark.report.page import Block, Heading, Picture, Text, to_html, to_markdown
 from playground.benchmark.report.pixels import pixels
 from playground.errors import ConfigError
+from playground.reporting.page import Block, Heading, Picture, Text, to_html, to_markdown
 from playground.runs.files import need_folder, write_text
 
 ROWS = ("results/reference", "results/benchmarks")
@@ -47,8 +47,8 @@ def run(options: Options) -> int:
   try:
     (out / PICTURES).mkdir(parents=True, exist_ok=True)
     for block in blocks:
-      if isinstance(block, Picture):
-        write_text(out / PICTURES / f"{block.name}.svg", block.svg)
+      if isinstance(block, Picture) and isinstance(block.image, str):
+        write_text(out / PICTURES / f"{block.name}.svg", block.image)
     write_text(out / "report.md", to_markdown(blocks, PICTURES))
     write_text(out / "report.html", to_html(blocks, TITLE))
   except OSError as error:

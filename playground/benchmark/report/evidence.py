@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from playground.benchmark.schema import COLUMNS, QUANTITIES, mean_and_ci95
+from playground.benchmark.schema import COLUMNS, QUANTITIES
 from playground.errors import ConfigError
+from playground.reporting.page import mean_and_ci95
 
 # Tables measured before `playground-bench`: their words for what a row's quantity is, and their columns.
 _WORDS = {

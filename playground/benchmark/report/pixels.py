@@ -4,9 +4,9 @@ from collections.abc import Iterable, Mapping
 
 from playground.benchmark.commands import COMPARED_CONDITIONS
 from playground.benchmark.report.evidence import Evidence, Figure
-from playground.benchmark.report.page import Block, Heading, Table, Text
 from playground.benchmark.report.sections import Notes, nothing
 from playground.paper import paper_table
+from playground.reporting.page import Block, Heading, Table, Text
 
 SEEN = {"episodes": "state", "pixels": "+ pictures", "inference": "+ inference", "update": "+ training"}
 PARTS = ("physics", "rendering", "inference", "policy update")  # what each of them adds, as the paper calls it

@@ -2,13 +2,13 @@
 
 import functools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from playground.benchmark.report import figures
 from playground.benchmark.report.evidence import Evidence, Figure
-from playground.benchmark.report.page import NOT_MEASURED, Block, Heading, Picture, Table, Text
 from playground.config import compose
 from playground.paper import SUITES, paper_table
+from playground.reporting import figures
+from playground.reporting.page import NOT_MEASURED, Block, Heading, Picture, Table, Text, short
 
 TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipulation": "Manipulation"}
 SPEED = "training_steps_per_s"
@@ -100,9 +100,9 @@ def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
           found = [
             f"{ours['task']} {'' if call else ours['setting']}".strip(),
             what,
-            _short(mine),
+            short(mine),
             who,
-            _short(its),
+            short(its),
             f"{better:.2f}",
           ]
           rows.append([*found, notes.number(ours), notes.number(peer)])
@@ -200,7 +200,7 @@ def _whole_runs(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     rate = evidence.best(**of_it, commit=figure["commit"]) or evidence.best(**of_it)
     count = f"{steps.mean:,.0f}" if steps else NOT_MEASURED
     times = f"{one / figure.mean:.2f}" if one else ""
-    derived = _short(steps.mean / rate.mean) if steps and rate else ""
+    derived = short(steps.mean / rate.mean) if steps and rate else ""
     result = [count, _with_ci(figure), times, derived, _with_ci(score) if score else NOT_MEASURED]
     topology = [_named(figure, *_TOPOLOGY, "agent.num_timesteps="), figure["devices"], _hyperparameters(figure)]
     rows.append([*topology, *result, figure["device"], notes.number(figure)])
@@ -288,9 +288,9 @@ def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     task, run = parts.groups() if parts else (name, name)
     groups.setdefault(task, {})[run] = points
   if groups:
-    yield Picture("curves", figures.curves(dict(sorted(groups.items()))), "Return of evaluations over control steps.")
+    yield Picture("curves", _curves(groups), "Return of evaluations over control steps.")
   if runs := runs_by_step(evidence):
-    yield Picture("runs", figures.curves(runs), "Return of runs that were measured whole, means over seeds.")
+    yield Picture("runs", _curves(runs), "Return of runs that were measured whole, means over seeds.")
   rows = []
   for figure in evidence.find(quantity="final_return"):
     if figure["benchmark"] != "chain":
@@ -318,6 +318,12 @@ def runs_by_step(evidence: Evidence) -> dict[str, dict[str, list[tuple[float, fl
   return dict(sorted(curves.items()))
 
 
+def _curves(groups: Mapping[str, Mapping[str, figures.Points]]) -> str:
+  in_millions = lambda points: figures.Curve([step / 1e6 for step, _ in points], [value for _, value in points])
+  panels = {title: {name: in_millions(points) for name, points in group.items()} for title, group in groups.items()}
+  return figures.curves(dict(sorted(panels.items())), "million control steps", "return").decode()
+
+
 def _named(figure: Figure, *varied: str) -> str:
   """A figure's task, its agent unless PPO, and its setting except for what begins with what a section varies."""
   agent = [figure["agent"]] * (figure["agent"] not in ("ppo", ""))
@@ -327,10 +333,6 @@ def _named(figure: Figure, *varied: str) -> str:
 def _with_ci(figure: Figure) -> str:
   digits = 0 if figure.mean >= 1000 else 1
   return f"{figure.mean:,.{digits}f}" + ("" if figure.ci95 is None else f" ± {figure.ci95:,.{digits}f}")
-
-
-def _short(value: float) -> str:
-  return f"{value:,.0f}" if value >= 1000 else f"{value:.4g}"
 
 
 def nothing(command: str) -> Block:

@@ -1,5 +1,6 @@
-"""A page as a list of blocks, written as Markdown with pictures beside it or as one HTML file."""
+"""A page as a list of blocks, written as Markdown with pictures beside it or as one HTML file; the text of numbers."""
 
+import base64
 import dataclasses
 import html
 import re
@@ -21,9 +22,20 @@ class Text:
   text: str
 
 
+class Link(str):
+  """A cell that leads to a file beside the page."""
+
+  target: str
+
+  def __new__(cls, text: str, target: str) -> "Link":
+    link = super().__new__(cls, text)
+    link.target = target
+    return link
+
+
 @dataclasses.dataclass(frozen=True)
 class Table:
-  """Rows of cells; columns that hold numbers stand to the right."""
+  """Rows of cells; columns of numbers are aligned to the right."""
 
   header: Sequence[str]
   rows: Sequence[Sequence[str]]
@@ -35,12 +47,12 @@ class Picture:
 
   Attributes:
     name: of its file, without suffix.
-    svg: the drawing.
-    caption: what it shows.
+    image: the drawing, as SVG or as the bytes of a PNG, which a Markdown page cannot show.
+    caption: its text.
   """
 
   name: str
-  svg: str
+  image: str | bytes
   caption: str
 
 
@@ -53,7 +65,7 @@ body{font:16px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding
 table{border-collapse:collapse;margin:1rem 0;font-size:.9rem}
 th,td{border-bottom:1px solid #ddd;padding:.25rem .7rem;text-align:left;vertical-align:top}
 td.n,th.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
-svg{max-width:100%;height:auto} figcaption{font-size:.9rem;color:#555}
+svg,img{max-width:100%;height:auto} figcaption{font-size:.9rem;color:#555}
 """
 
 
@@ -90,21 +102,51 @@ def _html(block: Block) -> str:
     case Text(text):
       marked = _CODE.sub(r"<code>\1</code>", html.escape(text))
       return f"<p>{marked}</p>"
-    case Picture(_, svg, caption):
-      drawing = svg[svg.index("<svg") :]
+    case Picture(_, image, caption):
+      if isinstance(image, bytes):
+        drawing = f'<img alt="" src="data:image/png;base64,{base64.b64encode(image).decode()}">'
+      else:
+        drawing = image[image.index("<svg") :]
       return f"<figure>{drawing}<figcaption>{html.escape(caption)}</figcaption></figure>"
     case Table(header, rows):
       kinds = [' class="n"' if right else "" for right in _numeric(block)]
 
       def line(cells: Sequence[str], tag: str) -> str:
-        parts = (f"<{tag}{kind}>{html.escape(cell)}</{tag}>" for cell, kind in zip(cells, kinds, strict=True))
+        parts = (f"<{tag}{kind}>{_cell(cell)}</{tag}>" for cell, kind in zip(cells, kinds, strict=True))
         return f"<tr>{''.join(parts)}</tr>"
 
       return "\n".join(["<table>", line(header, "th"), *(line(row, "td") for row in rows), "</table>"])
 
 
+def _cell(cell: str) -> str:
+  text = html.escape(cell)
+  return f'<a href="{html.escape(cell.target)}">{text}</a>' if isinstance(cell, Link) else text
+
+
 def _numeric(table: Table) -> list[bool]:
   """For each column, whether what is in it are numbers."""
-  is_number = lambda cell: cell[:1].isdigit() or cell in ("", NOT_MEASURED)
+  is_number = lambda cell: not isinstance(cell, Link) and (cell[:1].isdigit() or cell in ("", NOT_MEASURED))
   columns = [[row[i] for row in table.rows] for i in range(len(table.header))]
   return [all(map(is_number, column)) and any(cell[:1].isdigit() for cell in column) for column in columns]
+
+
+def short(value: float) -> str:
+  """A number with four digits, or all before the point."""
+  return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+
+
+def mean_and_ci95(values: Iterable[float]) -> tuple[float, float | None]:
+  """Mean, and half the width of its 95 % confidence interval (Student's t); None from one value."""
+  import numpy as np
+
+  sample = np.asarray(list(values), float)
+  if len(sample) < 2:
+    return float(sample.mean()), None
+  return float(sample.mean()), float(t_factor(len(sample)) * sample.std(ddof=1))
+
+
+def t_factor(count: int) -> float:
+  """Half the width of a mean's 95 % confidence interval over the standard deviation of `count` values."""
+  from scipy.special import stdtrit
+
+  return float(stdtrit(count - 1, 0.975)) / count**0.5 if count > 1 else 0.0

@@ -1,25 +1,38 @@
-"""The page's drawings, as SVG."""
+"""Drawings, as SVG or PNG."""
 
 import io
 import math
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 COLOURS = ("#2f6db5", "#d1762f", "#5a9e57", "#b5479a", "#8a6d3b", "#777777")
 Points = Sequence[tuple[float, float]]
 
 
-def _svg(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
+class Curve(NamedTuple):
+  """A line and, where there is one, half the width of the band around it."""
+
+  x: Sequence[float]
+  y: Sequence[float]
+  half_width: Sequence[float] | None = None
+
+
+def _figure(size: tuple[float, float], draw: Callable[[Any], None], kind: str = "svg") -> bytes:
   import matplotlib
   from matplotlib.figure import Figure  # not pyplot: no global state, no display
 
   with matplotlib.rc_context({"svg.hashsalt": "playground", "font.size": 9}):  # the same page from the same rows
     figure = Figure(figsize=size, layout="constrained")
     draw(figure)
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    buffer = io.BytesIO()
+    how: dict[str, Any] = {"metadata": {"Date": None}} if kind == "svg" else {"dpi": 130}
+    figure.savefig(buffer, format=kind, **how)
   return buffer.getvalue()
+
+
+def _svg(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
+  return _figure(size, draw).decode()
 
 
 def _wrapped(name: str) -> str:
@@ -51,25 +64,29 @@ def lines(title: str, series: Mapping[str, Points], x: str, y: str, log: bool = 
   return _svg((7, 3.2 + _height(series, 0.2)), draw)
 
 
-def curves(groups: Mapping[str, Mapping[str, Points]]) -> str:
-  """Learning curves, small, a pair of axes a group."""
-  columns = min(4, len(groups))
-  rows = math.ceil(len(groups) / columns)
+def curves(panels: Mapping[str, Mapping[str, Curve]], x: str, y: str, kind: str = "svg") -> bytes:
+  """Curves in small panels, as SVG or PNG; panels of more than 30 curves have no legend."""
+  columns = min(4, len(panels))
+  rows = math.ceil(len(panels) / columns)
 
   def draw(figure: Any) -> None:
     cells = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, (title, group) in zip(cells, groups.items(), strict=False):
-      for colour, (name, points) in zip(COLOURS * len(group), group.items(), strict=False):
-        axes.plot([step / 1e6 for step, _ in points], [value for _, value in points], label=name, color=colour)
+    for axes, (title, group) in zip(cells, panels.items(), strict=False):
+      for colour, (name, curve) in zip(COLOURS * len(group), group.items(), strict=False):
+        axes.plot(curve.x, curve.y, label=name, color=colour)
+        if curve.half_width is not None:
+          low, high = zip(*((m - h, m + h) for m, h in zip(curve.y, curve.half_width, strict=True)), strict=True)
+          axes.fill_between(curve.x, low, high, color=colour, alpha=0.2, linewidth=0)
       axes.set_title(title, fontsize=9)
       axes.grid(alpha=0.3)
-      axes.legend(frameon=False, fontsize=7)
+      if len(group) <= 30:
+        axes.legend(frameon=False, fontsize=7)
     for axes in list(cells):
       axes.set_axis_off()
-    figure.supxlabel("million control steps")
-    figure.supylabel("return")
+    figure.supxlabel(x)
+    figure.supylabel(y)
 
-  return _svg((2.9 * columns, 2.2 * rows + 0.4), draw)
+  return _figure((2.9 * columns, 2.2 * rows + 0.4), draw, kind)
 
 
 def bars(title: str, groups: Mapping[str, Mapping[str, float]], x: str) -> str:
