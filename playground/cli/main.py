@@ -7,6 +7,7 @@ from typing import Any
 from playground import __version__, registry
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest, one_sentence
 from playground.limits import SEED, count
+from playground.pretrained import working_copy
 from playground.rendering.gl import withhold_gl
 from playground.trust import trust
 
@@ -19,6 +20,9 @@ _NUMBERS = {
   "steps": count(1),
   "port": count(0, 65535),
 }
+
+
+_RUN = "run directory, checkpoint, or a task, which stands for its pretrained policy"
 
 
 def main() -> None:
@@ -77,17 +81,17 @@ def _parser() -> argparse.ArgumentParser:
   show.add_argument("--num-views", type=int, default=16)
   add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
   evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
-  evaluate.add_argument("run", help="run directory or checkpoint")
+  evaluate.add_argument("run", help=_RUN)
   evaluate.add_argument("--episodes", type=int, help="by default the run's num_eval_envs")
   evaluate.add_argument("--seed", type=int, default=0)
   evaluate.add_argument("--deterministic", action="store_true", help="act on the distribution's mode")
   evaluate.add_argument("--video", metavar="FILE", help="also render an episode")
   evaluate.add_argument("--camera", metavar="NAME", help="of --video: one of the model's; by default one that looks on")
   export = add("export", _export, "Write a run's policy as ONNX, with the contract that a controller needs.")
-  export.add_argument("run", help="run directory or checkpoint")
+  export.add_argument("run", help=_RUN)
   export.add_argument("--out", metavar="FOLDER", help="by default export/ in the run's")
   play = add("play", _play, "Run a policy in plain C MuJoCo: measure it, film it or watch it.")
-  play.add_argument("policy", help="run directory, checkpoint, or a policy.onnx beside its policy.yaml")
+  play.add_argument("policy", help=f"{_RUN}, or a policy.onnx beside its policy.yaml")
   play.add_argument("--episodes", type=int, default=10)
   play.add_argument("--seed", type=int, default=0)
   shown = play.add_mutually_exclusive_group()
@@ -97,6 +101,8 @@ def _parser() -> argparse.ArgumentParser:
   play.add_argument("--camera", metavar="NAME", help="of --video: one of the model's; by default one that looks on")
   play.add_argument("--host", default="127.0.0.1", help="of --web: the address to listen on; by default this machine's")
   play.add_argument("--port", type=int, default=8080, help="of --web")
+  pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
+  pretrained.add_argument("--add", metavar="RUN", help="measure a run's policy in C MuJoCo and put it into the package")
   sweep = add("sweep", _sweep, "Look at a sweep, gather its result, or do what is missing of it.")
   sweep.add_argument("action", choices=("status", "collect", "retry", "stop"))
   sweep.add_argument("folder", help="the sweep's")
@@ -135,7 +141,7 @@ def _eval(args: argparse.Namespace) -> int:
   from playground.cli.eval import evaluate_run
 
   return evaluate_run(
-    args.run,
+    working_copy(args.run, registry.names()),
     episodes=args.episodes,
     seed=args.seed,
     deterministic=args.deterministic,
@@ -147,14 +153,14 @@ def _eval(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
   from playground.deploy.export import export_run
 
-  return export_run(args.run, out=args.out)
+  return export_run(working_copy(args.run, registry.names()), out=args.out)
 
 
 def _play(args: argparse.Namespace) -> int:
   from playground.deploy.play import play
 
   return play(
-    args.policy,
+    working_copy(args.policy, registry.names()),
     episodes=args.episodes,
     seed=args.seed,
     video=args.video,
@@ -164,6 +170,12 @@ def _play(args: argparse.Namespace) -> int:
     host=args.host,
     port=args.port,
   )
+
+
+def _pretrained(args: argparse.Namespace) -> int:
+  from playground.cli import pretrained
+
+  return pretrained.add_policy(args.add) if args.add else pretrained.show_policies()
 
 
 def _sweep(args: argparse.Namespace) -> int:

@@ -43,6 +43,7 @@ from playground.config.schema import check_key, fit, is_terms
 from playground.config.text import first_line, join
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.mdp.options import OPTIONS
+from playground.pretrained import locate
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that say which keys a run has, in this order
@@ -332,6 +333,8 @@ def _resolve(value: Any) -> Any:
 
 def _check_path(key: str, value: Any) -> None:
   """What `resume` and `init_from` name must be there."""
+  if key == "init_from":
+    value = locate(str(value))
   path = Path(str(value))
   wanted, what = (path / "config.yaml", "run directory") if key == "resume" else (path, "run directory or checkpoint")
   if not os.path.lexists(wanted):  # a link that points to nothing is for `find_checkpoints` to name

@@ -20,14 +20,14 @@ from playground.errors import ConfigError
 from playground.hardware.distributed import agree, is_main, noting_loss, share
 from playground.hardware.setup import setup
 from playground.learning.algorithms import make_learner
-from playground.learning.checkpoints import Checkpoint, describe, find_checkpoints
+from playground.learning.checkpoints import describe
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
 from playground.runs.chain_result import write_result
 from playground.runs.interrupts import Interrupts, exit_code
 from playground.runs.provenance import process_age_s
 from playground.runs.run_dir import RunDirectory
-from playground.runs.start import Start
+from playground.runs.start import Start, weights_of
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
@@ -108,7 +108,7 @@ def _check(config: "RunConfig") -> None:
       facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
       facts |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(learner.policy_shape())}
       if before is None and config.init_from is not None:
-        start = Start(weights=Checkpoint(find_checkpoints(config.init_from)[0]))
+        start = Start(weights=weights_of(config.init_from))
         start.restore(learner, stage.agent.name, lambda: ({}, {}))
       if before is not None:
         _compare(f"env={stage.choices['env']}", facts, *before)

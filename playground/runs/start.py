@@ -8,15 +8,30 @@ from typing import TYPE_CHECKING, Any, Self
 
 import jax
 
+from playground import registry
 from playground.errors import CheckpointError
 from playground.hardware.distributed import is_main
 from playground.learning.checkpoints import Checkpoint, DamagedCheckpointError, NoCheckpointError, find_checkpoints
 from playground.learning.learner import Learner
 from playground.learning.loop import Draw
+from playground.pretrained import check_task, is_pretrained, locate
 from playground.runs.run_dir import RunDirectory
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
+
+
+def weights_of(path: str | Path) -> Checkpoint:
+  """The checkpoint that `path` names: a run's newest, one of its checkpoints, or `pretrained:<task>`.
+
+  Raises:
+    PlaygroundError: there is none, it is damaged, or a pretrained policy's task has changed since.
+  """
+  checkpoint = Checkpoint(find_checkpoints(locate(str(path)))[0])
+  folder = checkpoint.path.parents[1]
+  if is_pretrained(folder):
+    check_task(folder, checkpoint.meta["config"]["env"], registry.config(folder.name).to_dict())
+  return checkpoint
 
 
 @dataclasses.dataclass
@@ -65,13 +80,13 @@ class Start:
           start.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
         # A resumed run's `config` says this only for a chain, which may have been moved.
         weights = config.init_from or run_dir.config["init_from"]
-        start.weights = Checkpoint(find_checkpoints(weights)[0]) if weights else None
+        start.weights = weights_of(weights) if weights else None
       return start
     assert config.run_dir is not None, "composing names one"
     if config.resolved["run_dir"] is not None:  # else the name is a proposal, which `create` numbers if it is taken
       RunDirectory(config.run_dir).must_be_new()
     if config.init_from is not None:
-      return cls(weights=Checkpoint(find_checkpoints(config.init_from)[0]))
+      return cls(weights=weights_of(config.init_from))
     return cls()
 
   @contextlib.contextmanager

@@ -13,9 +13,10 @@ from playground import registry
 from playground.envs.base import Env
 from playground.hardware.setup import Hardware, setup, this_machine
 from playground.learning.algorithms import make_learner
-from playground.learning.checkpoints import Checkpoint, find_checkpoints
+from playground.learning.checkpoints import Checkpoint
 from playground.learning.learner import Learner, Policy
 from playground.runs.run_dir import RunDirectory
+from playground.runs.start import weights_of
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
@@ -72,7 +73,7 @@ def load_trained(
   """Reads a run's newest checkpoint, or the checkpoint given.
 
   Args:
-    path: a run directory, or one of its checkpoints.
+    path: a run directory, one of its checkpoints, or `pretrained:<task>`.
     load_task: makes the task of a name and a configuration; `registry.load` if None.
     platform: what to compute on; the run's, as far as this machine has it, if None.
     precision: of the networks' matrix products; the run's if None.
@@ -80,7 +81,7 @@ def load_trained(
   Raises:
     PlaygroundError: no such run or checkpoint, or one that is damaged or does not fit.
   """
-  checkpoint = Checkpoint(find_checkpoints(path)[0])
+  checkpoint = weights_of(path)
   run_dir = RunDirectory.open(checkpoint.path.parents[1])
   config = configs.from_saved(run_dir.config)
   hardware_config = this_machine(config.hardware)

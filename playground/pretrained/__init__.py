@@ -1,0 +1,138 @@
+"""Policies that come with the package: `pretrained:<task>` wherever a run or a checkpoint is named.
+
+Each is a run directory in `policies/<task>/` without what only resuming needs: configuration, metrics, the newest
+checkpoint's policy, the ONNX file with its contract, and `card.yaml`: how it was trained, what it reaches, and the
+SHA-256 of every file. `playground pretrained` lists them; `add` makes one from a run.
+"""
+
+import hashlib
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from playground.errors import CheckpointError, UnknownNameError, nearest
+
+PREFIX = "pretrained:"
+POLICIES = Path(__file__).parent / "policies"
+CARD = "card.yaml"
+_COPIES = Path("results/pretrained")
+_MEANING = ("observations", "observation_frames", "action_scale", "ctrl_dt")  # of an env section, for a policy
+
+
+def cards() -> dict[str, dict[str, Any]]:
+  """The card of each policy, by task."""
+  return {path.parent.name: yaml.safe_load(path.read_text()) for path in sorted(POLICIES.glob(f"*/{CARD}"))}
+
+
+def locate(name: str) -> str:
+  """The path that a name stands for: `pretrained:<task>` is a folder of this package, every other name itself.
+
+  Raises:
+    UnknownNameError: there is no pretrained policy of that task.
+    CheckpointError: a file is missing, or is another than when the policy was added.
+  """
+  if not name.startswith(PREFIX):
+    return name
+  task, known = name.removeprefix(PREFIX), [path.parent.name for path in sorted(POLICIES.glob(f"*/{CARD}"))]
+  if task not in known:
+    raise UnknownNameError(f"{name}: there are pretrained policies of {', '.join(known)}.{nearest(task, known)}")
+  folder = POLICIES / task
+  for file, sha256 in yaml.safe_load((folder / CARD).read_text())["sha256"].items():
+    if not (folder / file).is_file() or _sha256(folder / file) != sha256:
+      raise CheckpointError(f"{folder / file} is not the file that was trained: install the package again.")
+  return str(folder)
+
+
+def working_copy(name: str, tasks: Mapping[str, Any] | list[str]) -> str:
+  """The path that a name stands for, in a folder that results can be written to.
+
+  A pretrained policy is copied to `results/pretrained/<task>` when it is asked for first.
+
+  Args:
+    name: a path, `pretrained:<task>`, or the name of a task, which means the same where no such path exists.
+    tasks: the names of all tasks.
+
+  Raises:
+    PlaygroundError: what `locate` raises, or the folder cannot be written to.
+  """
+  if name in tasks and not Path(name).exists():
+    name = PREFIX + name
+  if not name.startswith(PREFIX):
+    return name
+  source = Path(locate(name))
+  copy = _COPIES / source.name
+  try:
+    if not copy.is_dir() or (copy / CARD).read_bytes() != (source / CARD).read_bytes():
+      copy.parent.mkdir(parents=True, exist_ok=True)
+      with tempfile.TemporaryDirectory(dir=copy.parent) as scratch:
+        shutil.copytree(source, Path(scratch) / source.name)
+        if copy.exists():
+          copy.rename(Path(scratch) / "old")
+        (Path(scratch) / source.name).rename(copy)
+  except OSError as error:
+    raise CheckpointError(f"{copy} cannot be written: {error.strerror}.") from error
+  return str(copy)
+
+
+def check_task(folder: Path, saved: Mapping[str, Any], today: Mapping[str, Any]) -> None:
+  """Raises CheckpointError if a pretrained policy's task observes or acts otherwise today.
+
+  Args:
+    folder: the policy's.
+    saved: the env section that it was trained with.
+    today: the task's.
+  """
+  for key in _MEANING:
+    if _without_noise(saved.get(key)) != _without_noise(today.get(key)):
+      raise CheckpointError(
+        f"The pretrained policy {folder.name} does not fit its task any more: env.{key} has changed since it was "
+        f"trained; train anew with playground-run env={folder.name}."
+      )
+
+
+def _without_noise(value: Any) -> Any:
+  """A part of an env section as it bears on what a policy's inputs mean."""
+  if isinstance(value, Mapping):
+    return [(key, _without_noise(entry)) for key, entry in value.items() if key != "noise" and entry is not None]
+  return list(value) if isinstance(value, list | tuple) else value
+
+
+def _sha256(file: Path) -> str:
+  return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def is_pretrained(folder: Path) -> bool:
+  """Whether a run directory is a pretrained policy, or a copy of one."""
+  return (folder / CARD).is_file()
+
+
+def add(run: Path, task: str, facts: Mapping[str, Any]) -> Path:
+  """Copies a run's policy into the package and writes its card.
+
+  Args:
+    run: a run directory with `export/policy.onnx`.
+    task: its task.
+    facts: what the card says beside the files' hashes.
+
+  Returns:
+    The folder.
+  """
+  folder = POLICIES / task
+  step = max((run / "checkpoints").glob("[0-9]*"), key=lambda path: int(path.name))
+  shutil.rmtree(folder, ignore_errors=True)
+  folder.mkdir(parents=True)
+  for name in ("config.yaml", "overrides.yaml", "manifest.json", "metrics.csv"):
+    shutil.copyfile(run / name, folder / name)
+  keep = shutil.ignore_patterns("state", "replay")
+  shutil.copytree(step, folder / "checkpoints" / step.name, ignore=keep)
+  (folder / "export").mkdir()
+  for name in ("policy.onnx", "policy.yaml"):
+    shutil.copyfile(run / "export" / name, folder / "export" / name)
+  files = sorted(path for path in folder.rglob("*") if path.is_file())
+  hashes = {str(path.relative_to(folder)): _sha256(path) for path in files}
+  (folder / CARD).write_text(yaml.safe_dump({**facts, "sha256": hashes}, sort_keys=False, width=120))
+  return folder

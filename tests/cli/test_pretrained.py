@@ -1,0 +1,36 @@
+"""`playground pretrained`: a run's policy becomes one that comes with the package."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from rich.console import Console
+
+from playground import pretrained
+from playground.cli.pretrained import add_policy, show_policies
+from playground.config import compose
+from playground.errors import ConfigError
+from playground.runs.start import weights_of
+from playground.runs.train import train
+from tests.runs.helpers import TASK
+
+
+def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  pytest.importorskip("onnxruntime")
+  monkeypatch.setattr(pretrained, "POLICIES", tmp_path / "policies")
+  monkeypatch.chdir(tmp_path)
+  run = tmp_path / "run"
+  assert train(compose([*TASK, "agent.num_timesteps=320", "agent.num_evals=2", f"run_dir={run}"])) == 0
+  assert add_policy(str(run)) == 0
+  (folder,) = (tmp_path / "policies").iterdir()
+  card = yaml.safe_load((folder / "card.yaml").read_text())
+  checkpoint = weights_of(f"pretrained:{folder.name}")
+  assert (card["task"], card["steps"], card["c_mujoco"]["episodes"]) == (folder.name, checkpoint.step, 20)
+  assert not checkpoint.has("state")
+  console = Console(record=True, width=120)
+  assert show_policies(console) == 0
+  assert f"{card['c_mujoco']['return']:.1f} ±" in console.export_text()
+  metrics = run / "metrics.csv"
+  metrics.write_text(metrics.read_text().splitlines()[0] + "\n")
+  with pytest.raises(ConfigError, match="was not evaluated at its newest checkpoint"):
+    add_policy(str(run))
