@@ -1,5 +1,7 @@
-"""Pages that `make docs` makes: the reference, from docstrings and configs/, and the notebook's."""
+"""Pages that `make docs` makes: the reference, from docstrings, settings classes and configs/, and the notebook's."""
 
+import dataclasses
+import inspect
 import itertools
 import json
 from collections.abc import Iterator
@@ -8,6 +10,10 @@ from pathlib import Path
 import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+
+from playground.config.definitions import RunSettings, defined
+from playground.settings import Setting, settings
+from playground.sweep.options import SweepConfig
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "docs/first_policy.ipynb"
@@ -59,12 +65,15 @@ def _api_page(title: str, modules: list[str]) -> str:
 def _groups() -> list[str]:
   """The configuration's groups, that of config.yaml itself ("") first, and each tuned set's agent as a group."""
   configs = ROOT / "configs"
-  return ["", *sorted({path.parent.relative_to(configs).as_posix() for path in configs.glob("*/**/*.yaml")})]
+  of_files = {path.parent.relative_to(configs).as_posix() for path in configs.glob("*/**/*.yaml")}
+  return ["", *sorted(of_files | set(defined()))]
 
 
 def _group_page(group: str) -> str:
-  """Every option of a group: the comment at its head, its keys, their values and what is said of them."""
+  """Every option of a group, those of classes first: what it is, its keys, their values and what is said of them."""
   parts = [f"# {f'configs/{group}' if group else 'config.yaml'}\n"]
+  classes = defined().get(group, {}) if group else {"A run": RunSettings, "A sweep": SweepConfig}
+  parts += [_class_section(name, cls) for name, cls in classes.items()]
   shared_first = lambda path: (path.stem[0].isupper(), path.stem)
   for path in sorted((ROOT / "configs" / group).glob("*.yaml"), key=shared_first):
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -80,6 +89,21 @@ def _group_page(group: str) -> str:
     if rows:
       parts.append("\n".join(["| key | value | |", "|---|---|---|", *rows]) + "\n")
   return "\n".join(parts)
+
+
+def _class_section(name: str, cls: type) -> str:
+  """The settings that a class defines."""
+  head = [f"## {name}\n", f"{_text(inspect.getdoc(cls) or '')}\n"]
+  rows = [_setting_row(setting) for setting in settings(cls).values() if setting.default is not dataclasses.MISSING]
+  return "\n".join([*head, "| key | default | allowed | |", "|---|---|---|---|", *filter(None, rows), ""])
+
+
+def _setting_row(setting: Setting) -> str:
+  if isinstance(setting.default, dict) and setting.default:  # a nested class: its fields have rows of their own
+    return ""
+  allowed = ", ".join(map(_code, setting.choices)) if setting.choices else str(setting.limit or "")
+  allowed += " or null" if setting.nullable and allowed else ""
+  return f"| {_code(setting.name)} | {_code(_flow(setting.default))} | {allowed} | {_text(setting.help)} |"
 
 
 def _keys(node: yaml.Node | None, lines: list[str], prefix: str = "") -> Iterator[tuple[str, str, str]]:

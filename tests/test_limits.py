@@ -9,16 +9,18 @@ import pytest
 import yaml
 
 from playground.config import compose, compose_settings, config_roots, override_section
+from playground.config.definitions import RunSettings, defined, definition
 from playground.config.limits import _OF_TERMS as OF_TERMS
-from playground.config.limits import limit_of, text_depth
+from playground.config.limits import limit_of
+from playground.envs.options import VisionConfig
 from playground.errors import ConfigError
-from playground.learning.hyperparameters import agent_names
 from playground.limits import MOST, SEED, Limit, count, positive, span
 from playground.mdp.terms import MODULES, registered
+from playground.settings import defaults, settings
+from playground.sweep.options import SweepConfig
 
-# Folders of configs/ and the section that their files are of.
-SECTIONS = {"agent": "agent", "env": "env", "robot": "env.robot", "hardware": "hardware", "tracking": "tracking"}
-SECTIONS |= {"launcher": "launcher", "search": "search"}
+# Folders of configs/ whose files define keys, and the section that they are of; the other keys are classes'.
+SECTIONS = {"env": "env", "robot": "env.robot"}
 
 
 def leaves(node: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
@@ -30,17 +32,6 @@ def leaves(node: Mapping[str, Any], key: str) -> Iterator[tuple[str, Any]]:
       yield inner, value
 
 
-def defined() -> Iterator[tuple[str, str, Any]]:
-  """File, dotted key and value of all that our files define."""
-  root = config_roots()[0]
-  files = [(root / "config.yaml", ""), (root / "sweep.yaml", ""), (root / "curriculum/none.yaml", "curriculum")]
-  files += [(path, section) for folder, section in SECTIONS.items() for path in (root / folder).glob("*.yaml")]
-  for path, section in files:
-    for key, value in leaves(yaml.safe_load(path.read_text()) or {}, section):
-      if not key.startswith(("hydra.", "defaults")) and not OF_TERMS.match(key):
-        yield f"{path.parent.name}/{path.name}", key, value
-
-
 def takes_a_number(value: Any) -> bool:
   """Whether a default is a number, has numbers or says nothing of what may stand there (null, an empty list)."""
   if isinstance(value, list):
@@ -48,13 +39,48 @@ def takes_a_number(value: Any) -> bool:
   return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-def test_every_number_has_limits() -> None:
-  missing = [
-    f"{file}: {key}={value}"
-    for file, key, value in defined()
-    if takes_a_number(value) and text_depth(key) is None and not any(limit_of(key, agent) for agent in agent_names())
-  ]
-  assert not missing, "give these a limit, where they are defined or in playground/config/limits.py, or say text"
+def test_every_number_of_a_file_has_limits() -> None:
+  root, missing = config_roots()[0], []
+  for path, section in ((path, section) for folder, section in SECTIONS.items() for path in (root / folder).glob("*")):
+    for key, value in leaves(yaml.safe_load(path.read_text()) or {}, section) if path.suffix == ".yaml" else ():
+      setting = definition(key, {})
+      text = setting is not None and setting.text_depth is not None
+      if takes_a_number(value) and not OF_TERMS.match(key) and not text and not limit_of(key, {}):
+        missing.append(f"{path.name}: {key}={value}")
+  assert not missing, "give these a limit in playground/config/limits.py, or say text in playground/envs/options.py"
+
+
+def classes() -> dict[str, type]:
+  grouped = {f"{g}={name}": cls for g, options in defined().items() if g != "agent" for name, cls in options.items()}
+  return {**grouped, "run": RunSettings, "sweep": SweepConfig}
+
+
+@pytest.mark.parametrize("name", classes())
+def test_every_setting_of_a_class_has_limits_and_help(name: str) -> None:
+  for setting in settings(classes()[name]).values():
+    if isinstance(setting.default, dict) and setting.default:
+      continue  # a nested class
+    text = setting.choices is not None or setting.text_depth is not None
+    assert text or setting.limit or not takes_a_number(setting.default), f"{setting.name} has no limit"
+    assert setting.limit is None or setting.default is None or setting.limit.allows(setting.default), setting.name
+    assert setting.choices is None or setting.default in setting.choices, setting.name
+    assert setting.help and len(setting.help) <= 110, f"{setting.name} has no line of help"
+
+
+@pytest.mark.parametrize("option", [f"{g}={name}" for g, found in defined().items() if g != "agent" for name in found])
+def test_the_command_line_has_the_defaults_of_the_classes(option: str) -> None:
+  group, _, name = option.partition("=")
+  composed = compose_settings([option]).to_dict() if group in ("launcher", "search") else compose([option]).resolved
+  section = {key: value for key, value in composed[group].items() if key != "name"}
+  assert section == defaults(defined()[group][name])
+
+
+def test_a_run_has_the_defaults_of_its_class() -> None:
+  resolved = compose(["env=CartpoleBalance"]).resolved
+  expected = defaults(RunSettings)
+  assert {key: resolved[key] for key in expected if key != "env"} == {k: v for k, v in expected.items() if k != "env"}
+  assert resolved["env"]["vision"] == defaults(VisionConfig)
+  assert dict(compose_settings([])).items() >= defaults(SweepConfig).items()
 
 
 @pytest.mark.parametrize("kind", MODULES)

@@ -23,10 +23,12 @@ from playground.config.overrides import Override, parse
 from playground.config.schema import wrong_type
 from playground.config.text import format_value
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
+from playground.runs.options import CurriculumConfig
+from playground.settings import defaults
 
 _FIELDS = ("num_timesteps", "overrides")
 _SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # by a stage: groups and sections
-SINGLE_RUN = {"scale": 1.0, "start_at": None, "stages": {}}  # curriculum=none
+SINGLE_RUN = defaults(CurriculumConfig)  # curriculum=none
 
 
 def stage_folders(curriculum: Mapping[str, Any]) -> dict[str, str]:

@@ -27,6 +27,7 @@ from playground.config.chains import (
   stage_folders,
   stage_overrides,
 )
+from playground.config.definitions import chosen_names, register
 from playground.config.files import DELTAS, config_roots, groups, lineage, options, search_path_override
 from playground.config.limits import check_limits, check_vision
 from playground.config.overrides import (
@@ -143,7 +144,8 @@ def from_saved(resolved: Mapping[str, Any], config_dir: Path | None = None) -> R
   ]
   today = _plain(_hydra(chosen, roots)[0])
   filled = {
-    section: _fit_known(_fill(saved.resolved[section], today[section]), today[section], section) for section in SECTIONS
+    section: _fit_known(_fill(saved.resolved[section], today[section]), today[section], section, chosen_names(today))
+    for section in SECTIONS
   }
   check_limits(filled)
   hardware = filled["hardware"]  # what only a command line says, see `is_of_command`
@@ -158,16 +160,16 @@ def saved_section(section: str, saved: Mapping[str, Any], default: Mapping[str, 
   Raises:
     ConfigError: a value of another type than its default, or one that cannot work.
   """
-  fitted = _fit_known(_fill(saved, default), default, section)
+  fitted = _fit_known(_fill(saved, default), default, section, {})
   check_limits({section: fitted})
   return fitted
 
 
-def _fit_known(value: Any, default: Any, key: str) -> Any:
+def _fit_known(value: Any, default: Any, key: str, names: Mapping[str, Any]) -> Any:
   """As `fit`, but keys that the default lacks are left as they are."""
   if not (isinstance(default, Mapping) and default and isinstance(value, Mapping)) or is_terms(key):
-    return fit(value, default, key)
-  known = {name: _fit_known(value[name], default[name], join(key, name)) for name in default if name in value}
+    return fit(value, default, names, key)
+  known = {name: _fit_known(value[name], default[name], join(key, name), names) for name in default if name in value}
   return {**value, **known}
 
 
@@ -238,6 +240,7 @@ def _hydra(
   """Hydra's composition of `<name>.yaml`, and what it chose for each group."""
   outer = GlobalHydra.instance().hydra  # the app's, if this is called within it: Hydra allows one at a time
   GlobalHydra.instance().clear()
+  register()
   try:
     with hydra.initialize_config_dir(str(roots[0]), version_base="1.3"):
       lines = [*overrides, *search_path_override(roots)]
@@ -270,7 +273,7 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Mapping[st
         raise ConfigError(f"{override.text}: {first_line(error)}.") from None
     if missing := OmegaConf.missing_keys(config):
       raise ConfigError(f"{min(missing)} has no value: set {min(missing)}=<value>.")
-    return fit(OmegaConf.to_container(config, resolve=True), schema)
+    return fit(OmegaConf.to_container(config, resolve=True), schema, chosen_names(schema))
   except OmegaConfBaseException as error:
     raise ConfigError(f"{first_line(error)}.") from None
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import yaml
 
+from playground.config.definitions import defined
 from playground.config.text import first_line
 
 ENTRY_POINTS = "playground.tasks"
@@ -28,14 +29,19 @@ def config_roots(config_dir: Path | None = None) -> list[Path]:
 
 def groups(roots: Iterable[Path]) -> list[str]:
   """Names of all groups, sorted."""
-  return sorted({folder.name for root in roots for folder in root.iterdir() if folder.is_dir()})
+  return sorted({folder.name for root in roots for folder in root.iterdir() if folder.is_dir()} | set(defined()))
 
 
 def options(group: str, roots: Iterable[Path] | None = None) -> list[str]:
-  """Names of a group's options, sorted; files whose name begins with an underscore are parts that options share."""
+  """Names of a group's options, sorted: those that a class defines, and files.
+
+  Files whose name begins with an underscore are parts that options share.
+  """
   folders = [root / group for root in (config_roots() if roots is None else roots)]
   files = [(path, folder) for folder in folders for path in folder.rglob("*.yaml") if not path.stem.startswith("_")]
-  return sorted({path.relative_to(folder).with_suffix("").as_posix() for path, folder in files})
+  return sorted(
+    {path.relative_to(folder).with_suffix("").as_posix() for path, folder in files} | set(defined().get(group, ()))
+  )
 
 
 def lineage(group: str, option: str, roots: Iterable[Path]) -> list[str]:

@@ -4,13 +4,13 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from playground.config.definitions import definition
 from playground.config.files import DELTAS
 from playground.config.moved import check_not_moved
 from playground.config.text import format_value, join, nearest_in
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.options import OPTIONS, keys
 
-_MAY_BE_NULL = ("env.robot.pd", "env.reward_clip")  # mappings and lists that null switches off
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", list: "a list"}
 
 
@@ -51,13 +51,14 @@ def is_terms(key: str) -> bool:
   return key.startswith("env.") and key[4:] in OPTIONS
 
 
-def fit(value: Any, default: Any, key: str = "") -> Any:
+def fit(value: Any, default: Any, names: Mapping[str, Any], key: str = "") -> Any:
   """Returns a value in the type of its default, e.g. 1e6 as the whole number that the default is.
 
   Args:
     value: of the configuration, or a part of it.
     default: the same part of the schema; None and ??? (no default) take any single value or list, an empty mapping any
       mapping.
+    names: the chosen agent, launcher and search, as `definition` takes them.
     key: where the part is, for errors.
 
   Raises:
@@ -66,12 +67,12 @@ def fit(value: Any, default: Any, key: str = "") -> Any:
   """
   if is_terms(key):
     return _fit_terms(value, key)
-  if value is None and key in _MAY_BE_NULL:
+  if value is None and (setting := definition(key, names)) and setting.nullable:
     return None
   if isinstance(default, Mapping) and default:
-    return _fit_mapping(value, default, key)
+    return _fit_mapping(value, default, names, key)
   if isinstance(default, list) and isinstance(value, list):
-    return _fit_list(value, default, key)
+    return _fit_list(value, default, names, key)
   if default is None or default == "???":
     if isinstance(value, Mapping):
       raise wrong_type(key, value, "a single value, a list or null")
@@ -120,17 +121,17 @@ def _check_mappings(entry: Mapping[str, Any], key: str) -> None:
       raise wrong_type(join(key, name), entry[name], "a mapping or null")
 
 
-def _fit_mapping(value: Any, default: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _fit_mapping(value: Any, default: Mapping[str, Any], names: Mapping[str, Any], key: str) -> dict[str, Any]:
   if not isinstance(value, Mapping):
     raise wrong_type(key, value, f"a mapping with the keys {', '.join(map(str, default))}")
   for name in value:
     if name not in default:
       near = nearest_in(key, str(name), default)
       raise UnknownNameError(f"{join(key, name)}, set by a chosen file or mapping, does not exist.{near}")
-  return {name: fit(value[name], default[name], join(key, name)) for name in value}
+  return {name: fit(value[name], default[name], names, join(key, name)) for name in value}
 
 
-def _fit_list(value: list[Any], default: list[Any], key: str) -> list[Any]:
+def _fit_list(value: list[Any], default: list[Any], names: Mapping[str, Any], key: str) -> list[Any]:
   """Lists may differ in length; if the default's entries are all of one scalar type, so must the value's be."""
   kinds = {type(entry) for entry in default}
   if float in kinds:
@@ -138,7 +139,7 @@ def _fit_list(value: list[Any], default: list[Any], key: str) -> list[Any]:
   if len(kinds) != 1 or not kinds <= {bool, int, float, str}:
     return value
   sample = next(entry for entry in default if type(entry) in kinds)
-  return [fit(entry, sample, f"{key}[{i}]") for i, entry in enumerate(value)]
+  return [fit(entry, sample, names, f"{key}[{i}]") for i, entry in enumerate(value)]
 
 
 def _unknown_key(key: str, parent: str, part: str, node: Any, schema: Mapping[str, Any]) -> UnknownNameError:

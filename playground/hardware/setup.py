@@ -3,7 +3,7 @@
 import dataclasses
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 from jax.sharding import Mesh
@@ -11,8 +11,9 @@ from jax.sharding import Mesh
 from playground.errors import ConfigError, HardwareError
 from playground.hardware.distributed import join
 from playground.hardware.mesh import make_mesh
+from playground.hardware.options import Precision
 
-PRECISIONS = ("highest", "float32", "tensorfloat32", "high", "bfloat16", "default")
+PRECISIONS: tuple[str, ...] = get_args(Precision)
 CACHE = Path("~/.cache/playground")
 
 

@@ -1,0 +1,113 @@
+"""The typed definition of each key: which settings class a section has, and what Hydra knows of those classes.
+
+A section's class lies beside the component that reads it. What a class defines is no file: `hardware=auto`, `agent=ppo`
+and the other options below are registered with Hydra, and files hold what differs.
+"""
+
+import dataclasses
+import functools
+import warnings
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from hydra.core.config_store import ConfigStore
+
+from playground.envs.options import EnvConfig, TaskKeys
+from playground.errors import PlaygroundError
+from playground.hardware.options import HardwareConfig
+from playground.learning.hyperparameters import agent_names, config_class
+from playground.limits import SEED
+from playground.runs.options import (
+  CheckpointConfig,
+  CurriculumConfig,
+  NonfiniteConfig,
+  ProfileConfig,
+  TrackingConfig,
+  VideoConfig,
+)
+from playground.settings import Setting, defaults, settings
+from playground.sweep.options import LAUNCHERS, SEARCHES, SweepConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSettings:
+  """Settings of a run that no group chooses."""
+
+  seed: Annotated[int, SEED, "of the whole run"] = 1
+  run_dir: Annotated[str | None, "the run's folder; null is results/<experiment or task>/<date_time>"] = None
+  resume: Annotated[str | None, "a run directory: continue exactly that run"] = None
+  init_from: Annotated[str | None, "a run directory or checkpoint: a new run from its weights"] = None
+  checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
+  video: VideoConfig = dataclasses.field(default_factory=VideoConfig)
+  env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+  on_nonfinite: NonfiniteConfig = dataclasses.field(default_factory=NonfiniteConfig)
+  profile: ProfileConfig = dataclasses.field(default_factory=ProfileConfig)
+
+
+def agents() -> dict[str, type]:
+  """Returns the settings class of each `agent.name`; an entry point that is broken is skipped with a warning."""
+  found: dict[str, type] = {}
+  for name in agent_names():
+    try:
+      found[name] = config_class(name)
+    except PlaygroundError as error:
+      warnings.warn(str(error), stacklevel=2)
+  return found
+
+
+@functools.cache
+def defined() -> dict[str, dict[str, type]]:
+  """Returns, by group, the options that a class defines, each with its class."""
+  return {
+    "agent": agents(),
+    "curriculum": {"none": CurriculumConfig},
+    "hardware": {"auto": HardwareConfig},
+    "tracking": {"csv": TrackingConfig},
+    "launcher": dict(LAUNCHERS),
+    "search": SEARCHES,
+  }
+
+
+@functools.cache
+def register() -> None:
+  """Registers the defaults of all settings with Hydra, once."""
+  store = ConfigStore.instance()
+  store.store("run_settings", defaults(RunSettings))
+  store.store("sweep_settings", defaults(SweepConfig))
+  for group, classes in defined().items():
+    if group == "agent":
+      continue
+    for name, cls in classes.items():
+      named = {"name": name} if group in ("agent", "launcher", "search") else {}
+      store.store(name, {**named, **defaults(cls)}, group=group, package=group)
+
+
+def definition(key: str, names: Mapping[str, Any]) -> Setting | None:
+  """Returns the definition of a dotted key; None if it is a file's alone, such as a task's own.
+
+  Args:
+    key: such as agent.learning_rate.
+    names: `agent`, `launcher` and `search`: the name of the chosen one.
+  """
+  section, _, rest = key.partition(".")
+  if section == "agent":
+    return _look_up(config_class(str(names["agent"])), rest) if "agent" in names else None
+  if section in ("launcher", "search"):
+    cls = defined()[section].get(str(names.get(section)))
+    return _look_up(cls, rest) if cls else None
+  if section in ("curriculum", "hardware", "tracking"):
+    return _look_up(next(iter(defined()[section].values())), rest)
+  if section == "env":
+    return _look_up(EnvConfig, rest) or _look_up(TaskKeys, rest)
+  return _look_up(RunSettings, key) or _look_up(SweepConfig, key)
+
+
+def chosen_names(resolved: Mapping[str, Any]) -> dict[str, Any]:
+  """Returns the `names` of `definition` for a configuration, which may lack these sections."""
+  sections = {section: resolved.get(section) for section in ("agent", "launcher", "search")}
+  return {section: value.get("name") for section, value in sections.items() if isinstance(value, Mapping)}
+
+
+def _look_up(cls: type, name: str) -> Setting | None:
+  found = settings(cls)
+  return found.get(name) or found.get(f"{name.rpartition('.')[0]}.*")

@@ -1,0 +1,72 @@
+"""Settings of `env` that every task has, and those of several tasks that are texts or may be null.
+
+The file of a task (configs/env/<TaskName>.yaml) adds the settings of its class and may change the defaults of these.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from playground.limits import count, positive, span
+
+TERMS = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class VisionConfig:
+  """Settings of what a camera sees as the observation pixels/<camera> (docs/vision.md)."""
+
+  enable: Annotated[bool, "whether the task observes pixels"] = False
+  camera: Annotated[str | None, "name of one of the model's cameras"] = None
+  image: Annotated[
+    Literal["rgb", "gray", "depth", "segmentation"], "segmentation is a geom's id and 1, 0 for nothing"
+  ] = "rgb"
+  width: Annotated[int, count(1, 4096), "pixels"] = 64
+  height: Annotated[int, count(1, 4096), "pixels"] = 64
+  frames: Annotated[int, count(1, 1000), "this image and the ones before it, newest last"] = 1
+  brightness: Annotated[Sequence[float], span(), "factor on all pixels, drawn for every episode"] = (1.0, 1.0)
+  farthest: Annotated[float, positive(), "distance at which a depth image is white, m"] = 5.0
+  shadows: Annotated[bool, "whether shadows are drawn"] = False
+  textures: Annotated[bool, "whether textures are drawn"] = False
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+  """Settings that every task has."""
+
+  episode_length: Annotated[int, count(1, 2**24), "control steps"] = 1000
+  action_repeat: Annotated[int, count(1, 1000), "control steps that take the same action"] = 1
+  impl: Annotated[Literal["auto", "jax", "warp"], "backend of physics; auto: cuda_impl on an NVIDIA GPU, else jax"] = (
+    "auto"
+  )
+  cuda_impl: Annotated[str, "what auto is on an NVIDIA GPU: the faster backend as measured"] = "jax"
+  naconmax_per_env: Annotated[int, count(0), "Warp: contacts of one environment, on average over the batch"] = 0
+  naccdmax_per_env: Annotated[
+    int | None, count(0), "Warp: of these, those of the convex collision routines; null: as many"
+  ] = None
+  njmax: Annotated[int, count(0), "Warp: constraint rows of one environment"] = 0
+  rewards: Annotated[TERMS, "reward terms by name (docs/add-a-reward.md)"] = dataclasses.field(default_factory=dict)
+  terminations: Annotated[TERMS, "termination terms by name"] = dataclasses.field(default_factory=dict)
+  events: Annotated[TERMS, "event terms by name"] = dataclasses.field(default_factory=dict)
+  vision: Annotated[VisionConfig, "observations of pixels"] = dataclasses.field(default_factory=VisionConfig)
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotKeys:
+  """Settings of `env.robot` that are texts or may be null."""
+
+  mjcf: Annotated[str | None, "file of the robot's MJCF"]
+  foot_pos: Annotated[Sequence[str] | None, "names of the sensors of the feet's positions"]
+  foot_contact: Annotated[Sequence[Sequence[str]] | None, "names of the sensors of each foot's contacts"]
+  pd: Annotated[Mapping[str, Any] | None, "gains of the position actuators; null keeps those of the MJCF"]
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskKeys:
+  """Settings of some tasks that are texts or may be null."""
+
+  reward_clip: Annotated[Sequence[float] | None, span(-1e9), "range that a step's reward is clipped to; null is none"]
+  observation_order: Annotated[
+    Mapping[str, Sequence[str]], "by group: terms that come first in its vector; the others follow as they are listed"
+  ]
+  robot: RobotKeys

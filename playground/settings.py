@@ -1,0 +1,115 @@
+"""Settings as typed fields of dataclasses: type, default, limit and one line of help in one place.
+
+```python
+@dataclasses.dataclass(frozen=True)
+class VideoConfig:
+  width: Annotated[int, count(1, 8192), "pixels"] = 640
+  visuals: Annotated[Literal["primitives", "menagerie"], "geoms that are drawn"] = "primitives"
+```
+
+Composition takes the defaults of `configs/` from these classes, checks values with them and quotes their choices; the
+reference pages show them. Nothing here imports JAX.
+"""
+
+import dataclasses
+import functools
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from playground.limits import Limit
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+  """One field of a settings class.
+
+  Attributes:
+    name: the field, dotted for a field of a nested class.
+    default: as YAML has it; `dataclasses.MISSING` if the field has none.
+    limit: of the numbers, None if there is none.
+    choices: the allowed texts, None if any is allowed.
+    text_depth: 0 for text, 1 for a list of texts, 2 for a list of such lists; None if it is no text.
+    nullable: whether null is allowed.
+    help: one line.
+  """
+
+  name: str
+  default: Any
+  limit: Limit | None
+  choices: tuple[str, ...] | None
+  text_depth: int | None
+  nullable: bool
+  help: str
+
+
+@functools.cache
+def settings(cls: type) -> dict[str, Setting]:
+  """Returns all fields of a settings class by dotted name, those of nested classes included."""
+  return {setting.name: setting for setting in _settings(cls)}
+
+
+def defaults(cls: type) -> dict[str, Any]:
+  """Returns the default values of a settings class as nested plain values; fields without one are left out."""
+  hints = get_type_hints(cls, include_extras=True)
+  values = {field.name: _default(field, hints[field.name]) for field in dataclasses.fields(cls)}
+  return {name: value for name, value in values.items() if value is not dataclasses.MISSING}
+
+
+def nested(hint: Any) -> type | None:
+  """Returns the settings class that an annotation names, None if it names another type."""
+  kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+  return kind if dataclasses.is_dataclass(kind) and isinstance(kind, type) else None
+
+
+def plain(value: Any) -> Any:
+  """Returns nested mappings, lists and scalars for a value that may hold dataclasses and tuples."""
+  if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+  if isinstance(value, Mapping):
+    return {key: plain(entry) for key, entry in value.items()}
+  return [plain(entry) for entry in value] if isinstance(value, list | tuple) else value
+
+
+def _settings(cls: type, prefix: str = "") -> Iterator[Setting]:
+  hints = get_type_hints(cls, include_extras=True)
+  for field in dataclasses.fields(cls):
+    hint, name = hints[field.name], f"{prefix}{field.name}"
+    metadata = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+    kind = get_args(hint)[0] if metadata else hint
+    options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    depths = [_text_depth(option) for option in options]
+    yield Setting(
+      name=name,
+      default=_default(field, hint),
+      limit=next((entry for entry in metadata if isinstance(entry, Limit)), None),
+      choices=next((get_args(option) for option in options if get_origin(option) is Literal), None),
+      text_depth=next((depth for depth in depths if depth is not None), None),
+      nullable=type(None) in options,
+      help=next((entry for entry in metadata if isinstance(entry, str)), ""),
+    )
+    inner = nested(hint)
+    if inner is not None:
+      yield from _settings(inner, f"{name}.")
+    for option in options:
+      if get_origin(option) is Mapping and get_args(option)[1] is not Any:
+        depth = _text_depth(get_args(option)[1])
+        yield Setting(f"{name}.*", dataclasses.MISSING, None, None, depth, False, "")
+
+
+def _default(field: dataclasses.Field[Any], hint: Any) -> Any:
+  inner = nested(hint)
+  if inner is not None and field.default_factory is dataclasses.MISSING and field.default is dataclasses.MISSING:
+    return defaults(inner)
+  value = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+  return value if value is dataclasses.MISSING else plain(value)
+
+
+def _text_depth(kind: Any) -> int | None:
+  """How deep texts are nested in lists; None if the type holds none."""
+  if kind is str:
+    return 0
+  if get_origin(kind) is Sequence:
+    inner = _text_depth(get_args(kind)[0])
+    return None if inner is None else inner + 1
+  return None
