@@ -97,7 +97,7 @@ class Point(PointTask):
 
 SMALL_PPO = PPOConfig(
   num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, unroll_length=5, batch_size=8, num_minibatches=4,
-  num_updates_per_batch=2, learning_rate=3e-3, discounting=0.95, normalize_observations=True,
+  num_updates_per_batch=2, learning_rate=3e-3, discounting=0.95, entropy_cost=1e-4, normalize_observations=True,
   network=NetworkConfig((16, 16), (16, 16), value_obs_key="privileged_state"),
 )  # fmt: skip
 SMALL_SAC = SACConfig(

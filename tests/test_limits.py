@@ -51,7 +51,7 @@ def test_every_number_of_a_file_has_limits() -> None:
 
 
 def classes() -> dict[str, type]:
-  grouped = {f"{g}={name}": cls for g, options in defined().items() if g != "agent" for name, cls in options.items()}
+  grouped = {f"{g}={name}": cls for g, options in defined().items() for name, cls in options.items()}
   return {**grouped, "run": RunSettings, "sweep": SweepConfig}
 
 
@@ -67,10 +67,14 @@ def test_every_setting_of_a_class_has_limits_and_help(name: str) -> None:
     assert setting.help and len(setting.help) <= 110, f"{setting.name} has no line of help"
 
 
-@pytest.mark.parametrize("option", [f"{g}={name}" for g, found in defined().items() if g != "agent" for name in found])
+def run(option: str) -> dict[str, Any]:
+  return compose([option, "env=CartpoleBalance", "tuned=null"]).resolved
+
+
+@pytest.mark.parametrize("option", [f"{g}={name}" for g, found in defined().items() for name in found])
 def test_the_command_line_has_the_defaults_of_the_classes(option: str) -> None:
   group, _, name = option.partition("=")
-  composed = compose_settings([option]).to_dict() if group in ("launcher", "search") else compose([option]).resolved
+  composed = compose_settings([option]).to_dict() if group in ("launcher", "search") else run(option)
   section = {key: value for key, value in composed[group].items() if key != "name"}
   assert section == defaults(defined()[group][name])
 

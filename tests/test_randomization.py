@@ -16,9 +16,9 @@ from mujoco import mjx
 from playground.config import config_dict
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError
 from playground.randomization import Randomizer, domain_randomizer, parse_events
-from playground.robots.in_hand import CUBES, build_in_hand_scene
 from playground.robots.scene import build_scene
 from playground.robots.tabletop import build_tabletop
+from tests.robots.figures import HANDS, in_hand_scene
 
 CONFIGS = Path(__file__).parents[1] / "configs/randomization"
 
@@ -147,7 +147,7 @@ DRAWN |= {"panda_vision": [1, 1, 1, 1, 1, 3, 1, 1, 3, 1]}
 def model_of(robot: str) -> mujoco.MjModel:
   if robot == "panda_vision":
     return build_tabletop("panda_single_cube_pixels").compile()
-  build = build_in_hand_scene if robot in CUBES else build_scene
+  build = in_hand_scene if robot in HANDS else build_scene
   return build(robot.removesuffix("_strong")).compile()
 
 
@@ -221,7 +221,7 @@ def test_density_moves_mass_and_inertia_in_proportion(small: mujoco.MjModel) -> 
   assert ratio[small.body("arm").id - 1] == pytest.approx(1) and len(np.unique(ratio)) == 3
 
 
-@pytest.mark.parametrize("hand", CUBES)
+@pytest.mark.parametrize("hand", HANDS)
 def test_a_hands_terms_change_what_the_paper_lists(hand: str) -> None:
   """Friction of the fingertips, cube's mass and centre, joints' calibration, friction and inertia, links, gains."""
   model = model_of(hand)

@@ -31,7 +31,7 @@ class Cartpole(cartpole.Cartpole):
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     cart_key, pole_key, _ = jax.random.split(rng, 3)
-    key = cart_key if self._swing_up else pole_key
+    key = cart_key if self.config.swing_up else pole_key
     return super().initial(rng) | {"qvel": 0.01 * jax.random.normal(key, (2,))}
 
 
@@ -76,11 +76,11 @@ class PendulumSwingup(pendulum.PendulumSwingup):
     return {"qpos": jnp.abs(super().initial(rng)["qpos"])}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    return tolerance(data.xmat[self._pole, 2, 2], (pendulum.UPRIGHT, 1.0)), {}
+    return tolerance(data.xmat[self.body["pole"], 2, 2], (pendulum.UPRIGHT, 1.0)), {}
 
 
 class Walker(walker.Walker):
   """The torso's uprightness is observed in place of its height."""
 
   def observe(self, data: PhysicsData) -> jax.Array:
-    return super().observe(data).at[14].set(data.xmat[self._torso, 2, 2])
+    return super().observe(data).at[14].set(data.xmat[self.body["torso"], 2, 2])

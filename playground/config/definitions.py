@@ -75,8 +75,6 @@ def register() -> None:
   store.store("run_settings", defaults(RunSettings))
   store.store("sweep_settings", defaults(SweepConfig))
   for group, classes in defined().items():
-    if group == "agent":
-      continue
     for name, cls in classes.items():
       named = {"name": name} if group in ("agent", "launcher", "search") else {}
       store.store(name, {**named, **defaults(cls)}, group=group, package=group)

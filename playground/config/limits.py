@@ -28,12 +28,12 @@ _ENV = {
   "ctrl_dt sim_dt": positive(100),
   "robot.restricted_range.*": span(-MOST),
   "action_scale": positive().each,
-  "hinge_damping max_torque stuck_after target_radius": positive(),
+  "hinge_damping max_torque robot.cube.half_size robot.cube.mass stuck_after target_radius": positive(),
   "success_angle success_distance success_threshold": positive(),
   "curriculum.angle curriculum.distance robot.pd.* robot.pose_weights": at_least_0().each,
   "goal.min_turn margin move_speed noise_level pose_noise.* sensor_noise.* settle_s": at_least_0(),
   "scene.terrain_params.* success_wait success_reward termination_reward": Limit(),
-  "robot.gaits.* robot.target_range.*": Limit().each,
+  "robot.cube.start robot.gaits.* robot.target_range.*": Limit().each,
 }
 
 

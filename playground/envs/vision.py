@@ -31,7 +31,7 @@ class Vision(Wrapper):
   jitted, observation_size = Env.jitted, Env.observation_size
 
   def __init__(self, env: Env):
-    """`env`: a task whose config has `vision`, see `configs/config.yaml`.
+    """`env`: a task whose config has `vision`, see `VisionConfig` in options.py.
 
     Raises:
       ConfigError: no camera, one that does not exist, or invalid settings.

@@ -30,13 +30,17 @@ class AgentConfig:
 
   algorithm: ClassVar[str]
 
-  num_timesteps: Annotated[int, count(1, 1e12)]  # control steps in all (action repeats counted), to within one batch
-  num_evals: Annotated[int, count(1, 10_000)] = 10  # evaluations, those before and after training included
-  num_resets_per_eval: Annotated[int, count(0, 1000)] = 0  # resets of all environments between two evaluations
-  num_envs: Annotated[int, count(1, 2**24)] = 2048
-  num_eval_envs: Annotated[int, count(1, 2**24)] = 128
-  normalize_observations: bool = False
-  deterministic_eval: bool = False
+  num_timesteps: Annotated[
+    int, count(1, 1e12), "environment steps in all, action repeats counted, to within one batch"
+  ] = 50_000_000
+  num_evals: Annotated[int, count(1, 10_000), "evaluations, those before and after training included"] = 10
+  num_resets_per_eval: Annotated[
+    int, count(0, 1000), "resets of all environments between two evaluations; 0 is never"
+  ] = 0
+  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 2048
+  num_eval_envs: Annotated[int, count(1, 2**24), "environments of an evaluation"] = 128
+  normalize_observations: Annotated[bool, "whether observations are scaled to mean 0 and standard deviation 1"] = True
+  deterministic_eval: Annotated[bool, "whether evaluations act by the mode of the policy; else they sample"] = False
 
   @classmethod
   def from_config(cls, config: Any) -> Self:
@@ -74,39 +78,58 @@ class AgentConfig:
 class CNNConfig:
   """Layers of a CNN, and what is done before and after them (paper, appendix C.6; Mnih et al., 2015)."""
 
-  channels: Annotated[Sequence[int], SIZES] = (16, 32)
-  kernels: Annotated[Sequence[int], SIZES] = (5, 3)  # pixels, square
-  strides: Annotated[Sequence[int], SIZES] = (2, 2)
-  activation: str = "elu"
-  max_pool: bool = True  # the largest of 2 x 2 pixels after each layer
-  global_pool: str = "none"  # of the last layer: none (all of it), avg, max, spatial_softmax
-  normalize_channels: bool = False  # each channel of a picture to mean 0 and deviation 1
+  channels: Annotated[Sequence[int], SIZES, "of each layer"] = (16, 32)
+  kernels: Annotated[Sequence[int], SIZES, "pixels, square, of each layer"] = (5, 3)
+  strides: Annotated[Sequence[int], SIZES, "pixels, of each layer"] = (2, 2)
+  activation: Annotated[str, "of each layer: elu, relu, swish, tanh and more"] = "elu"
+  max_pool: Annotated[bool, "whether each layer is followed by the maximum of 2 x 2 pixels"] = True
+  global_pool: Annotated[str, "of the last layer: none (all of it), avg, max, spatial_softmax"] = "none"
+  normalize_channels: Annotated[
+    bool, "whether each channel of an image is scaled to mean 0 and standard deviation 1"
+  ] = False
 
 
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:
   """Sizes and inputs of actor and critic, two separate MLPs (Brax's names and defaults)."""
 
-  policy_hidden_layer_sizes: Annotated[Sequence[int], SIZES] = (32, 32, 32, 32)
-  value_hidden_layer_sizes: Annotated[Sequence[int], SIZES] = (256, 256, 256, 256, 256)
-  activation: str = "swish"
-  policy_obs_key: str = "state"  # entry of a dict observation that the actor sees; "" is none, beside pictures
-  value_obs_key: str = "state"  # entry that the critic sees, "privileged_state" for an asymmetric pair
-  estimated_obs_key: str = ""  # entry that the actor learns to estimate from pictures, "" is none
-  value_dtype: str = "auto"  # of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere
-  cnn: CNNConfig = dataclasses.field(default_factory=CNNConfig)  # for pictures, if the observation has any
+  policy_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"] = (32, 32, 32, 32)
+  value_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the critic's hidden layers"] = (
+    256,
+    256,
+    256,
+    256,
+    256,
+  )
+  activation: Annotated[str, "of the hidden layers"] = "swish"
+  policy_obs_key: Annotated[
+    str, 'observation group that the actor reads; "" reads images alone, where env.vision gives any'
+  ] = "state"
+  value_obs_key: Annotated[str, "observation group that the critic reads; privileged_state for an asymmetric pair"] = (
+    "state"
+  )
+  estimated_obs_key: Annotated[str, 'observation group that the actor learns to estimate from images; "" is none'] = ""
+  value_dtype: Annotated[str, "of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere"] = (
+    "auto"
+  )
+  cnn: Annotated[CNNConfig, "of actor and critic each, for images"] = dataclasses.field(default_factory=CNNConfig)
 
 
 @dataclasses.dataclass(frozen=True)
 class SoftNetworkConfig:
   """Sizes and inputs of SAC's actor and twin critics (Brax's names and defaults)."""
 
-  hidden_layer_sizes: Annotated[Sequence[int], SIZES] = (256, 256)  # of the actor and of each critic
-  activation: str = "relu"
-  policy_network_layer_norm: bool = False
-  q_network_layer_norm: bool = False
-  policy_obs_key: str = "state"  # entry of a dict observation that the actor sees
-  value_obs_key: str = "state"  # entry that the critics see, "privileged_state" for an asymmetric pair
+  hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the hidden layers, of the actor and of each critic"] = (
+    256,
+    256,
+  )
+  activation: Annotated[str, "of the hidden layers"] = "relu"
+  policy_network_layer_norm: Annotated[bool, "whether the actor has layer normalisation"] = False
+  q_network_layer_norm: Annotated[bool, "whether the critics have layer normalisation"] = True
+  policy_obs_key: Annotated[str, "observation group that the actor reads"] = "state"
+  value_obs_key: Annotated[str, "observation group that the critics read; privileged_state for an asymmetric pair"] = (
+    "state"
+  )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,25 +138,37 @@ class PPOConfig(AgentConfig):
 
   algorithm = "playground.learning.ppo:PPO"
 
-  unroll_length: Annotated[int, count(1, 100_000)] = 10  # control steps (decisions) of one trajectory
-  batch_size: Annotated[int, count(1, 2**24)] = 32  # trajectories of one minibatch
-  num_minibatches: Annotated[int, count(1, 100_000)] = 16
-  num_updates_per_batch: Annotated[int, count(1, 100_000)] = 2  # passes over the collected trajectories
-  learning_rate: Annotated[float, positive(1)] = 1e-4  # Adam's
-  max_grad_norm: Annotated[float | None, positive()] = None  # gradients are scaled down to this global norm
-  discounting: Annotated[float, SHARE] = 0.9
-  gae_lambda: Annotated[float, SHARE] = 0.95
-  entropy_cost: Annotated[float, at_least_0()] = 1e-4
-  clipping_epsilon: Annotated[float, positive()] = 0.3
-  clipping_epsilon_value: Annotated[float | None, positive()] = None  # clips the value loss too, if set
-  vf_loss_coefficient: Annotated[float, at_least_0()] = 0.5
-  estimation_coefficient: Annotated[float, at_least_0()] = 1.0  # of the error in estimating `network.estimated_obs_key`
-  reward_scaling: Annotated[float, positive()] = 1.0
-  normalize_advantage: bool = True
-  bootstrap_on_timeout: bool = False  # a time-out pays the discounted value of its state instead of being masked out
-  init_at_random_ep_len: bool = False  # environments start as old as their draw says, so a batch holds all ages
-  augment_pixels: Annotated[int, count(0, 1024)] = 0  # largest random shift of images in an update, pixels
-  network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
+  unroll_length: Annotated[int, count(1, 100_000), "policy steps of one trajectory"] = 20
+  batch_size: Annotated[int, count(1, 2**24), "trajectories of one minibatch"] = 1024
+  num_minibatches: Annotated[int, count(1, 100_000), "minibatches of an epoch"] = 32
+  num_updates_per_batch: Annotated[int, count(1, 100_000), "epochs over the collected trajectories"] = 4
+  learning_rate: Annotated[float, positive(1), "of Adam"] = 3e-4
+  max_grad_norm: Annotated[
+    float | None, positive(), "gradients are scaled down to this global norm; null: they are not"
+  ] = None
+  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
+  gae_lambda: Annotated[float, SHARE, "of generalised advantage estimation"] = 0.95
+  entropy_cost: Annotated[float, at_least_0(), "factor on the entropy bonus"] = 1e-2
+  clipping_epsilon: Annotated[float, positive(), "clip range of the ratio of probabilities"] = 0.3
+  clipping_epsilon_value: Annotated[
+    float | None, positive(), "clip range of the value loss; null: it is not clipped"
+  ] = None
+  vf_loss_coefficient: Annotated[float, at_least_0(), "factor on the value loss"] = 0.5
+  estimation_coefficient: Annotated[
+    float, at_least_0(), "factor on the error (Huber) in estimating network.estimated_obs_key"
+  ] = 1.0
+  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
+  normalize_advantage: Annotated[bool, "whether advantages are normalised in each minibatch"] = True
+  bootstrap_on_timeout: Annotated[
+    bool, "whether a time-out adds the discounted value of its state; else it is masked out"
+  ] = False
+  init_at_random_ep_len: Annotated[
+    bool, "whether a reset gives environments random ages, so that a batch holds all parts of episodes"
+  ] = False
+  augment_pixels: Annotated[
+    int, count(0, 1024), "largest random shift of a trajectory's images in an update, pixels"
+  ] = 0
+  network: Annotated[NetworkConfig, "actor and critic"] = dataclasses.field(default_factory=NetworkConfig)
 
   @property
   def steps_per_update(self) -> int:
@@ -158,18 +193,27 @@ class SACConfig(AgentConfig):
 
   algorithm = "playground.learning.sac:SAC"
 
-  num_envs: Annotated[int, count(1, 2**24)] = 128
-  batch_size: Annotated[int, count(1, 2**24)] = 256  # transitions of one gradient step
-  grad_updates_per_step: Annotated[int, count(1, 100_000)] = 1  # gradient steps for each step of all environments
-  min_replay_size: Annotated[int, count(0, 2**40)] = 0  # transitions collected before the first gradient step
-  max_replay_size: Annotated[int, count(1, 2**40)] = 1_048_576  # transitions kept, the newest
-  learning_rate: Annotated[float, positive(1)] = 1e-4  # Adam's, for actor and critics
-  alpha_learning_rate: Annotated[float, positive(1)] = 3e-4  # Adam's, for the temperature
-  discounting: Annotated[float, SHARE] = 0.9
-  tau: Annotated[float, SHARE] = 0.005  # how far the target critics move towards the critics after each gradient step
-  reward_scaling: Annotated[float, positive()] = 1.0
-  checkpoint_replay: bool = True  # whether checkpoints hold the replay buffer; if not, a resumed run refills it
-  network: SoftNetworkConfig = dataclasses.field(default_factory=SoftNetworkConfig)
+  num_timesteps: Annotated[int, count(1, 1e12), "environment steps in all, action repeats and prefill counted"] = (
+    5_000_000
+  )
+  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 128
+  batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 512
+  grad_updates_per_step: Annotated[int, count(1, 100_000), "gradient steps for each step of all environments"] = 8
+  min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 8192
+  max_replay_size: Annotated[
+    int, count(1, 2**40), "transitions kept over all devices, the newest; a run prints their memory"
+  ] = 1_048_576
+  learning_rate: Annotated[float, positive(1), "of Adam, for actor and critics"] = 1e-3
+  alpha_learning_rate: Annotated[
+    float, positive(1), "of Adam, for the temperature, which holds the entropy at half a nat per action below zero"
+  ] = 3e-4
+  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
+  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each gradient step"] = 0.005
+  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
+  checkpoint_replay: Annotated[
+    bool, "whether the newest checkpoint holds the buffer, for an exact resume; else it is refilled"
+  ] = True
+  network: Annotated[SoftNetworkConfig, "actor and critics"] = dataclasses.field(default_factory=SoftNetworkConfig)
 
   @property
   def prefill_updates(self) -> int:

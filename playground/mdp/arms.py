@@ -16,7 +16,6 @@ from playground.errors import UnknownNameError, nearest
 from playground.mdp.context import StepContext
 from playground.mdp.lookup import lookup
 from playground.mdp.rotations import angle_between
-from playground.robots.tabletop import contact_addresses
 
 if TYPE_CHECKING:
   from playground.envs.manipulation.tabletop import TabletopTask
@@ -105,6 +104,13 @@ class ArmRobot:
     """Returns which of the contact sensors of a geom see a contact, bool, shape [sensors]; raises UnknownNameError."""
     self.find("geom", geom)
     return data.sensordata[contact_addresses(self._mj_model, geom)] > 0
+
+
+def contact_addresses(model: mujoco.MjModel, geom: str) -> np.ndarray:
+  """Where in `sensordata` the `found` sensors of a geom's contacts are, in the sensors' order: shape [sensors]."""
+  of_contacts = (model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & (model.sensor_dim == 1)
+  this = model.geom(geom).id
+  return model.sensor_adr[of_contacts & ((model.sensor_objid == this) | (model.sensor_refid == this))]
 
 
 class ArmContext(StepContext):

@@ -19,9 +19,12 @@ import mujoco
 
 from playground.config.text import first_line
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.mdp.lookup import lookup
 from playground.robots.terrain import add_terrain
 
 ROBOTS = Path(__file__).parent
+_OF_KEYFRAMES = ("qpos", "qvel", "act", "ctrl", "mpos", "mquat")
+GROUND = "studio/groundplane"  # material of the floor
 
 # Contacts MJX's JAX implementation keeps with self-collision (the closest ones); C MuJoCo and Warp ignore these.
 _SELF_COLLISION_LIMITS = {"max_contact_points": 30, "max_geom_pairs": 12}
@@ -71,6 +74,20 @@ def find_mjcf(mjcf: str) -> Path:
   )
 
 
+def read_mjcf(mjcf: str) -> mujoco.MjSpec:
+  """Reads a robot's MJCF; see `find_mjcf`.
+
+  Raises:
+    UnknownNameError: there is no such file.
+    ConfigError: MuJoCo cannot read it.
+  """
+  path = find_mjcf(mjcf)
+  try:
+    return mujoco.MjSpec.from_file(str(path))
+  except ValueError as error:
+    raise ConfigError(f"env.robot.mjcf={mjcf} is not an MJCF that MuJoCo reads: {first_line(error)}.") from None
+
+
 def build_scene(
   mjcf: str,
   *,
@@ -96,29 +113,21 @@ def build_scene(
     UnknownNameError: no such file, terrain, parameter, collision variant or geom.
     ConfigError: an invalid MJCF or parameter, or a collision variant that the robot has no geoms for.
   """
-  _check("collision", collision, COLLISIONS)
-  path = find_mjcf(mjcf)
-  try:
-    spec = mujoco.MjSpec.from_file(str(path))
-  except ValueError as error:
-    raise ConfigError(f"env.robot.mjcf={mjcf} is not an MJCF that MuJoCo reads: {first_line(error)}.") from None
+  activate = lookup(COLLISIONS, collision, "env.scene.collision")
+  spec = read_mjcf(mjcf)
   if collision != "feet" and not _full_geoms(spec):
-    raise ConfigError(f"collision={collision}: {path.stem} has geoms for the feet only, choose collision=feet.")
-  COLLISIONS[collision](spec)
+    raise ConfigError(f"collision={collision}: {Path(mjcf).stem} has geoms for the feet only, choose collision=feet.")
+  activate(spec)
   add_studio(spec)
   _set_keyframes(spec, add_terrain(spec, terrain, parameters or {}))
+  spec.geom("floor").material = GROUND
   if terrain != "flat":
     _round_cylinders(spec)
-  geoms = [geom.name for geom in spec.geoms if geom.name]
+  geoms = {geom.name: geom for geom in spec.geoms if geom.name}
   for name in floor_contacts:
-    _check("floor_contacts", name, geoms)
+    lookup(geoms, name, "env.robot.floor_contacts")
   add_floor_contacts(spec, floor_contacts)
   return spec
-
-
-def _check(key: str, name: str, known: Sequence[str] | Mapping[str, Any]) -> None:
-  if name not in known:
-    raise UnknownNameError(f"{key}={name!r} is unknown: choose from {', '.join(known)}.{nearest(name, known)}")
 
 
 def _feet(spec: mujoco.MjSpec) -> None:
@@ -173,11 +182,58 @@ def _round_cylinders(spec: mujoco.MjSpec) -> None:
       geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
 
 
-def add_floor_contacts(spec: mujoco.MjSpec, geoms: Sequence[str]) -> None:
-  """Adds contact sensors `<geom>_floor_found` to a scene, before those that it has.
+def load(part: str) -> mujoco.MjSpec:
+  """Reads a part's MJCF, e.g. `panda/arm` or `props/cube`."""
+  return mujoco.MjSpec.from_file(str(ROBOTS / f"{part}.xml"))
 
-  They give the number of contacts found (data=found, reduce=mindist, num=1, so 0 or 1) between each geom and the floor.
+
+def attach(spec: mujoco.MjSpec, part: str, *, frame: str = "", prefix: str = "") -> None:
+  """Puts a part into a scene, with its actuators, equality constraints and contact excludes, under the names it has.
+
+  Args:
+    spec: the scene.
+    part: as in `load`. None of its names, those of default classes and materials included, may be in the scene already.
+    frame: of the scene, where the part's own origin comes to lie; the world's origin without.
+    prefix: of the part's names in the scene.
   """
+  where = spec.frame(frame) if frame else spec.worldbody.add_frame()
+  keys = [(key.name, {field: list(getattr(key, field)) for field in _OF_KEYFRAMES}) for key in spec.keys]
+  # MuJoCo warns that a scene whose parts get no prefix may not be written as XML, which nobody does.
+  warning = mujoco.get_mju_user_warning()
+  mujoco.set_mju_user_warning(lambda message: None)
+  try:
+    spec.attach(load(part), prefix=prefix, frame=where)
+  finally:
+    mujoco.set_mju_user_warning(warning)
+  for name, values in keys:  # which MuJoCo empties until it compiles
+    for field, value in values.items():
+      setattr(spec.key(name), field, value)
+
+
+def add_contact_sensor(spec: mujoco.MjSpec, geom: str, other: str, *, name: str = "", data: str = "found") -> None:
+  """Adds a sensor of the deepest contact between two geoms.
+
+  Args:
+    spec: the scene.
+    geom: from which the normal points.
+    other: to which it points.
+    name: of the sensor, `<geom>_<other>_<data>` without.
+    data: `found` (above 0 while they touch) or `normal` (3 numbers, zeros while they do not).
+  """
+  field = {"found": mujoco.mjtConDataField.mjCONDATA_FOUND, "normal": mujoco.mjtConDataField.mjCONDATA_NORMAL}[data]
+  spec.add_sensor(
+    name=name or f"{geom}_{other}_{data}",
+    type=mujoco.mjtSensor.mjSENS_CONTACT,
+    objtype=mujoco.mjtObj.mjOBJ_GEOM,
+    objname=geom,
+    reftype=mujoco.mjtObj.mjOBJ_GEOM,
+    refname=other,
+    intprm=[1 << int(field), 1, 1],  # 1: the one of smallest distance; 1 contact
+  )
+
+
+def add_floor_contacts(spec: mujoco.MjSpec, geoms: Sequence[str]) -> None:
+  """Adds sensors `<geom>_floor_found` of each geom's contact with the floor, before the contact sensors that it has."""
   sensors = list(spec.sensors)
   contacts = [i for i, sensor in enumerate(sensors) if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT]
   after = sensors[contacts[0] :] if contacts else []
@@ -186,64 +242,26 @@ def add_floor_contacts(spec: mujoco.MjSpec, geoms: Sequence[str]) -> None:
   for sensor in after:
     spec.delete(sensor)
   for geom in geoms:
-    spec.add_sensor(
-      name=f"{geom}_floor_found",
-      type=mujoco.mjtSensor.mjSENS_CONTACT,
-      objtype=mujoco.mjtObj.mjOBJ_GEOM,
-      objname=geom,
-      reftype=mujoco.mjtObj.mjOBJ_GEOM,
-      refname="floor",
-      intprm=[1, 1, 1],
-    )
+    add_contact_sensor(spec, geom, "floor")
   for sensor in moved:
     spec.add_sensor(**sensor)
 
 
 def add_studio(spec: mujoco.MjSpec) -> None:
-  """Sky, checkered ground material and a spotlight that follows the robot."""
-  spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
-  spec.visual.headlight.diffuse = [0.5, 0.5, 0.5]
+  """Adds sky, checkered ground material and a spotlight that follows the robot, all named `studio/...`."""
+  spec.visual.headlight.ambient = [0.35] * 3
+  spec.visual.headlight.diffuse = [0.5] * 3
   spec.visual.headlight.specular = [0, 0, 0]
   spec.visual.rgba.haze = [0.85, 0.89, 0.94, 1]
-  spec.add_texture(
-    name="sky",
-    type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-    builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-    rgb1=[0.85, 0.89, 0.94],
-    rgb2=[0.33, 0.47, 0.65],
-    width=128,
-    height=768,
-  )
-  spec.add_texture(
-    name="groundplane",
-    type=mujoco.mjtTexture.mjTEXTURE_2D,
-    builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-    mark=mujoco.mjtMark.mjMARK_EDGE,
-    rgb1=[0.84, 0.86, 0.88],
-    rgb2=[0.74, 0.77, 0.8],
-    markrgb=[0.95, 0.96, 0.97],
-    width=300,
-    height=300,
-  )
-  ground = spec.add_material(name="groundplane", texuniform=True, texrepeat=[2, 2])
-  ground.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "groundplane"
-  root = spec.worldbody.first_body()
-  spec.worldbody.add_light(
-    name="spotlight",
-    type=mujoco.mjtLightType.mjLIGHT_SPOT,
-    mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM,
-    targetbody=root.name,
-    pos=[3, 0, 4],
-    diffuse=[0.7, 0.7, 0.7],
-    specular=[0.3, 0.3, 0.3],
-  )
+  attach(spec, "props/studio", prefix="studio/")
+  spec.light("studio/spotlight").targetbody = spec.worldbody.first_body().name
 
 
 def add_studio_floor(spec: mujoco.MjSpec, height: float = 0.0, **properties: Any) -> None:
   """A studio with an infinite plane `height` m above the origin, the geom `floor`; `properties` are the geom's."""
   add_studio(spec)
   plane, at = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, height]
-  spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 0.05], pos=at, material="groundplane", **properties)
+  spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 0.05], pos=at, material=GROUND, **properties)
 
 
 COLLISIONS: dict[str, Callable[[mujoco.MjSpec], None]] = {

@@ -10,8 +10,8 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from playground.errors import UnknownNameError, nearest
-from playground.robots.scene import ROBOTS, add_studio_floor
+from playground.mdp.lookup import lookup
+from playground.robots.scene import add_contact_sensor, add_studio_floor, attach, load
 
 # Pose from which the Panda picks things up: joints (rad), fingers (m).
 _ARM_HOME = (0, 0.3, 0, -1.57079, 0, 2, -0.7853)
@@ -28,66 +28,14 @@ def build_tabletop(name: str) -> mujoco.MjSpec:
     name: a key of `TABLETOPS`.
 
   Returns:
-    The scene, to edit further or `compile()`. The ground is geom 0, named `floor`; targets are mocap bodies.
+    The scene, to edit further or `compile()`. The ground is the geom `floor`; targets are mocap bodies.
 
   Raises:
     UnknownNameError: no such scene.
   """
-  if name not in TABLETOPS:
-    raise UnknownNameError(f"scene={name!r} is unknown: choose from {', '.join(TABLETOPS)}.{nearest(name, TABLETOPS)}")
-  return TABLETOPS[name]().copy()  # a copy does not repeat, when compiled, the warning that `attach` silences
-
-
-def load(part: str) -> mujoco.MjSpec:
-  """Reads a part's MJCF, e.g. `panda/arm` or `props/cube`."""
-  return mujoco.MjSpec.from_file(str(ROBOTS / f"{part}.xml"))
-
-
-def attach(spec: mujoco.MjSpec, part: str, *, frame: str = "") -> None:
-  """Puts a part into a scene, with its actuators, equality constraints and contact excludes, under the names it has.
-
-  Args:
-    spec: the scene.
-    part: as in `load`. None of its names, those of default classes and materials included, may be in the scene already.
-    frame: of the scene, where the part's own origin comes to lie; the world's origin without.
-  """
-  where = spec.frame(frame) if frame else spec.worldbody.add_frame()
-  # MuJoCo warns that a scene whose parts get no prefix may not be written as XML, which nobody does.
-  warning = mujoco.get_mju_user_warning()
-  mujoco.set_mju_user_warning(lambda message: None)
-  try:
-    spec.attach(load(part), prefix="", frame=where)
-  finally:
-    mujoco.set_mju_user_warning(warning)
-
-
-def add_contact_sensor(spec: mujoco.MjSpec, geom: str, other: str, *, name: str = "", data: str = "found") -> None:
-  """Adds a sensor of the deepest contact between two geoms.
-
-  Args:
-    spec: the scene.
-    geom: from which the normal points.
-    other: to which it points.
-    name: of the sensor, `<geom>_<other>_<data>` without.
-    data: `found` (above 0 while they touch) or `normal` (3 numbers, zeros while they do not).
-  """
-  field = {"found": mujoco.mjtConDataField.mjCONDATA_FOUND, "normal": mujoco.mjtConDataField.mjCONDATA_NORMAL}[data]
-  spec.add_sensor(
-    name=name or f"{geom}_{other}_{data}",
-    type=mujoco.mjtSensor.mjSENS_CONTACT,
-    objtype=mujoco.mjtObj.mjOBJ_GEOM,
-    objname=geom,
-    reftype=mujoco.mjtObj.mjOBJ_GEOM,
-    refname=other,
-    intprm=[1 << int(field), 1, 1],  # 1: the one of smallest distance; 1 contact
-  )
-
-
-def contact_addresses(model: mujoco.MjModel, geom: str) -> np.ndarray:
-  """Where in `sensordata` the `found` sensors of a geom's contacts are, in the sensors' order: shape [sensors]."""
-  of_contacts = (model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & (model.sensor_dim == 1)
-  this = model.geom(geom).id
-  return model.sensor_adr[of_contacts & ((model.sensor_objid == this) | (model.sensor_refid == this))]
+  return lookup(
+    TABLETOPS, name, "env.scene"
+  )().copy()  # a copy does not repeat, when compiled, the warning that `attach` silences
 
 
 def _panda() -> mujoco.MjSpec:
@@ -100,16 +48,12 @@ def _panda() -> mujoco.MjSpec:
 def _add_floor(spec: mujoco.MjSpec, height: float = 0.0) -> None:
   """A studio and its floor, `height` m above the arm's base."""
   add_studio_floor(spec, height)
-  spec.delete(spec.light("spotlight"))  # scenes here have lights of their own
+  spec.delete(spec.light("studio/spotlight"))  # scenes here have lights of their own
 
 
 def _add_top_light(spec: mujoco.MjSpec) -> None:
-  spec.worldbody.add_light(
-    name="top",
-    type=mujoco.mjtLightType.mjLIGHT_SPOT,
-    mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
-    pos=[0, 0, 2],
-  )
+  kind, mode = mujoco.mjtLightType.mjLIGHT_SPOT, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+  spec.worldbody.add_light(name="top", type=kind, mode=mode, pos=[0, 0, 2])
 
 
 def _add_sun(spec: mujoco.MjSpec, height: float) -> None:
@@ -238,10 +182,24 @@ def _drive_by_torque(spec: mujoco.MjSpec) -> None:
     motor.inheritrange, motor.ctrlrange = 0, [-1, 1]
 
 
+def _aloha(task: str, closed: float) -> mujoco.MjSpec:
+  """ALOHA 2 with the parts of a task; its left gripper closes up to `closed`, m."""
+  spec = load(f"aloha/{task}")
+  add_studio_floor(spec, -0.75, contype=0, conaffinity=0)
+  gripper = spec.actuator("left/gripper")
+  gripper.ctrlrange = [closed, gripper.ctrlrange[1]]
+  for side in ("left", "right"):
+    spec.camera(f"{side}/wrist_cam").name = f"wrist_cam_{side}"
+  return spec
+
+
 TABLETOPS: dict[str, Callable[[], mujoco.MjSpec]] = {
   "panda_single_cube": _panda_single_cube,
   "panda_single_cube_camera": _panda_single_cube_camera,
   "panda_single_cube_pixels": _panda_single_cube_pixels,
   "panda_cabinet": _panda_cabinet,
   "panda_robotiq_cube": _panda_robotiq_cube,
+  # A gap left open while it holds the box lets a policy that explores grasp it, as in Playground 0.2.0.
+  "handover": lambda: _aloha("handover", 0.01),
+  "peg_insertion": lambda: _aloha("peg_insertion", 0.002),
 }

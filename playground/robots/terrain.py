@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.mdp.lookup import lookup
 
 HALF_EXTENT = 10.0  # m, of the square
 POINTS = 256  # a side: 0.078 m apart
@@ -71,20 +72,19 @@ TERRAINS: dict[str, Callable[..., float]] = {
 
 def add_terrain(spec: mujoco.MjSpec, name: str, parameters: Mapping[str, Any]) -> float:
   """Calls a terrain of `TERRAINS` with its parameters checked; raises ConfigError or UnknownNameError."""
-  if name not in TERRAINS:
-    raise UnknownNameError(f"terrain={name!r} is unknown: choose from {', '.join(TERRAINS)}.{nearest(name, TERRAINS)}")
-  known = list(inspect.signature(TERRAINS[name]).parameters)[1:]
+  terrain = lookup(TERRAINS, name, "env.scene.terrain")
+  known = list(inspect.signature(terrain).parameters)[1:]
   for key in parameters:
     if key not in known:
       has = f"takes {', '.join(known)}" if known else "takes no parameters"
       raise UnknownNameError(f"{key!r} is no parameter of terrain={name}, which {has}.{nearest(key, known)}")
-  return TERRAINS[name](spec, **parameters)
+  return terrain(spec, **parameters)
 
 
 def _add_floor(spec: mujoco.MjSpec, *classes: str, **shape: Any) -> None:
   """Adds the ground's geom: what the robot's file says of the first of the default classes that it has."""
   default = next((d for d in map(spec.find_default, classes) if d), spec.default)
-  spec.worldbody.add_geom(default, name="floor", material="groundplane", **shape)
+  spec.worldbody.add_geom(default, name="floor", **shape)
 
 
 def _add_height_field(spec: mujoco.MjSpec, heights: np.ndarray) -> float:

@@ -11,9 +11,12 @@ import mujoco
 import numpy as np
 import yaml
 
+from playground.config import config_dict
+from playground.robots.in_hand import build_in_hand_scene
 from playground.robots.scene import build_scene
 
 TESTS = Path(__file__).parents[1]
+HANDS = ("leap_hand", "aero_hand")
 
 # Solver fields of a joint, by name in the figures, where they have them, and in MuJoCo's specifications.
 SOLVER_FIELDS = {"solreflimit": "solref_limit", "solimplimit": "solimp_limit"}
@@ -53,6 +56,11 @@ class Scene:
 def robot_config(robot: str) -> dict[str, Any]:
   """What `configs/robot/<robot>.yaml` says."""
   return yaml.safe_load((TESTS.parent / f"configs/robot/{robot}.yaml").read_text())
+
+
+def in_hand_scene(hand: str, **changes: Any) -> mujoco.MjSpec:
+  """The scene of a hand of `configs/robot`, some keys changed."""
+  return build_in_hand_scene(config_dict(robot_config(hand) | changes))
 
 
 @functools.cache

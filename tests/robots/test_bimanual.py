@@ -4,13 +4,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from playground.errors import UnknownNameError
-from playground.robots.bimanual import build_aloha_scene
+from playground.robots.tabletop import build_tabletop
 
 
 @pytest.fixture(params=("handover", "peg_insertion"), scope="module")
 def model(request: pytest.FixtureRequest) -> mujoco.MjModel:
-  return build_aloha_scene(request.param).compile()
+  return build_tabletop(request.param).compile()
 
 
 @pytest.fixture
@@ -40,11 +39,6 @@ def test_fingers_on_the_table(model: mujoco.MjModel, data: mujoco.MjData, side: 
 
 
 def test_handover_leaves_a_gap_in_the_left_gripper() -> None:
-  model = build_aloha_scene("handover").compile()
+  model = build_tabletop("handover").compile()
   assert model.actuator("left/gripper").ctrlrange[0] == 0.01
   assert model.actuator("right/gripper").ctrlrange[0] == 0.002
-
-
-def test_unknown_task() -> None:
-  with pytest.raises(UnknownNameError, match="peg_insertion"):
-    build_aloha_scene("peg")

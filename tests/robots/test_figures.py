@@ -7,9 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from playground.robots.bimanual import build_aloha_scene
 from playground.robots.gains import set_gains
-from playground.robots.in_hand import build_in_hand_scene
 from playground.robots.tabletop import build_tabletop
 from tests.robots.figures import (
   Scene,
@@ -20,6 +18,7 @@ from tests.robots.figures import (
   flags,
   floor_contacts,
   forward,
+  in_hand_scene,
   named,
   padded,
   reaching,
@@ -61,10 +60,10 @@ SCENES = {
   ),
   "aero_hand_cube": Scene(
     "aero_hand",
-    spec=functools.partial(build_in_hand_scene, "aero_hand"),
+    spec=functools.partial(in_hand_scene, "aero_hand"),
     no_tendon_lengths=("if_tendon1", "mf_tendon1", "rf_tendon1", "pf_tendon1"),  # which have no spring and no servo
   ),
-  "leap_cube": Scene("leap_hand", spec=functools.partial(build_in_hand_scene, "leap_hand")),
+  "leap_cube": Scene("leap_hand", spec=functools.partial(in_hand_scene, "leap_hand")),
   **{
     name: Scene(
       "panda",
@@ -79,8 +78,8 @@ SCENES = {
       ("panda_robotiq_cube", ()),
     )
   },
-  "aloha_peg": Scene("aloha", spec=functools.partial(build_aloha_scene, "peg_insertion")),
-  "aloha_handover": Scene("aloha", spec=functools.partial(build_aloha_scene, "handover")),
+  "aloha_peg": Scene("aloha", spec=functools.partial(build_tabletop, "peg_insertion")),
+  "aloha_handover": Scene("aloha", spec=functools.partial(build_tabletop, "handover")),
 }
 
 GEOM_FIELDS = (

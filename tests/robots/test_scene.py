@@ -104,6 +104,23 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
     build_scene(str(other))
 
 
+def test_a_robot_may_have_a_ground_material_of_its_own(tmp_path: Path) -> None:
+  """As those of MuJoCo Menagerie's scenes: texture, material, sky and light have the names that ours had."""
+  file = tmp_path / "ball.xml"
+  file.write_text(
+    '<mujoco><asset><texture name="sky" type="skybox" builtin="flat" width="8" height="8"/>'
+    '<texture name="groundplane" type="2d" builtin="checker" width="8" height="8"/>'
+    '<material name="groundplane" texture="groundplane" rgba="1 0 0 1"/></asset>'
+    '<worldbody><light name="spotlight" pos="0 0 2"/><body name="ball"><freejoint/>'
+    '<geom name="skin" size="0.1" material="groundplane"/></body></worldbody></mujoco>'
+  )
+  for terrain in ("flat", "rough"):
+    model = build_scene(str(file), terrain=terrain).compile()
+    material = lambda geom, model=model: model.mat(model.geom(geom).matid[0])
+    assert (material("skin").name, material("floor").name) == ("groundplane", "studio/groundplane")
+    np.testing.assert_allclose(material("skin").rgba, [1, 0, 0, 1])
+
+
 @pytest.mark.parametrize(
   ("robot", "options", "message"),
   [
@@ -112,7 +129,7 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
     ("no_such_package/go1.xml", {}, "does not exist"),
     ("go1", {"terrain": "flatt"}, "Did you mean 'flat'?"),
     ("go1", {"collision": "full_selv"}, "Did you mean 'full_self'?"),
-    ("go1", {"floor_contacts": ["FX"]}, "floor_contacts='FX' is unknown"),
+    ("go1", {"floor_contacts": ["FX"]}, "env.robot.floor_contacts: 'FX' is unknown"),
   ],
 )
 def test_unknown_names(robot: str, options: dict, message: str) -> None:

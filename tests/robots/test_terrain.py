@@ -22,7 +22,6 @@ ROBOT_NAMES = sorted(path.stem for path in ROBOTS.glob("*/*.xml") if path.stem =
 def heights(terrain: str, **parameters: Any) -> np.ndarray:
   """World heights (m) of the terrain's points, shape [along y, along x]."""
   spec = mujoco.MjSpec()
-  spec.add_material(name="groundplane")
   peak = add_terrain(spec, terrain, parameters)
   model = spec.compile()
   assert model.geom(0).name == "floor"
@@ -119,7 +118,7 @@ def test_cylinders_of_the_full_collision_variants_stand_on_height_fields() -> No
 @pytest.mark.parametrize(
   ("terrain", "parameters", "message"),
   [
-    ("rogh", {}, r"terrain='rogh' is unknown: choose from flat, .*Did you mean 'rough'\?"),
+    ("rogh", {}, r"env\.scene\.terrain: 'rogh' is unknown; choose from flat, .*Did you mean 'rough'\?"),
     ("stairs", {"step_hight": 1}, r"'step_hight' is no parameter of terrain=stairs.*Did you mean 'step_height'\?"),
     ("flat", {"seed": 1}, "'seed' is no parameter of terrain=flat, which takes no parameters"),
     ("stairs", {"step_height": 0}, "no heights: choose terrain=flat"),
@@ -174,7 +173,6 @@ def test_mjx_finds_the_contacts_of_c_mujoco() -> None:
   Which of a foot's contacts is deepest is a matter of the algorithm where an edge of the ground is inside the foot.
   """
   spec = mujoco.MjSpec()
-  spec.add_material(name="groundplane")
   add_terrain(spec, "rough", {"elevation": 0.2})
   for name, size in SHAPES.items():
     body = spec.worldbody.add_body(name=name)

@@ -37,6 +37,7 @@ def measure(
   agent: str,
   overrides: list[str],
   seconds: float,
+  lock: str | None,
   watch_memory: bool = False,
   until: str = "update",
 ) -> None:
@@ -59,7 +60,7 @@ def measure(
     for call, _ in calls.values():
       jax.block_until_ready(call(1))
     best = dict.fromkeys(calls, 0.0)
-    with alone(facts.lock):
+    with alone(lock):
       for _ in range(TURNS):
         for part, (call, steps) in calls.items():
           best[part] = max(best[part], rate(call, steps, seconds / TURNS)[0])

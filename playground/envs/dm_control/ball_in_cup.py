@@ -1,13 +1,11 @@
 """A ball on a string that is caught with a cup (DM Control Suite)."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
+from playground.envs.dm_control.suite import SuiteTask, Terms
 from playground.envs.physics import PhysicsData
 
 _XZ = slice(0, 3, 2)  # the plane of the task
@@ -23,30 +21,21 @@ class BallInCup(SuiteTask):
   An episode starts at rest, the ball anywhere about the cup (or in it) where it does not touch, as in DM Control.
   """
 
+  domain = "ball_in_cup"
   derived = ("site_xpos", "xpos")
-
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/BallInCup.yaml`."""
-    super().__init__(config, load_spec("ball_in_cup").compile())
-    model = self.mj_model
-    self._target, self._ball = model.site("target").id, model.body("ball").id
-    self._gap = jnp.array(model.site("target").size - model.geom("ball").size[0])[_XZ]  # half the target's play, m
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": {"position": 4, "velocity": 4}}
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     tries = jax.random.uniform(rng, (_TRIES, 2), minval=_LOW, maxval=_HIGH)
     free = self._clearance(tries) > 0
     return {"qpos": jnp.concatenate([jnp.zeros(2), tries[jnp.argmax(free)]])}  # the first that is free
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    return jnp.concatenate([data.qpos, data.qvel])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    return {"position": data.qpos, "velocity": data.qvel}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    offset = (data.site_xpos[self._target] - data.xpos[self._ball])[_XZ]
-    return (jnp.abs(offset) < self._gap).all().astype(jnp.float32), {}
+    offset = (data.site_xpos[self.site["target"]] - data.xpos[self.body["ball"]])[_XZ]
+    play = self.mj_model.site("target").size - self.mj_model.geom("ball").size[0]  # half the target's, m
+    return (jnp.abs(offset) < jnp.array(play)[_XZ]).all().astype(jnp.float32), {}
 
   def _clearance(self, ball: jax.Array) -> jax.Array:
     """Gap m between the ball, displaced by `ball` [n, 2], and the cup at rest, shape [n]; negative where they meet."""

@@ -1,13 +1,12 @@
 """Cart and pole: balance, or swing up and balance, with dense or sparse reward (DM Control Suite)."""
 
-import functools
-import operator
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
+from playground.envs.dm_control.suite import SuiteTask, Terms
 from playground.envs.physics import PhysicsData
 from playground.errors import ConfigError
 from playground.mdp.context import StepContext
@@ -24,22 +23,12 @@ class Cartpole(SuiteTask):
   angle_in_bounds.
   """
 
+  domain = "cartpole"
   derived = ("xmat",)
-
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/_cartpole.yaml`."""
-    super().__init__(config, load_spec("cartpole").compile())
-    self._swing_up: bool = config.swing_up
-    self._terms = _sparse if config.sparse else _dense
-    self._pole = self.mj_model.body("pole_1").id
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": {"cart_position": 1, "pole_cos": 1, "pole_sin": 1, "velocity": 2}}
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     cart_key, pole_key, velocity_key = jax.random.split(rng, 3)
-    if self._swing_up:
+    if self.config.swing_up:
       cart = 0.01 * jax.random.normal(cart_key)
       pole = jnp.pi + 0.01 * jax.random.normal(pole_key)
     else:
@@ -47,13 +36,13 @@ class Cartpole(SuiteTask):
       pole = jax.random.uniform(pole_key, minval=-0.034, maxval=0.034)
     return {"qpos": jnp.stack([cart, pole]), "qvel": 0.01 * jax.random.normal(velocity_key, (2,))}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    axis = data.xmat[self._pole, :, 2]
-    return jnp.stack([data.qpos[_SLIDER], axis[2], axis[0], *data.qvel])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    axis = data.xmat[self.body["pole_1"], :, 2]
+    return {"cart_position": data.qpos[_SLIDER], "pole_cos": axis[2], "pole_sin": axis[0], "velocity": data.qvel}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    terms = self._terms(data, action, data.xmat[self._pole, 2, 2])
-    return functools.reduce(operator.mul, terms.values()), terms
+    terms = (_sparse if self.config.sparse else _dense)(data, action, data.xmat[self.body["pole_1"], 2, 2])
+    return math.prod(terms.values(), start=jnp.ones(())), terms
 
 
 def _dense(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> Terms:
@@ -89,7 +78,7 @@ class CartpoleVision(Cartpole):
     (x, _), (x_speed, angle_speed) = data.qpos, data.qvel
     terms = {
       "alive": jnp.full((), 0.1),
-      "pole_pos_penalty": -jnp.square(1 - data.xmat[self._pole, 2, 2]),
+      "pole_pos_penalty": -jnp.square(1 - data.xmat[self.body["pole_1"], 2, 2]),
       "cart_pos_penalty": -0.02 * jnp.square(x),
       "cart_vel_penalty": -0.01 * jnp.abs(x_speed),
       "pole_vel_penalty": -0.005 * jnp.abs(angle_speed),

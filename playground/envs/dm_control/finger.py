@@ -4,8 +4,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
+from playground.envs.dm_control.suite import SuiteTask, Terms, draw_angle
 from playground.envs.physics import PhysicsData
 
 _XZ = jnp.array([0, 2])  # the plane of the finger
@@ -19,23 +20,21 @@ class Finger(SuiteTask):
   joints and the hinge rad/s, log(1 + force in N) on the fingertip's top and bottom.
   """
 
+  domain = "finger"
   derived = ("sensordata",)
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": {"joint_angles": 2, "tip_position": 2, "velocity": 3, "touch": 2}}
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     _, finger_key, _, hinge_key = jax.random.split(rng, 4)
-    low, high = self.mj_model.jnt_range[:2].T
-    finger = jax.random.uniform(finger_key, (2,), minval=low, maxval=high)
-    hinge = jax.random.uniform(hinge_key, minval=-jnp.pi, maxval=jnp.pi)
-    return {"qpos": jnp.append(finger, hinge)}
+    return {"qpos": jnp.append(self.draw_joints(finger_key, slice(2)), draw_angle(hinge_key))}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    angles = [self.sensor(data, name) for name in ("proximal", "distal")]
-    touch = [jnp.log1p(self.sensor(data, name)) for name in ("touchtop", "touchbottom")]
-    return jnp.concatenate([*angles, self._from_spinner(data, "tip"), data.qvel, *touch])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    read = lambda *names: jnp.concatenate([self.sensor(data, name) for name in names])
+    return {
+      "joint_angles": read("proximal", "distal"),
+      "tip_position": self._from_spinner(data, "tip"),
+      "velocity": data.qvel,
+      "touch": jnp.log1p(read("touchtop", "touchbottom")),
+    }
 
   def _from_spinner(self, data: PhysicsData, name: str) -> jax.Array:
     return (self.sensor(data, name) - self.sensor(data, "spinner"))[_XZ]
@@ -44,13 +43,12 @@ class Finger(SuiteTask):
 class FingerSpin(Finger):
   """Spins the body: reward 1 while it turns at 15 rad/s or more (clockwise as seen by `cam0`), else 0."""
 
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/FingerSpin.yaml`."""
-    spec = load_spec("finger")
+  def scene(self, config: Any) -> mujoco.MjSpec:
+    spec = super().scene(config)
     spec.joint("hinge").damping[0] = config.hinge_damping
     for site in ("target", "tip"):
       spec.site(site).rgba[3] = 0.0  # no target here
-    super().__init__(config, spec.compile())
+    return spec
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
     return (self.sensor(data, "hinge_velocity")[0] <= _SPIN_VELOCITY).astype(jnp.float32), {}
@@ -63,31 +61,24 @@ class FingerTurn(Finger):
   (negative inside), all m.
   """
 
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/FingerTurnEasy.yaml`."""
-    spec = load_spec("finger")
+  def scene(self, config: Any) -> mujoco.MjSpec:
+    spec = super().scene(config)
     spec.site("target").size[0] = config.target_radius
-    super().__init__(config, spec.compile())
-    self._target_radius: float = config.target_radius
-    self._hinge = jnp.array(self.mj_model.body("spinner").pos)
-    self._reach = float(self.mj_model.geom("cap1").size.sum())  # to the end of the spinner
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": super().observation_parts["state"] | {"target_position": 2, "distance_to_target": 1}}
+    return spec
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    angle = jax.random.uniform(jax.random.split(rng, 3)[2], minval=-jnp.pi, maxval=jnp.pi)
-    offset = self._reach * jnp.stack([jnp.sin(angle), jnp.zeros(()), jnp.cos(angle)])
-    return {**super().initial(rng), "mocap_pos": (self._hinge + offset)[None]}
+    angle = draw_angle(jax.random.split(rng, 3)[2])
+    reach = self.mj_model.geom("cap1").size.sum()  # to the end of the spinner, m
+    offset = reach * jnp.stack([jnp.sin(angle), jnp.zeros(()), jnp.cos(angle)])
+    return {**super().initial(rng), "mocap_pos": (self.mj_model.body("spinner").pos + offset)[None]}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    target = self._from_spinner(data, "target")
-    return jnp.concatenate([super().observe(data), target, self._distance(data)[None]])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    target = {"target_position": self._from_spinner(data, "target"), "distance_to_target": self._distance(data)}
+    return super().parts(data) | target
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
     return (self._distance(data) <= 0).astype(jnp.float32), {}
 
   def _distance(self, data: PhysicsData) -> jax.Array:
     gap = self._from_spinner(data, "target") - self._from_spinner(data, "tip")
-    return jnp.linalg.norm(gap) - self._target_radius
+    return jnp.linalg.norm(gap) - self.config.target_radius

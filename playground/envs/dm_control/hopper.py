@@ -1,12 +1,9 @@
 """A planar one-legged hopper: stand, or hop forward (DM Control Suite)."""
 
-import math
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec, move_speed, small_control
+from playground.envs.dm_control.suite import SuiteTask, Terms, reach_speed, small_control
 from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
 
@@ -22,33 +19,22 @@ class Hopper(SuiteTask):
   any pose at any pitch, which may reach into the floor, as in the original suite.
   """
 
+  domain = "hopper"
   derived = ("sensordata", "xipos")
 
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/_hopper.yaml`."""
-    super().__init__(config, load_spec("hopper").compile())
-    self._move_speed = move_speed(config)
-    self._torso, self._foot = (self.mj_model.body(name).id for name in ("torso", "foot"))
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": {"position": 6, "velocity": 7, "touch": 2}}
-
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    _, pitch_key, joints_key = jax.random.split(rng, 3)
-    return {"qpos": self.planar_pose(pitch_key, joints_key)}
+    return {"qpos": self.draw_planar_pose(*jax.random.split(rng, 3)[1:])}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    touch = [jnp.log1p(self.sensor(data, name)) for name in ("touch_toe", "touch_heel")]
-    return jnp.concatenate([data.qpos[1:], data.qvel, *touch])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    touch = jnp.concatenate([self.sensor(data, name) for name in ("touch_toe", "touch_heel")])
+    return {"position": data.qpos[1:], "velocity": data.qvel, "touch": jnp.log1p(touch)}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    height = data.xipos[self._torso, 2] - data.xipos[self._foot, 2]  # between centres of mass
+    goal = self.config.move_speed
+    height = data.xipos[self.body["torso"], 2] - data.xipos[self.body["foot"], 2]  # between centres of mass
     standing = tolerance(height, (_STAND_HEIGHT, _MAX_HEIGHT))
-    if self._move_speed == 0:
+    if goal == 0:
       control = small_control(action)
       return standing * control, {"standing": standing, "small_control": control}
-    speed = self.sensor(data, "torso_subtreelinvel")[0]
-    goal = (self._move_speed, math.inf)
-    hopping = tolerance(speed, goal, margin=self._move_speed / 2, sigmoid="linear", value_at_margin=0.5)
+    hopping = reach_speed(self.sensor(data, "torso_subtreelinvel")[0], goal, margin=goal / 2, value_at_margin=0.5)
     return standing * hopping, {"standing": standing, "hopping": hopping}

@@ -1,13 +1,11 @@
 """A humanoid with 21 motors: stand, walk or run (DM Control Suite)."""
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec, move_speed, small_control
+from playground.envs.dm_control.suite import SuiteTask, Terms, reach_speed, small_control
 from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
 
@@ -28,47 +26,25 @@ class Humanoid(SuiteTask):
   fall, which the paper's settings and returns are not for.
   """
 
+  domain = "humanoid"
   derived = ("sensordata", "xpos", "xmat")
-
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/_humanoid.yaml`."""
-    super().__init__(config, load_spec("humanoid").compile())
-    self._move_speed = move_speed(config)
-    self._torso, self._head = (self.mj_model.body(name).id for name in ("torso", "head"))
-    self._extremities = np.array([self.mj_model.body(name).id for name in _EXTREMITIES])
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {
-      "state": {
-        "joint_angles": 21,
-        "head_height": 1,
-        "extremities": 12,
-        "torso_vertical": 3,
-        "com_velocity": 3,
-        "velocity": 27,
-      }
-    }
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     return {}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    torso = data.xmat[self._torso]
-    extremities = (data.xpos[self._extremities] - data.xpos[self._torso]) @ torso
-    return jnp.concatenate(
-      [
-        data.qpos[_FREE_QPOS:],
-        data.xpos[self._head, 2:],
-        extremities.ravel(),
-        torso[2],
-        self.sensor(data, "torso_subtreelinvel"),
-        data.qvel,
-      ]
-    )
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    torso, extremities = self.body["torso"], jnp.array([self.body[name] for name in _EXTREMITIES])
+    return {
+      "joint_angles": data.qpos[_FREE_QPOS:],
+      "head_height": data.xpos[self.body["head"], 2],
+      "extremities": (data.xpos[extremities] - data.xpos[torso]) @ data.xmat[torso],
+      "torso_vertical": data.xmat[torso, 2],
+      "com_velocity": self.sensor(data, "torso_subtreelinvel"),
+      "velocity": data.qvel,
+    }
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    head, uprightness = data.xpos[self._head, 2], data.xmat[self._torso, 2, 2]
+    head, uprightness = data.xpos[self.body["head"], 2], data.xmat[self.body["torso"], 2, 2]
     standing = tolerance(head, (_HEAD_HEIGHT, math.inf), margin=_HEAD_HEIGHT / 4)
     upright = tolerance(uprightness, (0.9, math.inf), margin=1.9, sigmoid="linear", value_at_margin=0)
     terms = {
@@ -82,8 +58,7 @@ class Humanoid(SuiteTask):
 
   def _move(self, velocity: jax.Array) -> jax.Array:
     """How well the centre of mass keeps still, or reaches the speed; `velocity` is horizontal, m/s."""
-    if self._move_speed == 0:
+    goal = self.config.move_speed
+    if goal == 0:
       return tolerance(velocity, margin=2).mean()
-    goal = (self._move_speed, math.inf)
-    speed = jnp.linalg.norm(velocity)
-    return (5 * tolerance(speed, goal, margin=self._move_speed, sigmoid="linear", value_at_margin=0) + 1) / 6
+    return (5 * reach_speed(jnp.linalg.norm(velocity), goal, margin=goal, value_at_margin=0) + 1) / 6

@@ -1,12 +1,10 @@
 """A pendulum that is swung up and held there (DM Control Suite)."""
 
 import math
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
+from playground.envs.dm_control.suite import SuiteTask, Terms, draw_angle
 from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
 
@@ -22,23 +20,15 @@ class PendulumSwingup(SuiteTask):
   An episode starts at rest, anywhere on the circle.
   """
 
+  domain = "pendulum"
   derived = ("xmat",)
 
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/PendulumSwingup.yaml`."""
-    super().__init__(config, load_spec("pendulum").compile())
-    self._pole = self.mj_model.body("pole").id
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": {"pole_sin": 1, "pole_cos": 1, "velocity": 1}}
-
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    return {"qpos": jax.random.uniform(jax.random.split(rng)[1], (1,), minval=-jnp.pi, maxval=jnp.pi)}
+    return {"qpos": draw_angle(jax.random.split(rng)[1], (1,))}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    axis = data.xmat[self._pole, :, 2]
-    return jnp.stack([axis[0], axis[2], data.qvel[0]])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    axis = data.xmat[self.body["pole"], :, 2]
+    return {"pole_sin": axis[0], "pole_cos": axis[2], "velocity": data.qvel}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    return tolerance(data.xmat[self._pole, 2, 2], (UPRIGHT, math.inf)), {}
+    return tolerance(data.xmat[self.body["pole"], 2, 2], (UPRIGHT, math.inf)), {}

@@ -1,11 +1,9 @@
 """A point mass that is pushed to the middle of a table (DM Control Suite)."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
+from playground.envs.dm_control.suite import SuiteTask, Terms, small_control
 from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
 
@@ -17,30 +15,17 @@ class PointMass(SuiteTask):
   rest, anywhere between the walls.
   """
 
+  domain = "point_mass"
   derived = ("geom_xpos",)
 
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/PointMass.yaml`."""
-    super().__init__(config, load_spec("point_mass").compile())
-    self._target, self._mass = (self.mj_model.geom(name).id for name in ("target", "pointmass"))
-    self._target_radius = float(self.mj_model.geom("target").size[0])
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": {"position": 2, "velocity": 2}}
-
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    low, high = self.mj_model.jnt_range.T
-    return {"qpos": jax.random.uniform(jax.random.split(rng)[1], (2,), minval=low, maxval=high)}
+    return {"qpos": self.draw_joints(jax.random.split(rng)[1])}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    return jnp.concatenate([data.qpos, data.qvel])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    return {"position": data.qpos, "velocity": data.qvel}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    distance = jnp.linalg.norm(data.geom_xpos[self._target] - data.geom_xpos[self._mass])
-    control = tolerance(action, margin=1, sigmoid="quadratic", value_at_margin=0).mean()
-    terms = {
-      "near_target": tolerance(distance, (0.0, self._target_radius), margin=self._target_radius),
-      "small_control": (4 + control) / 5,
-    }
+    distance = jnp.linalg.norm(data.geom_xpos[self.geom["target"]] - data.geom_xpos[self.geom["pointmass"]])
+    radius = self.mj_model.geom("target").size[0]
+    terms = {"near_target": tolerance(distance, (0.0, radius), margin=radius), "small_control": small_control(action)}
     return terms["near_target"] * terms["small_control"], terms

@@ -4,8 +4,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec
+from playground.envs.dm_control.suite import SuiteTask, Terms, draw_angle
 from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
 
@@ -17,37 +18,28 @@ class Reacher(SuiteTask):
   fingertip and target touch, else 0. An episode starts at rest, with arm and target anywhere.
   """
 
+  domain = "reacher"
   derived = ("geom_xpos",)
 
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/_reacher.yaml`."""
-    spec = load_spec("reacher")
+  def scene(self, config: Any) -> mujoco.MjSpec:
+    spec = super().scene(config)
     spec.geom("target").size[0] = config.target_radius
-    super().__init__(config, spec.compile())
-    target, finger = self.mj_model.geom("target"), self.mj_model.geom("finger")
-    self._target, self._finger = target.id, finger.id
-    self._target_height = jnp.array(self.mj_model.body("target").pos[2])
-    self._reach = float(target.size[0] + finger.size[0])  # where fingertip and target touch
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": {"joint_angles": 2, "to_target": 2, "velocity": 2}}
+    return spec
 
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     _, shoulder_key, wrist_key, angle_key, radius_key = jax.random.split(rng, 5)
-    shoulder = jax.random.uniform(shoulder_key, minval=-jnp.pi, maxval=jnp.pi)
-    low, high = self.mj_model.joint("wrist").range
-    wrist = jax.random.uniform(wrist_key, minval=low, maxval=high)
+    wrist = self.draw_joints(wrist_key, slice(1, 2))
     angle = jax.random.uniform(angle_key, maxval=2 * jnp.pi)
     radius = jax.random.uniform(radius_key, minval=0.05, maxval=0.2)
-    target = jnp.stack([radius * jnp.sin(angle), radius * jnp.cos(angle), self._target_height])
-    return {"qpos": jnp.stack([shoulder, wrist]), "mocap_pos": target[None]}
+    target = jnp.stack([radius * jnp.sin(angle), radius * jnp.cos(angle), self.mj_model.body("target").pos[2]])
+    return {"qpos": jnp.append(draw_angle(shoulder_key), wrist), "mocap_pos": target[None]}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    return jnp.concatenate([data.qpos, self._to_target(data), data.qvel])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    return {"joint_angles": data.qpos, "to_target": self._to_target(data), "velocity": data.qvel}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    return tolerance(jnp.linalg.norm(self._to_target(data)), (0.0, self._reach)), {}
+    radii = self.mj_model.geom("target").size[0] + self.mj_model.geom("finger").size[0]
+    return tolerance(jnp.linalg.norm(self._to_target(data)), (0.0, radii)), {}
 
   def _to_target(self, data: PhysicsData) -> jax.Array:
-    return (data.geom_xpos[self._target] - data.geom_xpos[self._finger])[:2]
+    return (data.geom_xpos[self.geom["target"]] - data.geom_xpos[self.geom["finger"]])[:2]

@@ -1,9 +1,10 @@
 """What the DM Control Suite's tasks share: the model beside the module, motors driven directly, endless episodes."""
 
 import abc
+import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -19,39 +20,27 @@ from playground.mdp.tolerance import tolerance
 Terms = dict[str, jax.Array]
 
 
-def load_spec(domain: str) -> mujoco.MjSpec:
-  """The domain's MJCF, for a task to edit and compile."""
-  return mujoco.MjSpec.from_file(str(Path(__file__).with_name(f"{domain}.xml")))
-
-
-def move_speed(config: Any) -> float:
-  """`env.move_speed` in m/s, of tasks where 0 means to stand.
-
-  Raises:
-    ConfigError: it is negative.
-  """
-  if config.move_speed < 0:
-    raise ConfigError(f"env.move_speed={config.move_speed} must be at least 0 m/s (0: stand).")
-  return config.move_speed
-
-
-def small_control(action: jax.Array) -> jax.Array:
-  """1 for no action, 0.8 where all are at (or beyond) full scale."""
-  return (4 + tolerance(action, margin=1, sigmoid="quadratic", value_at_margin=0).mean()) / 5
-
-
 class SuiteTask(Env):
   """A task of the suite (paper, Appendix A): the action is `ctrl`.
 
   A domain says how an episode starts, what is observed and what is rewarded. The terms of `env.rewards` are added to
   that reward, those of `env.terminations` end an episode; they read `c.data`, `c.action` and `c.env.mj_model`.
+
+  Attributes:
+    domain: name of the MJCF beside the module.
+    body, site, geom: ids by name: `data.xpos[self.body["torso"]]`.
   """
 
+  domain: ClassVar[str]
   episode_info = ("last_act", "last_last_act")
   robot = None
 
-  def __init__(self, config: Any, mj_model: mujoco.MjModel):
-    """Binds the terms; raises ConfigError for an event of another mode than startup."""
+  def __init__(self, config: Any):
+    """Compiles the scene and binds the terms. `config`: the task's, e.g. `configs/env/_walker.yaml`.
+
+    Raises:
+      ConfigError: a value that is invalid, or an event of another mode than startup.
+    """
     for name, entry in (config.get("events") or {}).items():
       if entry is not None and entry.get("mode") != "startup":
         raise ConfigError(f"env.events.{name}.mode={entry.get('mode')}: tasks of this suite have startup events only.")
@@ -59,19 +48,38 @@ class SuiteTask(Env):
     added = [*self.rewards.terms, *self.terminations.terms]
     if self.rewards.terms or any(not term.func.__module__.startswith("playground.") for term in added):
       self.derived = DERIVED_FIELDS  # which a term may read
-    super().__init__(config, mj_model)
+    super().__init__(config, self.scene(config).compile())
+    model = self.mj_model
+    self.body = {model.body(i).name: i for i in range(model.nbody)}
+    self.site = {model.site(i).name: i for i in range(model.nsite)}
+    self.geom = {model.geom(i).name: i for i in range(model.ngeom)}
+
+  def scene(self, config: Any) -> mujoco.MjSpec:
+    """Returns the scene to compile: the domain's MJCF, changed as the config says."""
+    del config
+    return mujoco.MjSpec.from_file(str(Path(__file__).with_name(f"{self.domain}.xml")))
 
   @abc.abstractmethod
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     """State fields at the start of an episode, by name ("qpos", "qvel", "mocap_pos"), from one random key."""
 
   @abc.abstractmethod
-  def observe(self, data: PhysicsData) -> jax.Array:
-    """The observation, one vector."""
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    """The parts of the observation by name, in their order."""
 
   @abc.abstractmethod
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
     """The reward in [0, 1] and the terms it is made of, which are logged as `reward/<name>`."""
+
+  def observe(self, data: PhysicsData) -> jax.Array:
+    """The observation, one vector."""
+    return jnp.concatenate([part.ravel() for part in self.parts(data).values()])
+
+  @property
+  def observation_parts(self) -> dict[str, dict[str, int]]:
+    sizes: dict[str, int] = {}
+    jax.eval_shape(lambda: sizes.update({name: part.size for name, part in self.parts(self.physics.make()).items()}))
+    return {"state": sizes}
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
     model = self.mjx_model if model is None else model
@@ -86,12 +94,14 @@ class SuiteTask(Env):
     sensor = self.mj_model.sensor(name)
     return data.sensordata[sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
 
-  def planar_pose(self, angle_key: jax.Array, joints_key: jax.Array) -> jax.Array:
-    """`qpos` of a planar model (two slides, a hinge, then joints) at the origin, turned and bent at random."""
-    low, high = self.mj_model.jnt_range[3:].T
-    angle = jax.random.uniform(angle_key, (1,), minval=-jnp.pi, maxval=jnp.pi)
-    joints = jax.random.uniform(joints_key, low.shape, minval=low, maxval=high)
-    return jnp.concatenate([jnp.zeros(2), angle, joints])
+  def draw_joints(self, key: jax.Array, joints: slice = slice(None)) -> jax.Array:
+    """Draws positions of joints, uniform in their ranges; `joints` are their ids."""
+    low, high = self.mj_model.jnt_range[joints].T
+    return jax.random.uniform(key, low.shape, minval=low, maxval=high)
+
+  def draw_planar_pose(self, angle_key: jax.Array, joints_key: jax.Array) -> jax.Array:
+    """Draws `qpos` of a planar model (two slides, a hinge, then joints): at the origin, turned and bent at random."""
+    return jnp.concatenate([jnp.zeros(2), draw_angle(angle_key, (1,)), self.draw_joints(joints_key, slice(3, None))])
 
   def settle(self, data: PhysicsData, model: mjx.Model) -> PhysicsData:
     """Lets the initial state come to rest, where a task needs that."""
@@ -109,3 +119,18 @@ class SuiteTask(Env):
     after = {**info, "last_act": action, "last_last_act": info["last_act"]} if self.rewards.terms else dict(info)
     reward = sum(more.values(), reward)
     return State(data, self.observe(data), reward, c.terminated.astype(jnp.float32), metrics, after)
+
+
+def draw_angle(key: jax.Array, shape: tuple[int, ...] = ()) -> jax.Array:
+  """Draws angles anywhere on the circle, rad."""
+  return jax.random.uniform(key, shape, minval=-jnp.pi, maxval=jnp.pi)
+
+
+def reach_speed(speed: jax.Array, goal: float, margin: float, value_at_margin: float) -> jax.Array:
+  """1 from the speed `goal` m/s on, falling linearly to `value_at_margin` at `margin` m/s below it."""
+  return tolerance(speed, (goal, math.inf), margin=margin, sigmoid="linear", value_at_margin=value_at_margin)
+
+
+def small_control(action: jax.Array) -> jax.Array:
+  """1 for no action, 0.8 where all are at (or beyond) full scale."""
+  return (4 + tolerance(action, margin=1, sigmoid="quadratic", value_at_margin=0).mean()) / 5

@@ -1,12 +1,10 @@
 """A planar two-legged walker: stand, walk or run (DM Control Suite)."""
 
 import math
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 
-from playground.envs.dm_control.suite import SuiteTask, Terms, load_spec, move_speed
+from playground.envs.dm_control.suite import SuiteTask, Terms, reach_speed
 from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
 
@@ -21,34 +19,24 @@ class Walker(SuiteTask):
   episode starts in any pose at any pitch, which may reach into the floor, as in the original suite.
   """
 
+  domain = "walker"
   derived = ("sensordata", "xpos", "xmat")
 
-  def __init__(self, config: Any):
-    """Loads the model. `config`: see `configs/env/_walker.yaml`."""
-    super().__init__(config, load_spec("walker").compile())
-    self._move_speed = move_speed(config)
-    self._torso = self.mj_model.body("torso").id
-
-  @property
-  def observation_parts(self) -> dict[str, dict[str, int]]:
-    return {"state": {"orientations": 14, "height": 1, "velocity": 9}}
-
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    _, pitch_key, joints_key = jax.random.split(rng, 3)
-    return {"qpos": self.planar_pose(pitch_key, joints_key)}
+    return {"qpos": self.draw_planar_pose(*jax.random.split(rng, 3)[1:])}
 
-  def observe(self, data: PhysicsData) -> jax.Array:
-    orientations = data.xmat[self._torso :, 0, ::2]  # x and z axis of every body along x
-    return jnp.concatenate([orientations.ravel(), data.xpos[self._torso, 2:], data.qvel])
+  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
+    torso = self.body["torso"]
+    orientations = data.xmat[torso:, 0, ::2]  # x and z axis of every body along x
+    return {"orientations": orientations, "height": data.xpos[torso, 2:], "velocity": data.qvel}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    standing = tolerance(data.xpos[self._torso, 2], (_STAND_HEIGHT, math.inf), margin=_STAND_HEIGHT / 2)
-    upright = (1 + data.xmat[self._torso, 2, 2]) / 2
+    torso, goal = self.body["torso"], self.config.move_speed
+    standing = tolerance(data.xpos[torso, 2], (_STAND_HEIGHT, math.inf), margin=_STAND_HEIGHT / 2)
+    upright = (1 + data.xmat[torso, 2, 2]) / 2
     stand = (3 * standing + upright) / 4
     terms = {"standing": standing, "upright": upright, "stand": stand}
-    if self._move_speed == 0:
+    if goal == 0:
       return stand, terms
-    speed = self.sensor(data, "torso_subtreelinvel")[0]
-    goal = (self._move_speed, math.inf)
-    move = tolerance(speed, goal, margin=self._move_speed / 2, sigmoid="linear", value_at_margin=0.5)
+    move = reach_speed(self.sensor(data, "torso_subtreelinvel")[0], goal, margin=goal / 2, value_at_margin=0.5)
     return stand * (5 * move + 1) / 6, {**terms, "move": move}

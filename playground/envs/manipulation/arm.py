@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from playground.envs.manipulation.tabletop import TabletopTask
 from playground.envs.physics import PhysicsData, mjx
 from playground.mdp.arms import ArmContext
-from playground.robots.tabletop import build_tabletop
 
 
 class ArmTask(TabletopTask):
@@ -25,10 +24,6 @@ class ArmTask(TabletopTask):
 
   episode_info = (*TabletopTask.episode_info, "reached_box")
   summaries: ClassVar[Mapping[str, str]] = dict.fromkeys(("success", "position_error_cm", "rotation_error_deg"), "last")
-
-  def __init__(self, config: Any):
-    """Builds the scene `config.scene` (`playground.robots.tabletop`). `config`: see `configs/env/_panda.yaml`."""
-    super().__init__(config, build_tabletop(config.scene))
 
   def at_goal(self, c: ArmContext) -> jax.Array:
     near = self.goal_distance(c) < self.config.success_distance

@@ -1,12 +1,11 @@
 """What tasks of ALOHA's two arms share: scene, actions, and a reward that is a weighted mean."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 
 from playground.envs.manipulation.tabletop import TabletopTask
-from playground.robots.bimanual import build_aloha_scene
 
 
 class Bimanual(TabletopTask):
@@ -18,10 +17,6 @@ class Bimanual(TabletopTask):
 
   arm_joints = r"(left|right)/(?!.*_finger).*"
   summaries: ClassVar[Mapping[str, str]] = {"success": "last", "position_error_cm": "last"}
-
-  def __init__(self, config: Any):
-    """Builds the scene `config.scene` (`playground.robots.bimanual`). `config`: see `configs/env/_aloha.yaml`."""
-    super().__init__(config, build_aloha_scene(config.scene))
 
   def total(self, rewards: Mapping[str, jax.Array]) -> jax.Array:
     return super().total(rewards) / sum(term.options.weight for term in self.rewards.terms)

@@ -54,7 +54,7 @@ class HandTask(Task):
 
   def scene(self, config: Any) -> mujoco.MjSpec:
     """Returns the scene to compile; called first of all."""
-    spec = build_in_hand_scene(config.robot.name)
+    spec = build_in_hand_scene(config.robot)
     if not config.torque_limits:
       for joint in spec.joints:
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE

@@ -10,6 +10,7 @@ import mujoco
 from playground.envs.base import State
 from playground.envs.task import InitialState, Task
 from playground.mdp.arms import ArmContext, ArmRobot
+from playground.robots.tabletop import build_tabletop
 
 
 class TabletopTask(Task):
@@ -28,19 +29,19 @@ class TabletopTask(Task):
 
   robot: ArmRobot
 
-  def __init__(self, config: Any, spec: mujoco.MjSpec):
-    """Compiles the scene and binds the terms.
+  def __init__(self, config: Any):
+    """Builds the scene and binds the terms.
 
     Args:
-      config: the task's ConfigDict: that of `Task`, `action_scale`, `keyframe`, `object` and `gripper`.
-      spec: the scene.
+      config: the task's ConfigDict: that of `Task`, `scene` (`playground.robots.tabletop`), `action_scale`, `keyframe`,
+        `object` and `gripper`.
 
     Raises:
       UnknownNameError: a term, parameter or object of the model that does not exist.
       ConfigError: a value that is invalid.
     """
     self.object, self.gripper = config.get("object"), config.get("gripper")
-    super().__init__(config, spec)
+    super().__init__(config, build_tabletop(config.scene))
     self._action_scale: float = config.action_scale
 
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> ArmRobot:
