@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from playground.benchmark.arguments import option
-from playground.benchmark.jobs import Job, Plan, probe, run_jobs
+from playground.benchmark.jobs import Measurement, probe, run_jobs
 from playground.benchmark.options import TRAINING, Measuring, OfRuns, OfTasks
 from playground.benchmark.peer import PEERS, check_peer
 from playground.benchmark.schema import Table
@@ -38,7 +38,7 @@ class Throughput(OfTasks):
 
   name = "throughput"
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     seeds = list(range(1, self.seeds + 1))
     return [self.on_one_device(self.job("training", task, seeds=seeds)) for task in self.chosen()]
 
@@ -51,9 +51,9 @@ class Startup(OfTasks):
   alone = True
   sets_devices = False
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     last = {"quantity": "start_to_first_update_s", "setting": " ".join((*self.overrides, "warm"))}
-    jobs = [self.job("startup", task) for task in self.chosen()]
+    jobs = [self.job("runs:startup", task) for task in self.chosen()]
     return [dataclasses.replace(job, last=last) for job in jobs]
 
 
@@ -65,7 +65,7 @@ class Scaling(OfTasks):
 
   name = "scaling"
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     jobs = []
     for task in self.chosen():
       for count in self.num_envs:
@@ -81,7 +81,7 @@ class Breakdown(OfTasks):
 
   name = "breakdown"
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, "part=update"))}
     jobs = [self.on_one_device(self.job("breakdown", task)) for task in self.chosen()]
     return [dataclasses.replace(job, last=last) for job in jobs]
@@ -112,7 +112,7 @@ class Pixels(OfTasks):
       if not self.configured(task).env.vision.enable:
         raise ConfigError(f"{task} sees nothing: add env.vision.enable=true env.vision.camera=<name>.")
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     jobs = []
     until = "pixels" if self.compared else "update"  # simulators are compared without policies
     for task in self.chosen():
@@ -146,7 +146,7 @@ class Topology(OfRuns):
       if kind not in ("fixed", "scaled"):
         raise ConfigError(f"hyperparameters={kind} must be fixed, scaled or both.")
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     counts = self.devices or [2**i for i in range(facts["devices"].bit_length())]
     if max(counts) > facts["devices"]:
       raise ConfigError(f"devices={list(counts)}: this machine has {facts['devices']}.")
@@ -179,13 +179,15 @@ class Chain(Measuring):
     if not compose([f"experiment={self.experiment}", *self.overrides]).stages:
       raise ConfigError(f"experiment={self.experiment} is no chain: choose one that ends in _chain.")
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     agent = compose([f"experiment={self.experiment}", *self.overrides]).agent.name
     arguments = {"experiment": self.experiment, "overrides": list(self.overrides)}
     arguments |= {"runs": self.runs, "again": self.rerun}
     columns = self.columns(self.experiment, agent)
     last = {"quantity": "wall_clock_s", "setting": " ".join((*self.overrides, "stage=all"))}
-    return [Job("chain", {**arguments, "seeds": [seed]}, columns, last) for seed in range(1, self.seeds + 1)]
+    return [
+      Measurement("runs:chain", {**arguments, "seeds": [seed]}, columns, last) for seed in range(1, self.seeds + 1)
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,11 +215,11 @@ class BesidePeer(OfTasks):
       raise ConfigError(f"agent={self.agent}: {self.name} is of {' or '.join(self.agents)}.")
     check_peer(self.peer, self.peer_python, self.peer_path, self.peer_menagerie)
 
-  def peer_job(self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: Any) -> Job:
+  def peer_job(self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: Any) -> Measurement:
     """A job of the peer; overrides are of our run and do not reach it."""
-    peer = {"peer": self.peer, "python": self.peer_python, "path": self.peer_path, "menagerie": self.peer_menagerie}
+    peer = {"name": self.peer, "python": self.peer_python, "path": self.peer_path, "menagerie": self.peer_menagerie}
     columns = self.columns(task, self.agent, setting, PEERS[self.peer].label)
-    return Job(measure, {"task": task, **peer, **arguments}, columns, {"quantity": quantity})
+    return Measurement(measure, {"task": task, "peer": peer, **arguments}, columns, {"quantity": quantity})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,7 +231,7 @@ class Compare(BesidePeer):
   name = "compare"
   alone = True
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     jobs = []
     for task in self.chosen():
       for turn in range(1, self.repeats + 1):
@@ -237,7 +239,7 @@ class Compare(BesidePeer):
         jobs.append(self.on_one_device(dataclasses.replace(ours, columns=self.columns(task, self.ours))))
         for backend in self.backends:
           of_it = {"seconds": self.seconds, "backend": backend, "seeds": [turn]}
-          jobs.append(self.peer_job("peer", TRAINING, task, [f"env.impl={backend}"], **of_it))
+          jobs.append(self.peer_job("peer:rates", TRAINING, task, [f"env.impl={backend}"], **of_it))
     return jobs
 
 
@@ -259,7 +261,7 @@ class Learning(BesidePeer, OfRuns):
     if self.agent == "sac" and (others := set(self.chosen()) - set(tasks_of("dm_control"))):
       raise ConfigError(f"agent=sac: the package trains SAC on DM Control alone, not {', '.join(sorted(others))}.")
 
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     jobs = []
     for task in self.chosen():
       for seed in range(1, self.seeds + 1):
@@ -268,7 +270,7 @@ class Learning(BesidePeer, OfRuns):
           setting = [f"env.impl={backend}", *self.budget()]
           of_it = {"agent": self.agent, "num_timesteps": self.num_timesteps, "backend": backend, "seeds": [seed]}
           of_it["told"] = [*self.overrides, *setting]
-          jobs.append(self.peer_job("peer_run", "final_return", task, setting, **of_it))
+          jobs.append(self.peer_job("peer:whole", "final_return", task, setting, **of_it))
     return jobs
 
 
@@ -284,7 +286,6 @@ def run(command: Measuring) -> int:
   table = Table(Path(command.out) if command.out else RESULTS / f"{command.name}.csv")
   hardware = [text for text in command.overrides if text.startswith("hardware")]
   facts = probe(hardware, command.gpus)
-  plan = Plan(**{field.name: getattr(command, field.name) for field in dataclasses.fields(Plan)})
   jobs = command.jobs(facts)  # says what does not fit, before anything else is said
   print(f"{facts['devices']} x {facts['device']}; {facts['versions']}")
-  return run_jobs(jobs, table, facts, plan)
+  return run_jobs(jobs, table, facts, command)

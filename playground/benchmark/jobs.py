@@ -1,43 +1,45 @@
-"""Runs measurements, each in a process of its own, and adds their rows to the table as they come."""
+"""Measurements as jobs of the sweep's runner, each in a process of its own; rows go to the table as they come."""
 
 import contextlib
 import dataclasses
 import datetime
 import json
-import os
-import queue
-import signal
-import subprocess
 import sys
 import tempfile
-import threading
-import time
-from collections import deque
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from playground.benchmark.arguments import option
 from playground.benchmark.schema import Table, commit_of
-from playground.benchmark.worker import ERROR, ROW
+from playground.benchmark.worker import ROW
+from playground.config import compose_settings
 from playground.errors import HardwareError
 from playground.interpreter import PYTHON
 from playground.runs.provenance import git_state
+from playground.sweep.folder import FAILED, Job, JobState, SweepDirectory
+from playground.sweep.local import ALL, LocalLauncher, Slot
+from playground.sweep.runner import Runner
+from playground.sweep.view import View
 
 WORKER = (*PYTHON, "-W", "ignore", "-m", "playground.benchmark.worker")
-GRACE_S = 40.0  # between asking a process to end and ending it: a training run saves first
-CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")
+GRACE_S = 40  # between asking a process to end and ending it: a training run saves first
 TAIL = 30  # lines of a failed process that are shown
+
+Row = dict[str, Any]
+Add = Callable[["Measurement", Row], None]  # takes a row of a measurement
 
 
 @dataclasses.dataclass(frozen=True)
-class Job:
+class Measurement:
   """One measurement.
 
   Attributes:
-    measure: a module of `measures`.
-    arguments: of its `measure` function; `seeds`, where it takes them, shrinks to those not measured yet.
+    measure: a module of `measures`, and its function unless `measure`: `module:function`.
+    arguments: of that function; `seeds`, where it takes them, shrinks to those not measured yet.
     columns: of its rows (benchmark, task, agent, who, setting).
-    last: columns of the row that shows that it is done; there is one for each seed if it takes seeds.
+    last: columns of its last row; there is one for each seed if it takes seeds.
   """
 
   measure: str
@@ -45,7 +47,7 @@ class Job:
   columns: Mapping[str, Any]
   last: Mapping[str, Any]
 
-  def left(self, table: Table, facts: Mapping[str, Any]) -> "Job | None":
+  def left(self, table: Table, facts: Mapping[str, Any]) -> "Measurement | None":
     """The part that the table does not have for this device yet; None if there is none."""
     row = {"device": facts["device"], **self.columns, **self.last}
     if "seeds" not in self.arguments:
@@ -59,160 +61,123 @@ class Job:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-  """How jobs are run; see `commands.Measuring`."""
+  """How measurements are run."""
 
-  rerun: bool
-  minutes: float | None
-  workers: int
-  gpus: tuple[int, ...]
-  cache: bool
-  commit: str | None
-  note: str
+  rerun: bool = option(False, "measure again what the CSV has already")
+  minutes: float | None = option(None, "stop after this long; the same command again measures the rest")
+  workers: int = option(1, "processes at once: they compile side by side, one at a time is timed on a device")
+  gpus: tuple[int, ...] = option((), "GPUs that the processes are spread over; none is all of them to each")
+  cache: bool = option(False, "reuse compiled programs; compile and start times are then not those of a cold start")
+  commit: str | None = option(None, "what to record where there is no git")
+  note: str = option("", "added to the conditions of every row")
+
+
+class _Rows(View):
+  """Hands each row on as soon as its measurement prints it, and prints why measurements fail."""
+
+  def __init__(self, sweep: SweepDirectory, measurements: Sequence[Measurement], add: Add):
+    super().__init__(sweep)
+    self.again = "the same command measures the rest"
+    self._measurements = dict(zip((job.name for job in sweep.jobs), measurements, strict=True))
+    self._add = add
+    self._read = dict.fromkeys(self._measurements, 0)  # bytes of each log
+    self.reasons: dict[str, str] = {}
+    self.states: Mapping[str, JobState] = {}
+
+  def begin(self, states: Mapping[str, JobState], at_work: int, trials: int | None = None) -> None:
+    """Prints nothing: measurements of an earlier start are in the table."""
+
+  def update(self, states: Mapping[str, JobState], now: bool = False) -> None:
+    self.states = dict(states)
+    for job in self._sweep.jobs:
+      measurement, log = self._measurements[job.name], self._sweep.folder(job).log
+      new = b""
+      if log.is_file():
+        with log.open("rb") as file:
+          file.seek(self._read[job.name])
+          new = file.read().rpartition(b"\n")[0]
+      self._read[job.name] += len(new)
+      for line in new.decode(errors="replace").splitlines():
+        if line.startswith(ROW):
+          self._add(measurement, json.loads(line.removeprefix(ROW)))
+      if states[job.name].status in FAILED and job.name not in self.reasons:
+        self.reasons[job.name] = self._why(job, states[job.name])
+        print(f"{measurement}: {self.reasons[job.name]}", file=sys.stderr, flush=True)
+
+  def _why(self, job: Job, state: JobState) -> str:
+    """The reason of a failure, with the end of the log if the process did not give one itself."""
+    folder = self._sweep.folder(job)
+    if folder.run.status.get("reason"):
+      return state.reason
+    lines = folder.log.read_text(encoding="utf-8", errors="replace").splitlines()
+    return "\n".join([state.reason, *[line for line in lines if line.strip() and not line.startswith(ROW)][-TAIL:]])
+
+
+def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int, _Rows]:
+  """Runs measurements; returns the runner's exit code and how they ended."""
+  gpus = list(map(str, plan.gpus)) or [ALL]
+  slots = [Slot(number, gpus[number % len(gpus)], ()) for number in range(plan.workers)]
+  with tempfile.TemporaryDirectory() as temporary:
+    folder = Path(temporary).resolve()
+    payload = {"cache": plan.cache, "shares": plan.workers > len(gpus)}
+    jobs = []
+    for number, each in enumerate(measurements):
+      name = f"{number:03d}"
+      payload |= {"measure": each.measure, "arguments": dict(each.arguments), "folder": str(folder / "jobs" / name)}
+      jobs.append(Job(name, [json.dumps(payload)], {}))
+    sweep = SweepDirectory.create(folder, "benchmark", [], [], [], jobs)
+    rows = _Rows(sweep, measurements, add)
+    config = compose_settings([f"launcher.grace={GRACE_S}"]).launcher
+    with contextlib.closing(LocalLauncher(sweep, config, WORKER, slots)) as launcher:
+      code = Runner(sweep, launcher, rows, seconds=plan.minutes and 60 * plan.minutes).run()
+    return code, rows
 
 
 def probe(overrides: Sequence[str], gpus: Sequence[int]) -> dict[str, Any]:
-  """What the jobs will run on, asked of a process of its own: this one must not hold a device.
+  """The device and the versions that measurements will have, found in a process of its own: this one holds no device.
 
   Raises:
     HardwareError: the device cannot be used.
   """
-  rows: list[dict[str, Any]] = []
-  reason = _run("machine", {"overrides": list(overrides)}, _environment(gpus[:1]), rows.append, None)
-  if reason:
-    raise HardwareError(reason)
-  return {"devices": int(rows[0]["value"]), "device": rows[0]["device"], "versions": rows[0]["versions"]}
+  found: list[Row] = []
+  columns = dict.fromkeys(("task", "agent", "who", "setting"), "")
+  machine = Measurement("machine", {"overrides": list(overrides)}, columns, {})
+  code, rows = _run([machine], lambda _, row: found.append(row), Plan(gpus=tuple(gpus[:1]), cache=True))
+  if code:
+    raise HardwareError(rows.reasons.get("000", "the machine was not asked: interrupted."))
+  return {"devices": int(found[0]["value"]), "device": found[0]["device"], "versions": found[0]["versions"]}
 
 
-def run_jobs(jobs: Sequence[Job], table: Table, facts: Mapping[str, Any], plan: Plan) -> int:
+def run_jobs(measurements: Sequence[Measurement], table: Table, facts: Mapping[str, Any], plan: Plan) -> int:
   """Runs what the table does not have yet.
 
   Returns:
-    0 when all is there, 1 when something failed, 3 when the time was up before.
+    0 when all is there, 1 when something failed, 3 when the time was up before, 130 or 143 when interrupted.
   """
-  todo = [left for job in jobs if (left := job if plan.rerun else job.left(table, facts))]
-  if len(todo) < len(jobs):
-    print(f"{len(jobs) - len(todo)} of {len(jobs)} are in {table.path} already (rerun=true measures them again).")
-  waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
-  for job in todo:
-    waiting.put(job)
-  deadline = None if plan.minutes is None else time.monotonic() + 60 * plan.minutes
-  reasons: list[str | None] = []  # of each job that was run, why it failed
-  stop = threading.Event()
-  commit, slots = plan.commit or commit_of(git_state()), plan.gpus or (None,)
+  todo = [left for each in measurements if (left := each if plan.rerun else each.left(table, facts))]
+  if len(todo) < len(measurements):
+    there = len(measurements) - len(todo)
+    print(f"{there} of {len(measurements)} are in {table.path} already (rerun=true measures them again).")
   remarks = [f"{plan.workers} processes at once, one timed at a time on a device"] if plan.workers > 1 else []
   remarks += ["caches of earlier runs" if plan.cache else "cold caches", " ".join(plan.note.split())]
+  shared = {"device": facts["device"], "versions": facts["versions"], "commit": plan.commit or commit_of(git_state())}
 
-  def work(folder: str, slot: int) -> None:
-    gpu = slots[slot % len(slots)]
-    lock = f"{folder}/gpu{gpu}.lock" if plan.workers > len(slots) else None
-    while not stop.is_set() and (deadline is None or time.monotonic() < deadline):
-      try:
-        job = waiting.get_nowait()
-      except queue.Empty:
-        return
+  def add(measurement: Measurement, row: Row) -> None:
+    conditions = "; ".join(part for part in (row.get("conditions", ""), *remarks) if part)
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    table.add({**measurement.columns, **shared, **row, "conditions": conditions, "date": now})
+    where = [row["setting"]] if "setting" in row else []
+    where += [f"seed {row['seed']}"] if "seed" in row else []
+    print(f"{measurement}: {row['quantity']} {row['value']:,} {row['unit']} {' '.join(where)}".rstrip(), flush=True)
 
-      def add(row: Mapping[str, Any], job: Job = job) -> None:
-        conditions = "; ".join(part for part in (row.get("conditions", ""), *remarks) if part)
-        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        here = {name: facts[name] for name in ("device", "versions")}
-        table.add({**job.columns, **here, "commit": commit, **row, "conditions": conditions, "date": now})
-        where = [row["setting"]] if "setting" in row else []
-        where += [f"seed {row['seed']}"] if "seed" in row else []
-        print(f"{job}: {row['quantity']} {row['value']:,} {row['unit']} {' '.join(where)}".rstrip(), flush=True)
-
-      arguments = {**job.arguments, "lock": lock}
-      with tempfile.TemporaryDirectory(dir=folder) as empty:
-        env = _environment([] if gpu is None else [gpu], None if plan.cache else empty)
-        reason = _run(job.measure, arguments, env, add, deadline)
-      reasons.append(reason)
-      if reason:
-        print(f"{job}: {reason}", file=sys.stderr, flush=True)
-
-  with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(plan.workers) as pool:
-    try:
-      for future in [pool.submit(work, folder, slot) for slot in range(plan.workers)]:
-        future.result()
-    except BaseException:  # interrupted: what we started must not go on without us
-      stop.set()
-      for process in list(_running):
-        _signal(process, signal.SIGTERM)
-      raise
-  failed = sum(reason not in (None, OUT_OF_TIME) for reason in reasons)
-  left = len(todo) - len(reasons) + reasons.count(OUT_OF_TIME)
-  print(f"{reasons.count(None)} measured, {failed} failed, {left} left: {table.path}")
+  code, rows = _run(todo, add, plan)
+  counts = Counter(state.status for state in rows.states.values())
+  failed = sum(counts[status] for status in FAILED)
+  left = len(todo) - counts["finished"] - failed
+  print(f"{counts['finished']} measured, {failed} failed, {left} left: {table.path}")
+  if code >= 128:
+    return code
   if left:
-    rest = (
-      "name what is left in tasks=, for rerun=true begins anew" if plan.rerun else "the same command measures the rest"
-    )
+    rest = "name what is left in tasks=, for rerun=true begins anew" if plan.rerun else rows.again
     print(f"The time was up: {rest}.")
   return 1 if failed else 3 if left else 0
-
-
-_running: "set[subprocess.Popen[str]]" = set()
-OUT_OF_TIME = "stopped, the time was up"
-
-
-def _run(
-  measure: str, arguments: Mapping[str, Any], env: dict[str, str], add: Any, deadline: float | None
-) -> str | None:
-  """Runs one worker and hands on its rows; returns why it failed, None if it did not."""
-  command = [*WORKER, json.dumps({"measure": measure, "arguments": dict(arguments)})]
-  process = subprocess.Popen(
-    command,
-    stdout=subprocess.PIPE,
-    stderr=subprocess.STDOUT,
-    text=True,
-    errors="replace",
-    env=env,
-    start_new_session=True,
-  )
-  assert process.stdout is not None
-  _running.add(process)
-  timer = threading.Timer(max(0.0, deadline - time.monotonic()), _end, [process]) if deadline else None
-  if timer:
-    timer.daemon = True
-    timer.start()
-  tail: deque[str] = deque(maxlen=TAIL)
-  error = None
-  try:
-    for line in process.stdout:
-      if line.startswith(ROW):
-        add(json.loads(line.removeprefix(ROW)))
-      elif line.startswith(ERROR):
-        error = line.removeprefix(ERROR).strip()
-      elif line.strip():
-        tail.append(line)
-    code = process.wait()
-  finally:
-    if timer:
-      timer.cancel()
-    if process.poll() is None:
-      _signal(process, signal.SIGTERM)
-    _running.discard(process)
-  if code == 0:
-    return None
-  if deadline is not None and time.monotonic() >= deadline:
-    return OUT_OF_TIME
-  return error or f"ended with code {code}\n{''.join(tail)}"
-
-
-def _environment(gpus: Sequence[int], cache: str | None = None) -> dict[str, str]:
-  """Of a worker: the GPUs that it sees, and the folder of its caches unless they are the user's."""
-  env = {**os.environ, "PYTHONUNBUFFERED": "1"}
-  if gpus:
-    env["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, gpus))
-  return env | ({name: f"{cache}/{name}" for name in CACHES} if cache else {})
-
-
-def _end(process: "subprocess.Popen[str]") -> None:
-  """Asks a worker and what it started to end, and ends them if they do not."""
-  _signal(process, signal.SIGTERM)
-  try:
-    process.wait(GRACE_S)
-  except subprocess.TimeoutExpired:
-    _signal(process, signal.SIGKILL)
-
-
-def _signal(process: "subprocess.Popen[str]", number: int) -> None:
-  with contextlib.suppress(ProcessLookupError):
-    os.killpg(process.pid, number)

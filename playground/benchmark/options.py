@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from playground.benchmark.arguments import check_amounts, option
-from playground.benchmark.jobs import Job
+from playground.benchmark.jobs import Measurement, Plan
 from playground.config import RunConfig, compose
 from playground.config.files import task_names
 from playground.errors import ConfigError, UnknownNameError, nearest
@@ -18,29 +18,22 @@ QUANTITY = {  # the last row of a measurement
   "training": TRAINING,
   "environment": "env_steps_per_s",
   "breakdown": "seconds_per_step",
-  "startup": "start_to_first_update_s",
+  "runs:startup": "start_to_first_update_s",
 }
 
 
 @dataclasses.dataclass(frozen=True)
-class Measuring(abc.ABC):
+class Measuring(Plan, abc.ABC):
   """Options of everything that measures."""
 
   out: str | None = option(None, "CSV that rows are added to; null is results/benchmarks/<command>.csv")
-  rerun: bool = option(False, "measure again what the CSV has already")
-  minutes: float | None = option(None, "stop after this long; the same command again measures the rest")
-  workers: int = option(1, "processes at once: they compile side by side, one at a time is timed on a device")
-  gpus: tuple[int, ...] = option((), "GPUs that the processes are spread over; none is all of them to each")
-  cache: bool = option(False, "reuse compiled programs; compile and start times are then not those of a cold start")
-  commit: str | None = option(None, "what to record where there is no git")
-  note: str = option("", "added to the conditions of every row")
   overrides: tuple[str, ...] = option((), "of the run's configuration")
 
   name = "measuring"
   alone = False  # whether it needs the machine to itself
 
   @abc.abstractmethod
-  def jobs(self, facts: dict[str, Any]) -> list[Job]:
+  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
     """What is to be measured on a machine of which `facts` are known."""
 
   def check(self) -> None:
@@ -101,13 +94,13 @@ class OfTasks(Measuring):
     self.configured(task, *setting)  # a number that does not fit is said here
     return setting
 
-  def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: Any) -> Job:
+  def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: Any) -> Measurement:
     """A job with overrides, which `setting` says."""
     overrides = [*self.overrides, *setting]
     arguments = {"task": task, "agent": self.agent, "overrides": overrides, "seconds": self.seconds, **arguments}
-    return Job(measure, arguments, self.columns(task, self.agent, setting), {"quantity": QUANTITY[measure]})
+    return Measurement(measure, arguments, self.columns(task, self.agent, setting), {"quantity": QUANTITY[measure]})
 
-  def on_one_device(self, job: Job) -> Job:
+  def on_one_device(self, job: Measurement) -> Measurement:
     """The job with one device for each process: what most tables are about, so no setting of its own."""
     arguments = {**job.arguments, "overrides": [*job.arguments["overrides"], "hardware.devices=1"]}
     return dataclasses.replace(job, arguments=arguments)
@@ -127,9 +120,9 @@ class OfRuns(OfTasks):
   def budget(self) -> list[str]:
     return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
 
-  def whole_run(self, task: str, agent: str, seed: int, setting: Sequence[str] = ()) -> Job:
+  def whole_run(self, task: str, agent: str, seed: int, setting: Sequence[str] = ()) -> Measurement:
     """A job that trains from beginning to end, for the budget."""
     setting = [*setting, *self.budget()]
     told = [*self.overrides, *setting]
     arguments = {"task": task, "agent": agent, "overrides": told, "told": told, "seeds": [seed]}
-    return Job("run", arguments, self.columns(task, agent, setting), {"quantity": "final_return"})
+    return Measurement("runs:whole", arguments, self.columns(task, agent, setting), {"quantity": "final_return"})

@@ -3,19 +3,26 @@
 import importlib
 import json
 import os
+import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from playground.collector import uncollected
 
-ROW, ERROR = "ROW ", "ERROR "  # what a line begins with; other lines are the libraries' own
-
-Emit = Callable[..., None]  # (quantity, value, unit, **columns)
+ROW = "ROW "  # a line with a row begins with it; other lines are the libraries' own
+CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")
 
 
 class Facts(dict[str, Any]):
-  """Columns that all rows of a measurement share, and the function that emits one."""
+  """Columns that all rows of a measurement share, and the function that emits one.
+
+  Attributes:
+    lock: a file to hold while timing, where several measurements share a device; else None.
+  """
+
+  lock: str | None = None
 
   def emit(self, quantity: str, value: float, unit: str, **columns: Any) -> None:
     row = {"quantity": quantity, "value": float(f"{value:.6g}"), "unit": unit, **self, **columns}
@@ -23,20 +30,27 @@ class Facts(dict[str, Any]):
 
 
 def main() -> None:
-  """Runs `measures.<name>.measure(facts, **arguments)`; what the user can act on is one line, else a traceback."""
+  """Runs a function of `measures`; an error that the user can act on is the reason of the job, others a traceback."""
   from playground.errors import PlaygroundError
+  from playground.runs.files import write_json
 
   job = json.loads(sys.argv[1])
-  arguments = job["arguments"]
+  arguments, folder, facts = job["arguments"], Path(job["folder"]), Facts()
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # else a GPU looks full from the start
+  if not job["cache"]:
+    os.environ |= {name: str(folder / name) for name in CACHES}
+  if job["shares"]:  # with the measurements that see the same GPUs
+    gpus = re.sub(r"\W", "_", os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
+    facts.lock = str(folder.parent / f"gpu{gpus}.lock")
+  module, _, function = job["measure"].partition(":")
   try:
     with uncollected(stays=True):
-      if job["measure"] == "training":  # in this process
+      if module == "training":  # in this process
         _stand_by(**arguments)
-      measure = importlib.import_module(f"playground.benchmark.measures.{job['measure']}").measure
-    measure(Facts(), **arguments)
+      measure = getattr(importlib.import_module(f"playground.benchmark.measures.{module}"), function or "measure")
+    measure(facts, **arguments)
   except PlaygroundError as error:
-    print(ERROR + " ".join(str(error).split()), flush=True)
+    write_json(folder / "status.json", {"status": "failed", "reason": " ".join(str(error).split())})
     sys.exit(2)
 
 

@@ -25,6 +25,7 @@ class View:
     self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
     self._seen: dict[str, tuple[str, int]] = {}
     self._drawn_at = 0.0
+    self.again = f"the same command, or `playground sweep retry {sweep.path}`, goes on"  # how a stopped sweep goes on
 
   def __enter__(self) -> Self:
     if self._live:
@@ -38,11 +39,6 @@ class View:
   def print(self, text: str) -> None:
     """A line above the table."""
     self._console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-  @property
-  def again(self) -> str:
-    """How a stopped sweep goes on."""
-    return f"the same command, or `playground sweep retry {self._sweep.path}`, goes on"
 
   def begin(self, states: Mapping[str, JobState], at_work: int, trials: int | None = None) -> None:
     """Prints how the sweep stands; its jobs' first states are not printed later."""

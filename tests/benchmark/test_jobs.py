@@ -12,14 +12,17 @@ import pytest
 
 from playground.benchmark import jobs
 from playground.benchmark.commands import Topology
-from playground.benchmark.jobs import Job, Plan, probe, run_jobs
+from playground.benchmark.jobs import Measurement, Plan, probe, run_jobs
 from playground.benchmark.schema import Table
+from playground.benchmark.worker import CACHES
 from playground.errors import HardwareError
 
 FACTS = {"device": "a device", "versions": "1.0"}
-PLAN = Plan(rerun=False, minutes=None, workers=1, gpus=(), cache=True, commit="abc", note="a\n note")
+PLAN = Plan(cache=True, commit="abc", note="a\n note")
 WORKER = """
 import json, os, sys, time
+from pathlib import Path
+from playground.benchmark import worker
 job = json.loads(sys.argv[1]); measure, arguments = job["measure"], job["arguments"]
 def row(**columns):
   print("ROW " + json.dumps({"quantity": "training_steps_per_s", "unit": "steps/s", **columns}), flush=True)
@@ -27,10 +30,16 @@ print("what a library says")
 if measure == "train":
   gpu = os.environ["CUDA_VISIBLE_DEVICES"]
   for seed in arguments["seeds"]: row(seed=seed, value=100.0 + seed, conditions="timed", backend=gpu)
-elif measure == "lock": row(seed=1, value=1.0, conditions=f"lock {arguments['lock']}")
-elif measure == "caches": row(value=1.0, conditions=",".join(os.environ.get(name, "") for name in arguments["names"]))
+elif measure in ("lock", "caches"):
+  def told(facts, **_):
+    text = f"lock {facts.lock}" if measure == "lock" else ",".join(os.environ.get(name, "") for name in worker.CACHES)
+    facts.emit("training_steps_per_s", 1.0, "", seed=1, conditions=text)
+  worker.importlib.import_module = lambda name: type("Module", (), {"measure": told})
+  worker.main()
 elif measure == "read": row(seed=1, value=1.0, commit="earlier")
-elif measure == "user": print("ERROR that cannot be."); sys.exit(2)
+elif measure == "user":
+  (Path(job["folder"]) / "status.json").write_text('{"status": "failed", "reason": "that cannot be."}')
+  sys.exit(2)
 elif measure == "bug": sys.exit("Traceback of a bug")
 elif measure == "sleep": row(seed=1, value=1.0); time.sleep(60)
 elif measure == "wait":
@@ -49,9 +58,9 @@ def worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
 
 
-def job(measure: str, task: str = "A", seeds: tuple[int, ...] = (1, 2)) -> Job:
+def job(measure: str, task: str = "A", seeds: tuple[int, ...] = (1, 2)) -> Measurement:
   columns = {"benchmark": "throughput", "task": task, "agent": "ppo", "who": "ours", "setting": ""}
-  return Job(measure, {"seeds": list(seeds)}, columns, {"quantity": "training_steps_per_s"})
+  return Measurement(measure, {"seeds": list(seeds)}, columns, {"quantity": "training_steps_per_s"})
 
 
 def test_rows_have_their_columns(tmp_path: Path):
@@ -73,13 +82,13 @@ def test_what_was_run_earlier_keeps_its_commit(tmp_path: Path):
 def test_caches_are_empty_ones_unless_the_users_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
   def caches(**plan: Any) -> list[str]:
     path = tmp_path / f"rows{plan}.csv"
-    asks = [dataclasses.replace(job("caches", name), arguments={"names": jobs.CACHES}) for name in "AB"]
+    asks = [job("caches", name) for name in "AB"]
     assert run_jobs(asks, Table(path), FACTS, Plan(**{**vars(PLAN), **plan})) == 0
     return [row["conditions"].split(";")[0] for row in csv.DictReader(path.read_text().splitlines())]
 
-  for name in jobs.CACHES:
+  for name in CACHES:
     monkeypatch.setenv(name, "the user's")
-  assert caches(cache=True) == [",".join(["the user's"] * len(jobs.CACHES))] * 2
+  assert caches(cache=True) == [",".join(["the user's"] * len(CACHES))] * 2
   cold = caches(cache=False)
   assert len(set(cold)) == 2 and not any("the user's" in text for text in cold), "one for each process"
 
@@ -110,7 +119,7 @@ def test_a_failure_is_named_and_the_others_go_on(tmp_path: Path, capsys: pytest.
 
 def test_the_time_is_kept_and_rows_so_far_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
   table = Table(tmp_path / "rows.csv")
-  plan = Plan(**{**vars(PLAN), "minutes": 1.5 / 60})
+  plan = Plan(**{**vars(PLAN), "minutes": 4.0 / 60})
   assert run_jobs([job("sleep", "S"), job("train", "T")], table, FACTS, plan) == 3
   assert table.has({"task": "S", "seed": 1}) and not table.has({"task": "T"})
   said = capsys.readouterr().out
@@ -144,7 +153,7 @@ def test_more_workers_than_gpus_take_turns_at_each(tmp_path: Path):
 
 def test_all_of_a_topology_takes_turns_at_the_machine(tmp_path: Path):
   of_it = Topology(tasks=("CartpoleBalance",), num_timesteps=5000, seeds=1, workers=3).jobs({"devices": 2})
-  assert {job.measure for job in of_it} == {"training", "run"}
+  assert {job.measure for job in of_it} == {"training", "runs:whole"}
   path = tmp_path / "rows.csv"
   jobs = [dataclasses.replace(job, measure="lock") for job in of_it]
   assert run_jobs(jobs, Table(path), FACTS, Plan(**{**vars(PLAN), "workers": 3})) == 0
@@ -154,9 +163,8 @@ def test_all_of_a_topology_takes_turns_at_the_machine(tmp_path: Path):
 
 def test_the_machine_is_asked_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch):
   assert probe([], ()) == {"devices": 2, "device": "a device", "versions": "1.0"}
-  run: Any = jobs._run
-  monkeypatch.setattr(jobs, "_run", lambda measure, *rest: run("user", *rest))
-  with pytest.raises(HardwareError, match="cannot be"):
+  monkeypatch.setattr(jobs, "Measurement", lambda _, *rest: Measurement("user", *rest))
+  with pytest.raises(HardwareError, match="that cannot be"):
     probe([], ())
 
 
@@ -171,8 +179,8 @@ from playground.benchmark.schema import Table
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
 jobs.WORKER = {jobs.WORKER!r}
 columns = dict(benchmark="throughput", task="A", agent="ppo", who="ours", setting="")
-job = jobs.Job("wait", {{}}, columns, {{"quantity": "steps"}})
-jobs.run_jobs([job], Table(Path({str(table)!r})), {FACTS!r}, jobs.Plan(False, None, 1, (), True, "", ""))
+job = jobs.Measurement("wait", {{}}, columns, {{"quantity": "steps"}})
+sys.exit(jobs.run_jobs([job], Table(Path({str(table)!r})), {FACTS!r}, jobs.Plan(cache=True)))
 """)
   process = subprocess.Popen([sys.executable, str(main)], stdout=subprocess.PIPE, text=True)
   assert process.stdout is not None

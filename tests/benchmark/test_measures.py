@@ -16,13 +16,15 @@ from playground import registry
 from playground.benchmark import commands
 from playground.benchmark import peer as peers
 from playground.benchmark.commands import Compare, Learning, Topology
-from playground.benchmark.measures import run
+from playground.benchmark.measures import peer as peer_measures
+from playground.benchmark.measures import runs
 from playground.benchmark.schema import Table
 from playground.benchmark.worker import ROW, Facts
 from playground.errors import ConfigError
 from playground.runs.files import write_json
 from tests.dummy import Point
 
+PEER = {"name": "some", "python": sys.executable, "path": "", "menagerie": ""}
 CHECKOUT = Path(__file__).parents[2]
 SMALL = ["agent.num_envs=16", "agent.batch_size=16", "agent.num_minibatches=1", "agent.unroll_length=5"]
 SMALL += ["agent.num_updates_per_batch=1", "agent.num_eval_envs=2"]
@@ -38,7 +40,7 @@ def test_a_training(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
   from playground.benchmark.measures import training
 
   monkeypatch.setattr(registry, "load", lambda name, config: Point())
-  training.measure(Facts(), "CartpoleBalance", "ppo", SMALL, seeds=[3, 4], seconds=0.2, lock=None)
+  training.measure(Facts(), "CartpoleBalance", "ppo", SMALL, seeds=[3, 4], seconds=0.2)
   found = rows(capsys)
   assert [(row["quantity"], row["seed"]) for row in found] == [
     ("trace_s", 3), ("compile_s", 3), ("start_to_first_update_s", 3),
@@ -73,10 +75,8 @@ def write_chain(run: Path, final_return: float = 4.0) -> None:
 
 
 def test_a_finished_chain_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-  from playground.benchmark.measures import chain
-
   write_chain(tmp_path / "some_chain_seed_2")
-  chain.measure(Facts(), "some_chain", [], str(tmp_path), again=False, seeds=[2], lock=None)
+  runs.chain(Facts(), "some_chain", [], str(tmp_path), again=False, seeds=[2])
   given = rows(capsys)
   found = {(row["setting"], row["quantity"]): row["value"] for row in given}
   assert found["stage=walk", "final_return"] == 3.0 and found["stage=run", "wall_clock_s"] == 2.0
@@ -87,8 +87,6 @@ def test_a_finished_chain_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_chain_of_other_overrides_or_again_is_another_run(
   monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-  from playground.benchmark.measures import chain
-
   begun: list[str] = []
 
   def train(overrides: list[str]) -> None:
@@ -96,10 +94,10 @@ def test_a_chain_of_other_overrides_or_again_is_another_run(
     write_chain(Path(overrides[-1].partition("=")[2]), final_return=10.0 * len(begun))
 
   def measured(overrides: list[str], again: bool = False) -> float:
-    chain.measure(Facts(), "some_chain", overrides, str(tmp_path), again=again, seeds=[2], lock=None)
+    runs.chain(Facts(), "some_chain", overrides, str(tmp_path), again=again, seeds=[2])
     return next(r["value"] for r in rows(capsys) if r["quantity"] == "final_return" and "stage=all" in r["setting"])
 
-  monkeypatch.setattr(chain, "run_training", train)
+  monkeypatch.setattr(runs, "run_training", train)
   assert [measured(["a=1"]), measured(["a=2"]), measured([]), measured(["a=1"])] == [10.0, 20.0, 30.0, 10.0]
   assert [measured(["a=1"], again=True), measured([], again=True)] == [40.0, 50.0]
   assert len(set(begun)) == 5, "nothing is overwritten"
@@ -111,27 +109,23 @@ def test_a_chain_of_other_overrides_or_again_is_another_run(
 
 
 def test_a_peer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-  from playground.benchmark.measures import peer
-
   result = {"start_s": 2.0, "epochs": [1.0, 4.0, 2.0, 3.0], "epoch_steps": 1000, "update_steps": 100}
   result |= {"versions": "JAX 1", "settings": "num_envs 8", "peak_memory_gib": 1.5}
   driver = tmp_path / "driver.py"
   driver.write_text(f"print('noise'); print('RESULT ' + {json.dumps(result)!r})")
   monkeypatch.setitem(peers.PEERS, "some", peers.Peer(driver, "some", "1"))
-  arguments = {"task": "CheetahRun", "seconds": 1.0, "python": sys.executable, "path": "", "menagerie": ""}
-  peer.measure(Facts(), **arguments, peer="some", backend="jax", seeds=[1], lock=None)
+  arguments = {"task": "CheetahRun", "seconds": 1.0, "peer": PEER}
+  peer_measures.rates(Facts(), **arguments, backend="jax", seeds=[1])
   found = {row["quantity"]: row["value"] for row in rows(capsys)}
   # The best epoch; the first epoch's end less what is beyond its first update, at that speed.
   assert found == {"training_steps_per_s": 500.0, "start_to_first_update_s": 1.2, "peak_memory_gib": 1.5}
 
   driver.write_text("raise SystemExit('it broke')")
-  with pytest.raises(peer.PeerFailedError, match="it broke"):
-    peer.measure(Facts(), **arguments, peer="some", backend="jax", seeds=[1], lock=None)
+  with pytest.raises(peer_measures.PeerFailedError, match="it broke"):
+    peer_measures.rates(Facts(), **arguments, backend="jax", seeds=[1])
 
 
 def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-  from playground.benchmark.measures import peer, peer_run
-
   result = {"evaluations": [[0, 9.0, 0.0], [1000, 7.0, 30.25], [2000, 6.0, 40.5]], "steps": 2000, "wall_clock_s": 40.5}
   result |= {"training_steps_per_s": 100.0, "versions": "JAX 1", "settings": "num_evals 3"}
   driver = tmp_path / "driver.py"
@@ -139,10 +133,10 @@ def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
   with driver.open("a") as file:
     file.write(f"print('RESULT ' + {json.dumps(result)!r})")
   monkeypatch.setitem(peers.PEERS, "some", peers.Peer(driver, "some", "1"))
-  arguments = {"task": "CheetahRun", "num_timesteps": None, "python": sys.executable, "path": "", "menagerie": ""}
-  arguments |= {"peer": "some", "agent": "sac", "backend": "warp", "told": ["env.impl=warp"]}
-  arguments |= {"seeds": [2], "lock": None}
-  peer_run.measure(Facts(), **arguments)
+  arguments = {"task": "CheetahRun", "num_timesteps": None, "peer": PEER}
+  arguments |= {"agent": "sac", "backend": "warp", "told": ["env.impl=warp"]}
+  arguments |= {"seeds": [2]}
+  peer_measures.whole(Facts(), **arguments)
   found = rows(capsys)
   assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
     ("return", 9.0, "env.impl=warp step=0"), ("return", 7.0, "env.impl=warp step=1000"),
@@ -155,8 +149,8 @@ def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
   assert json.loads((tmp_path / "job").read_text()) == job
 
   driver.write_text("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
-  with pytest.raises(peer.PeerFailedError, match="some failed: nothing said"):
-    peer_run.measure(Facts(), **arguments)
+  with pytest.raises(peer_measures.PeerFailedError, match="some failed: nothing said"):
+    peer_measures.whole(Facts(), **arguments)
   assert rows(capsys) == []
 
 
@@ -174,9 +168,9 @@ def test_a_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
     lines = ["step,time/wall_clock_s,eval/episode_reward", "0,0.5,1.0", "50,1.5,", "100,3.0,4.0", "200,7.0,3.0"]
     (folder / "metrics.csv").write_text("\n".join(lines))
 
-  monkeypatch.setattr(run, "run_training", train)
+  monkeypatch.setattr(runs, "run_training", train)
   overrides, told = ["agent.num_timesteps=200", "hardware.devices=1"], ["agent.num_timesteps=200"]
-  run.measure(Facts(), "CheetahRun", "ppo", overrides, told, seeds=[3], lock=None)
+  runs.whole(Facts(), "CheetahRun", "ppo", overrides, told, seeds=[3])
   found = rows(capsys)
   setting = "agent.num_timesteps=200 step="
   assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
@@ -195,7 +189,7 @@ def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytes
   own = Learning(tasks=("CheetahRun", "HopperHop"), seeds=2, backends=("jax", "warp"), peer_python="py").jobs({})
   assert [(job.columns["task"], job.arguments["seeds"], job.measure) for job in own] == [
     (task, [seed], measure)
-    for task in ("CheetahRun", "HopperHop") for seed in (1, 2) for measure in ("run", "peer_run", "peer_run")
+    for task in ("CheetahRun", "HopperHop") for seed in (1, 2) for measure in ("runs:whole", "peer:whole", "peer:whole")
   ]  # fmt: skip
   assert [job.columns["setting"] for job in own[:3]] == ["", "env.impl=jax", "env.impl=warp"]
   assert [(job.columns["agent"], job.columns["who"]) for job in own[:2]] == [
@@ -253,7 +247,7 @@ def test_topology_has_all_devices_and_may_have_several_workers():
 def test_topology_trains_whole_runs_after_the_rates():
   rates = Topology(tasks=("CheetahRun",), seeds=2, overrides=("env.impl=jax",))
   both = dataclasses.replace(rates, num_timesteps=5000).jobs({"devices": 2})
-  assert both[:3] == rates.jobs({"devices": 2}) and {job.measure for job in both[3:]} == {"run"}
+  assert both[:3] == rates.jobs({"devices": 2}) and {job.measure for job in both[3:]} == {"runs:whole"}
   settings = [f"env.impl=jax {text} agent.num_timesteps=5000" for text in TOPOLOGIES]
   assert [(job.columns["setting"], job.arguments["seeds"]) for job in both[3:]] == [
     (setting, [seed]) for setting in settings for seed in (1, 2)
@@ -261,8 +255,8 @@ def test_topology_trains_whole_runs_after_the_rates():
   for job in both[3:]:
     assert job.last == {"quantity": "final_return"} and job.columns["benchmark"] == "topology"
     assert job.arguments["overrides"] == job.arguments["told"] == job.columns["setting"].split()
-    job_of_run = inspect.signature(run.measure).parameters
-    assert set(job.arguments) == set(job_of_run) - {"facts", "lock"}
+    job_of_run = inspect.signature(runs.whole).parameters
+    assert set(job.arguments) == set(job_of_run) - {"facts"}
 
 
 def test_whole_runs_that_were_stopped_go_on_where_they_are_missing(tmp_path: Path):
@@ -271,10 +265,12 @@ def test_whole_runs_that_were_stopped_go_on_where_they_are_missing(tmp_path: Pat
   left = lambda: [(job.measure, job.arguments["seeds"]) for each in jobs if (job := each.left(table, facts))]
   whole = {**jobs[1].columns, **facts, "seed": 1}
   table.add({**whole, "quantity": "training_steps_per_s", "value": 1.0})
-  assert left() == [("training", [1, 2]), ("run", [1]), ("run", [2])], "its rate is not that of the rates, nor its end"
+  assert left() == [("training", [1, 2]), ("runs:whole", [1]), ("runs:whole", [2])], (
+    "its rate is not that of the rates, nor its end"
+  )
   table.add({**whole, "quantity": "final_return", "value": 1.0})
   table.add({**jobs[0].columns, **facts, "seed": 1, "quantity": "training_steps_per_s", "value": 1.0})
-  assert left() == [("training", [2]), ("run", [2])]
+  assert left() == [("training", [2]), ("runs:whole", [2])]
 
 
 FAKE = """

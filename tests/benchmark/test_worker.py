@@ -7,21 +7,22 @@ from typing import Any
 import pytest
 
 from playground.benchmark import worker
-from playground.benchmark.measures import startup, training
+from playground.benchmark.measures import runs, training
 from playground.envs import warp_kernels
 
 
-@pytest.mark.parametrize(("measure", "stands_by"), [("training", True), ("startup", False)])
+@pytest.mark.parametrize(("measure", "stands_by"), [("training", True), ("runs:startup", False)])
 def test_what_trains_in_it_has_warps_compiler_stand_by(
   monkeypatch: pytest.MonkeyPatch, measure: str, stands_by: bool
 ) -> None:
   asked: list[Any] = []
   measured: list[dict[str, Any]] = []
   monkeypatch.setattr(warp_kernels, "stand_by", lambda env, platform: asked.append((env.impl, env.cuda_impl, platform)))
-  module = training if measure == "training" else startup
-  monkeypatch.setattr(module, "measure", lambda _, **arguments: measured.append(arguments))
+  module, name = (training, "measure") if measure == "training" else (runs, "startup")
+  monkeypatch.setattr(module, name, lambda _, **arguments: measured.append(arguments))
   arguments = {"task": "PandaPickCube", "agent": "ppo", "overrides": ["hardware=cpu"], "seeds": [1]}
-  monkeypatch.setattr(sys, "argv", ["worker", json.dumps({"measure": measure, "arguments": arguments})])
+  job = {"measure": measure, "arguments": arguments, "folder": "none", "cache": True, "shares": False}
+  monkeypatch.setattr(sys, "argv", ["worker", json.dumps(job)])
   monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
   worker.main()
   assert measured == [arguments]

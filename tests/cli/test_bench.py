@@ -109,5 +109,5 @@ def test_commands_stand_for_jobs():
 
   turns = commands.Compare(tasks=("CartpoleBalance",), repeats=2).jobs(facts)
   assert [(job.measure, job.arguments["seeds"]) for job in turns] == [
-    (who, [turn]) for turn in (1, 2) for who in ("training", "peer", "peer")
+    (who, [turn]) for turn in (1, 2) for who in ("training", "peer:rates", "peer:rates")
   ]

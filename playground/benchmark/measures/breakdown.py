@@ -37,7 +37,6 @@ def measure(
   agent: str,
   overrides: list[str],
   seconds: float,
-  lock: str | None,
   watch_memory: bool = False,
   until: str = "update",
 ) -> None:
@@ -60,7 +59,7 @@ def measure(
     for call, _ in calls.values():
       jax.block_until_ready(call(1))
     best = dict.fromkeys(calls, 0.0)
-    with alone(lock):
+    with alone(facts.lock):
       for _ in range(TURNS):
         for part, (call, steps) in calls.items():
           best[part] = max(best[part], rate(call, steps, seconds / TURNS)[0])

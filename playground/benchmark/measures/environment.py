@@ -8,7 +8,7 @@ from playground.benchmark.worker import Facts
 LENGTH = 20  # control steps of one call
 
 
-def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float, lock: str | None) -> None:
+def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float) -> None:
   """A row for env steps a second of as many environments as `agent.num_envs` says, and one for memory.
 
   The environments are those that a trainer steps: guarded, limited, reset when done, on randomised models.
@@ -35,7 +35,7 @@ def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: 
     return state.done
 
   jax.block_until_ready(call(1))
-  with alone(lock):
+  with alone(facts.lock):
     speed, timed = rate(call, num_envs * LENGTH * env.action_repeat, seconds)
   facts["conditions"] = f"random actions; {timed:.1f} s timed"
   facts.emit("env_steps_per_s", speed, "steps/s")

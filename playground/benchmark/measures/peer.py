@@ -1,4 +1,4 @@
-"""The public package's PPO, run by its own interpreter (`playground/benchmark/peer/`)."""
+"""The public package's training, run by its own interpreter (`playground/benchmark/peer/`)."""
 
 import json
 import math
@@ -7,6 +7,8 @@ import subprocess
 from typing import Any
 
 from playground.benchmark.measures.machine import used_memory
+from playground.benchmark.measures.runs import RESULT, emit_result, emit_returns
+from playground.benchmark.measures.subject import alone
 from playground.benchmark.peer import PEERS
 from playground.benchmark.worker import Facts
 from playground.errors import PlaygroundError
@@ -19,24 +21,12 @@ class PeerFailedError(PlaygroundError):
   """The peer's process ended with an error."""
 
 
-def measure(
-  facts: Facts,
-  task: str,
-  seconds: float,
-  peer: str,
-  python: str,
-  path: str,
-  menagerie: str,
-  backend: str,
-  seeds: list[int],
-  lock: str | None,
-) -> None:
+def rates(facts: Facts, task: str, seconds: float, backend: str, seeds: list[int], peer: dict[str, str]) -> None:
   """Rows for the best epoch's steps a second, time to the first update and memory, as `training` has them of ours."""
-  del lock  # a comparison has the machine to itself
   (seed,) = seeds
   job = {"task": task, "backend": backend, "seed": seed, "steps": _epoch_steps(task, seconds), "epochs": EPOCHS}
   with used_memory(facts, seed):
-    result = drive(facts, peer, python, path, menagerie, job)
+    result = drive(facts, peer, job)
   epochs = result["epochs"]  # seconds of each
   best = result["epoch_steps"] / min(epochs[1:])
   first_update = result["start_s"] + epochs[0] - (result["epoch_steps"] - result["update_steps"]) / best
@@ -47,19 +37,45 @@ def measure(
   facts.emit("training_steps_per_s", best, "steps/s", seed=seed)
 
 
-def drive(facts: Facts, peer: str, python: str, path: str, menagerie: str, job: dict[str, Any]) -> dict[str, Any]:
-  """Has the peer's driver do a job, and fills in the facts that its rows share.
+def whole(
+  facts: Facts, task: str, agent: str, num_timesteps: int | None, backend: str, told: list[str], seeds: list[int],
+  peer: dict[str, str],
+) -> None:  # fmt: skip
+  """Rows as `runs.whole` has them of ours, with the peer's own evaluations.
+
+  Its wall-clock time differs: the peer compiles its training while it runs.
+  """
+  (seed,) = seeds
+  job = {"task": task, "agent": agent, "backend": backend, "seed": seed}
+  job |= {"evaluate": True, "num_timesteps": num_timesteps}
+  with alone(facts.lock):
+    result = drive(facts, peer, job)
+  when = "time from the end of the evaluation before training to that of the last, compiling the training in it"
+  facts["conditions"] = f"a whole run, {when}; {result['settings']}"
+  emit_returns(facts, result["evaluations"], told, seed)
+  trained = [score for step, score, _ in result["evaluations"] if step > 0]
+  result |= {"best_return": max(trained), "final_return": trained[-1]}
+  emit_result(facts, result, RESULT, seed=seed)
+
+
+def drive(facts: Facts, peer: dict[str, str], job: dict[str, Any]) -> dict[str, Any]:
+  """Runs a job in the peer's driver, and fills in the facts that its rows share.
+
+  Args:
+    facts: of the rows.
+    peer: its `name`, `python` (interpreter), `path` (PYTHONPATH) and `menagerie` (folder of robot models).
+    job: the driver's argument.
 
   Raises:
     PeerFailedError: it ended with an error, or was ended.
   """
-  env = {**os.environ, "PYTHONPATH": path, "PEER_MENAGERIE": menagerie}
+  env = {**os.environ, "PYTHONPATH": peer["path"], "PEER_MENAGERIE": peer["menagerie"]}
   env.pop("JAX_COMPILATION_CACHE_DIR", None)  # the peer keeps no compiled programs
-  command = [python, "-W", "ignore", str(PEERS[peer].driver), json.dumps(job)]
+  command = [peer["python"], "-W", "ignore", str(PEERS[peer["name"]].driver), json.dumps(job)]
   done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=env)
   lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
   if done.returncode or not lines:
-    raise PeerFailedError(f"{peer} failed: {(done.stderr.strip().splitlines() or ['nothing said'])[-1]}")
+    raise PeerFailedError(f"{peer['name']} failed: {(done.stderr.strip().splitlines() or ['nothing said'])[-1]}")
   result = json.loads(lines[-1].removeprefix("RESULT "))
   facts.update(backend=job["backend"], devices=1, precision="JAX's default", versions=result["versions"])
   return result

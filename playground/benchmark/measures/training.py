@@ -19,7 +19,6 @@ def measure(
   overrides: list[str],
   seeds: list[int],
   seconds: float,
-  lock: str | None,
   watch_memory: bool = False,
 ) -> None:
   """Rows for compile time, time to the first update and memory, and for each seed the steps a second.
@@ -34,7 +33,6 @@ def measure(
     overrides: of the run's configuration.
     seeds: of the trainings.
     seconds: how long to time each, at least one update.
-    lock: see `alone`.
     watch_memory: ask the GPU's driver, too, how much is in use.
   """
   with used_memory(facts, seeds[0]) if watch_memory else nullcontext():
@@ -47,7 +45,7 @@ def measure(
     warm_up = 1 + learner.config.prefill_updates
     for seed in seeds:
       model = program.model if seed == seeds[0] else subject.draw(seed)[0]
-      with alone(lock):
+      with alone(facts.lock):
         state = None  # the last seed's goes before the next one's comes: a replay buffer is large
         state = program.init(subject.key(seed), model)
 
@@ -57,7 +55,7 @@ def measure(
           return metrics["nonfinite"]
 
         jax.block_until_ready(train(warm_up))
-        if seed == seeds[0] and lock is None:  # with a lock, waiting for it would be in the time
+        if seed == seeds[0] and facts.lock is None:  # with a lock, waiting for it would be in the time
           facts.emit("start_to_first_update_s", process_age_s(), "s", seed=seed)
         speed, timed = rate(train, learner.steps_per_update, seconds)
       how = f"{timed:.1f} s timed after the first update, no evaluation, no outer resets"

@@ -29,5 +29,5 @@ def test_every_environment_and_every_repeat_of_an_action_counts(monkeypatch: pyt
 
   monkeypatch.setattr(environment.Subject, "build", lambda *_: found)
   monkeypatch.setattr(environment, "rate", rate)
-  environment.measure(Facts(), "A", "ppo", [], seconds=1.0, lock=None)
+  environment.measure(Facts(), "A", "ppo", [], seconds=1.0)
   assert counted == {"steps": 4 * environment.LENGTH * 3, "taken": [2.0 * environment.LENGTH] * 4}

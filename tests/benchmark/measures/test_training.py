@@ -35,7 +35,7 @@ def test_a_seed_begins_anew_and_warms_up_before_the_clock(monkeypatch: pytest.Mo
   monkeypatch.setattr(training.Subject, "build", lambda facts, *_: facts.update(conditions="") or found)
   monkeypatch.setattr(training, "compile_program", lambda *_: program)
   monkeypatch.setattr(training, "rate", timed)
-  training.measure(Facts(), "CartpoleBalance", agent, [], seeds=[3, 4], seconds=1.0, lock=None)
+  training.measure(Facts(), "CartpoleBalance", agent, [], seeds=[3, 4], seconds=1.0)
   assert done == [
     ("train", "key 3 model 3", "model 3", before), "clock",
     ("train", "key 4 model 4", "model 4", before), "clock",

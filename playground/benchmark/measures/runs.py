@@ -1,0 +1,144 @@
+"""Whole commands: `playground-run` to its first update or to its end, and curricula stage by stage."""
+
+import hashlib
+import itertools
+import os
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from playground.benchmark.measures.subject import alone
+from playground.benchmark.schema import commit_of
+from playground.benchmark.worker import Facts
+from playground.config import RunConfig, compose
+from playground.errors import PlaygroundError
+from playground.interpreter import PYTHON
+from playground.learning.hyperparameters import config_class
+from playground.runs.run_dir import RunDirectory
+
+RESULT = ("steps", "wall_clock_s", "training_steps_per_s", "best_return", "final_return")
+_UNITS = {"steps": "steps", "wall_clock_s": "s", "training_steps_per_s": "steps/s"}
+_RETURN, _TIME = "eval/episode_reward", "time/wall_clock_s"
+_CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH")  # environment variables that replace the run's own caches
+
+
+class RunFailedError(PlaygroundError):
+  """The command ended with an error."""
+
+
+def startup(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float) -> None:
+  """Rows `cold` and `warm`: the same command twice in fresh processes, its budget cut to the first update that learns.
+
+  Evaluation is compiled, and the one before training is run, as in any run.
+  """
+  del seconds  # this times one run as it is
+  chosen = [f"env={task}", f"agent={agent}", *overrides]
+  with tempfile.TemporaryDirectory() as folder:
+    short = [f"agent.num_timesteps={_one_update(compose(chosen))}", "agent.num_evals=2", "agent.num_resets_per_eval=0"]
+    short += ["video.enable=false", "tracking=csv", f"hardware.cache_dir={folder}/cache"]
+    for name in ("cold", "warm"):
+      run = Path(folder) / name
+      run_training([*chosen, *short, f"run_dir={run}"], without=_CACHES)
+      manifest = RunDirectory(run).manifest
+      facts.update(facts_of(manifest), conditions="whole command, evaluations included, one update, a cache of its own")
+      for quantity in ("trace_s", "compile_s", "start_to_first_update_s"):
+        facts.emit(quantity, manifest["timings"][quantity], "s", setting=" ".join((*overrides, name)))
+
+
+def whole(facts: Facts, task: str, agent: str, overrides: list[str], told: list[str], seeds: list[int]) -> None:
+  """A row for each evaluation, `step=<steps trained>`, then those of the whole run, the last evaluation's return last.
+
+  The whole run has the device to itself, its compiling too. `told` is the measurement's setting, to which an
+  evaluation's row adds its step.
+  """
+  (seed,) = seeds
+  with tempfile.TemporaryDirectory() as folder:
+    run = RunDirectory(Path(folder) / "run")
+    chosen = [f"env={task}", f"agent={agent}", *overrides, f"seed={seed}"]
+    with alone(facts.lock):
+      run_training([*chosen, "video.enable=false", "tracking=csv", f"run_dir={run.path}"])
+    facts.update(facts_of(run.manifest), conditions="a whole run, evaluations and saving in its time, compiling not")
+    evaluations = pd.read_csv(run.metrics_csv).dropna(subset=[_RETURN])
+    emit_returns(facts, evaluations[["step", _RETURN, _TIME]].itertuples(index=False), told, seed)
+    result = {**run.summary, "training_steps_per_s": run.manifest["timings"]["steady_steps_per_second"]}
+    emit_result(facts, result, RESULT, seed=seed)
+
+
+def chain(facts: Facts, experiment: str, overrides: list[str], runs: str, again: bool, seeds: list[int]) -> None:
+  """Rows for each stage of a curriculum, `stage=<name>`, and for all together, `stage=all`.
+
+  An unfinished run of the same experiment, overrides and seed is resumed; its times are sums over its starts. A
+  finished one is read, and its commit is the rows', unless `again` asks for a new one.
+  """
+  (seed,) = seeds
+  run = _chain_run(Path(runs), experiment, overrides, seed, again)
+  if not _finished(run):
+    begun = run.config_path.is_file()
+    new = [f"experiment={experiment}", f"seed={seed}", "video.enable=false", *overrides, f"run_dir={run.path}"]
+    run_training([f"resume={run.path}"] if begun else new)
+  for stage in [*run.summary["stages"], {**run.summary, "name": "all"}]:
+    manifest = (run if stage["name"] == "all" else RunDirectory(run.path / stage["folder"])).manifest
+    columns: dict[str, Any] = {"seed": seed, "setting": " ".join((*overrides, f"stage={stage['name']}"))}
+    columns |= facts_of(manifest) if manifest else {}
+    if git := manifest.get("git"):
+      columns["commit"] = commit_of(git)
+    columns["conditions"] = f"task {stage['env']}, evaluations included, compiling not"
+    emit_result(facts, stage, ("steps", "final_return", "wall_clock_s"), **columns)
+
+
+def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
+  """Runs `playground-run` in a process of its own; raises RunFailedError with its last line."""
+  env = {key: value for key, value in os.environ.items() if key not in without}
+  command = [*PYTHON, "-W", "ignore", "-c", "from playground.cli.run import main; main()", *overrides]
+  with subprocess.Popen(
+    command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace", env=env
+  ) as process:
+    signal.signal(signal.SIGTERM, lambda *_: process.terminate())  # it saves, and this process waits for that
+    out, errors = process.communicate()
+  if process.returncode:
+    lines = (errors or out).strip().splitlines()
+    why = lines[-1] if lines else "nothing said"
+    raise RunFailedError(f"playground-run ended with code {process.returncode}: {why}")
+
+
+def facts_of(manifest: Mapping[str, Any]) -> dict[str, Any]:
+  """Columns of a row, from a run's manifest."""
+  precision = f"physics {manifest['matmul_precision']}, networks {manifest['network_precision']}"
+  return {"backend": manifest["impl"], "devices": manifest["num_devices"], "precision": precision}
+
+
+def emit_returns(facts: Facts, evaluations: Iterable[Sequence[Any]], setting: Sequence[str], seed: int) -> None:
+  """A row for each evaluation: (steps trained, mean return, seconds into the run)."""
+  for step, score, seconds in evaluations:
+    columns = {"setting": " ".join((*setting, f"step={step:.0f}")), "seed": seed}
+    facts.emit("return", score, "", **columns, conditions=f"{facts['conditions']}; after {seconds:.1f} s")
+
+
+def emit_result(facts: Facts, result: Mapping[str, Any], quantities: Sequence[str], **columns: Any) -> None:
+  """A row for each quantity that the result of a run has, in their order."""
+  for quantity in quantities:
+    if result.get(quantity) is not None:
+      facts.emit(quantity, result[quantity], _UNITS.get(quantity, ""), **columns)
+
+
+def _one_update(config: RunConfig) -> int:
+  """The budget (control steps) with which something is learned once."""
+  settings = config_class(config.agent.name).from_config(config.agent)
+  return (settings.prefill_updates + 1) * settings.steps_per_update * config.env.action_repeat
+
+
+def _chain_run(runs: Path, experiment: str, overrides: list[str], seed: int, again: bool) -> RunDirectory:
+  """The run directory, one for each set of overrides; if `again`, the first of the numbered that is not finished."""
+  told = [hashlib.sha256(" ".join(overrides).encode()).hexdigest()[:8]] if overrides else []
+  name = "_".join([experiment, *told, f"seed_{seed}"])
+  numbered = (name if number == 1 else f"{name}_{number}" for number in itertools.count(1))
+  return next(run for path in numbered if not _finished(run := RunDirectory(runs / path)) or not again)
+
+
+def _finished(run: RunDirectory) -> bool:
+  return run.status.get("status") == "finished"
