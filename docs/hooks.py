@@ -12,6 +12,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from playground.config.definitions import RunSettings, defined
+from playground.envs.options import TermsConfig
 from playground.settings import Setting, settings
 from playground.sweep.options import SweepConfig
 
@@ -72,7 +73,11 @@ def _groups() -> list[str]:
 def _group_page(group: str) -> str:
   """Every option of a group, those of classes first: what it is, its keys, their values and what is said of them."""
   parts = [f"# {f'configs/{group}' if group else 'config.yaml'}\n"]
-  classes = defined().get(group, {}) if group else {"A run": RunSettings, "A sweep": SweepConfig}
+  classes = (
+    defined().get(group, {})
+    if group
+    else {"A run": RunSettings, "env of a task made of terms": TermsConfig, "A sweep": SweepConfig}
+  )
   parts += [_class_section(name, cls) for name, cls in classes.items()]
   shared_first = lambda path: (path.stem[0].isupper(), path.stem)
   for path in sorted((ROOT / "configs" / group).glob("*.yaml"), key=shared_first):

@@ -2,7 +2,11 @@
 
 import difflib
 import errno
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
+
+T = TypeVar("T")
+_MANY = 20  # names, of which only the nearest is named
 
 
 class PlaygroundError(ValueError):
@@ -46,3 +50,15 @@ def nearest(name: str, known: Iterable[str]) -> str:
   begun = [k for k in lowered if len(name) > 3 and k.startswith(name.lower())]
   match = begun or difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
   return f" Did you mean {lowered[match[0]]!r}?" if match else ""
+
+
+def lookup(table: Mapping[str, T], name: str, key: str) -> T:
+  """Returns `table[name]`, where `key` is the configuration key that holds the name.
+
+  Raises:
+    UnknownNameError: the table has no such name; the message gives the nearest.
+  """
+  if name not in table:
+    has = f"; choose from {', '.join(table)}" if len(table) <= _MANY else ""
+    raise UnknownNameError(f"{key}: {name!r} is unknown{has}.{nearest(str(name), table)}")
+  return table[name]

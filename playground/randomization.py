@@ -22,7 +22,7 @@ cameras, colours and materials are fields like any others (docs/vision.md). Deri
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -33,8 +33,11 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src.math import quat_mul, rotate
 
+from playground.config.text import format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.mdp.options import MODEL_FIELD, is_model_field, keys
+from playground.mdp.events import ModelField
+from playground.mdp.options import MODEL_FIELD, EventOptions, is_model_field
+from playground.mdp.terms import bind_one
 
 # Whose rows a field has, by the prefix of its name: object type and number of objects.
 _OBJECTS = {
@@ -73,105 +76,6 @@ _DISTRIBUTIONS: dict[str, Callable[[jax.Array, tuple[int, ...], float, float], j
   "normal": lambda key, shape, mean, std: mean + std * jax.random.normal(key, shape),
   "bernoulli": lambda key, shape, mean, _: jax.random.bernoulli(key, mean, shape),
 }
-_PARAMETERS = {"normal": ("mean", "std"), "bernoulli": ("mean",)}  # of the others: range
-
-
-@dataclasses.dataclass(frozen=True)
-class Term:
-  """Parameters of one event of func `model_field`.
-
-  Attributes:
-    field: a field of `mjx.Model`, of numbers or switches, with a row per geom, body, site, actuator, tendon, pair,
-      light, camera, material, joint, dof or qpos entry, or `actuator_kp`, which moves a position servo's gain and bias
-      together, or `body_density`, which scales a body's mass and inertia together.
-    target: whose rows: a name, a list of names, `all`, or `joints` (every joint but the free ones).
-    operation: `set`, `scale`, `add`, or `rotate`, which turns a direction or quaternion about a random axis by the
-      angle that is drawn, rad.
-    range: (low, high) of `uniform` and `log_uniform`.
-    mean: of `normal`, and of `bernoulli` the probability of true.
-    std: of `normal`.
-    distribution: `uniform`, `log_uniform` or `normal`; of a switch `bernoulli`.
-    column: column, or columns, of a two-dimensional field; None is all.
-    shared: one draw for all entries, instead of one for each.
-    axis: of `rotate`, ranges of the axis's x, y and z before it has length 1; None is any direction alike.
-  """
-
-  field: str
-  target: str | Sequence[str]
-  operation: str
-  range: Sequence[float] | None = None
-  mean: float | None = None
-  std: float | None = None
-  distribution: str = "uniform"
-  column: int | Sequence[int] | None = None
-  shared: bool = False
-  axis: Sequence[Sequence[float]] | None = None
-
-  @property
-  def parameters(self) -> tuple[float, float]:
-    """The distribution's two parameters: (low, high) or (mean, std); a bernoulli's std is 0 here."""
-    moments = (self.mean, 0.0 if self.distribution == "bernoulli" else self.std)
-    first, second = moments if self.distribution in _PARAMETERS else (self.range or (None, None))
-    return first, second  # pyright: ignore[reportReturnType]  # parse has seen that they are numbers
-
-  def describe(self) -> dict[str, str]:
-    """Field, target, operation and draw (distribution and parameters), for people."""
-    first, second = self.parameters
-    parameters = f"{first:g}" if self.distribution == "bernoulli" else f"{first:g}, {second:g}"
-    return {
-      "field": self.field if self.column is None else f"{self.field}[:, {self.column}]",
-      "target": self.target if isinstance(self.target, str) else ", ".join(self.target),
-      "operation": self.operation,
-      "draw": f"{self.distribution}({parameters})",
-    }
-
-  @classmethod
-  def parse(cls, term: Mapping[str, Any], key: str) -> "Term":
-    """Checks the parameters that `key`, e.g. `env.events.payload.params`, holds; raises ConfigError."""
-    term = dict(term)
-    known = [field.name for field in dataclasses.fields(cls)]
-    for name in term:
-      _choose(f"{key} key", name, known)
-    for name in ("field", "target", "operation"):
-      if name not in term:
-        raise ConfigError(f"{key} lacks the key {name!r}.")
-    parsed = cls(**term)
-    _choose(f"{key}.operation", parsed.operation, _OPERATIONS)
-    _choose(f"{key}.distribution", parsed.distribution, _DISTRIBUTIONS)
-    needed = _PARAMETERS.get(parsed.distribution, ("range",))
-    for name in ("range", "mean", "std"):
-      if (name in needed) != (getattr(parsed, name) is not None):
-        verb = "needs" if name in needed else "has no"
-        raise ConfigError(f"{key}: distribution {parsed.distribution!r} {verb} key {name!r}.")
-    if not isinstance(parsed.target, str) and not _is_list_of(parsed.target, str):
-      raise ConfigError(f"{key}.target={parsed.target!r} is neither a name nor a list of names.")
-    if parsed.range is not None and not (_is_list_of(parsed.range, int | float) and len(parsed.range) == 2):
-      raise ConfigError(f"{key}.range={parsed.range!r} is not a pair [low, high].")
-    values = parsed.parameters
-    if not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in values):
-      raise ConfigError(f"{key}.{needed[0]}: {values} are not two finite numbers.")
-    if parsed.distribution == "normal" and values[1] < 0:
-      raise ConfigError(f"{key}.std={values[1]} is negative.")
-    if parsed.distribution == "bernoulli" and not 0 <= values[0] <= 1:
-      raise ConfigError(f"{key}.mean={values[0]} is no probability.")
-    if "range" in needed and values[0] > values[1]:
-      raise ConfigError(f"{key}.range={list(values)} has its low end above its high end.")
-    if parsed.distribution == "log_uniform" and values[0] <= 0:
-      raise ConfigError(f"{key}.range={list(values)} must be above 0 for log_uniform.")
-    parsed._check_axis(key)
-    return parsed
-
-  def _check_axis(self, key: str) -> None:
-    if self.axis is None:
-      return
-    if self.operation != "rotate":
-      raise ConfigError(f"{key}: operation {self.operation!r} has no key 'axis'.")
-    pairs = isinstance(self.axis, list | tuple) and len(self.axis) == 3
-    pairs = pairs and all(
-      _is_list_of(pair, int | float) and len(pair) == 2 and pair[0] <= pair[1] for pair in self.axis
-    )
-    if not pairs or not any(any(pair) for pair in self.axis):
-      raise ConfigError(f"{key}.axis={self.axis!r} is not three pairs [low, high], of x, y and z, not all 0.")
 
 
 class _Slot(NamedTuple):
@@ -185,7 +89,7 @@ class _Slot(NamedTuple):
 class _Draw(NamedTuple):
   """A term on a model: `shape` is what is drawn for, `slots` where it goes."""
 
-  term: Term
+  term: ModelField
   slots: tuple[_Slot, ...]
   shape: tuple[int, ...]
 
@@ -231,7 +135,9 @@ class Randomizer:
       ConfigError: an event that is invalid, with its key.
       UnknownNameError: a key, field, target, operation or distribution that does not exist.
     """
-    self._draws = [_bind(mj_model, Term.parse(t, key), key) for key, t in model_fields(events, mode).items()]
+    self._draws = [
+      _bind(mj_model, term, f"env.events.{name}.params") for name, term in model_fields(events, mode).items()
+    ]
     self.fields: tuple[str, ...] = tuple(dict.fromkeys(slot.field for draw in self._draws for slot in draw.slots))
     self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
 
@@ -251,41 +157,29 @@ class Randomizer:
     return jax.vmap(self.sample)(keys)
 
   def describe(self) -> list[dict[str, str]]:
-    """One row per term for people: `Term.describe`, and how many values are drawn."""
+    """One row per term for people: `ModelField.describe`, and how many values are drawn."""
     return [draw.term.describe() | {"values": str(draw.count)} for draw in self._draws]
 
 
-def model_fields(events: Mapping[str, Any] | None, mode: str) -> dict[str, Mapping[str, Any]]:
-  """Returns the parameters of the enabled events of func `model_field` and a mode, by their key in the config.
+def model_fields(events: Mapping[str, Any] | None, mode: str = "startup") -> dict[str, ModelField]:
+  """Returns the enabled events of func `model_field` and a mode by name, checked as far as possible without a model.
 
   Raises:
-    ConfigError: an event of that func whose mode is neither `startup` nor `reset`, or whose parameters are no mapping.
+    ConfigError, UnknownNameError: an event of that func that is invalid, of either mode.
   """
   found = {}
   for name, entry in (events or {}).items():
     if entry is None or not is_model_field(name, entry):
       continue
     key = f"env.events.{name}"
-    for field in entry:
-      _choose(f"{key} key", field, keys("events"))
-    if entry.get("mode") not in ("startup", "reset"):
-      raise ConfigError(f"{key}.mode={entry.get('mode')} must be startup or reset: func {MODEL_FIELD} has these two.")
-    if not isinstance(entry.get("enabled", True), bool):
-      raise ConfigError(f"{key}.enabled={entry['enabled']!r} must be true or false.")
-    if not hasattr(entry.get("params"), "keys"):
-      raise ConfigError(f"{key}.params={entry.get('params')!r} is not a mapping such as {{field: body_mass, ...}}.")
-    if entry["mode"] == mode and entry.get("enabled", True):
-      found[f"{key}.params"] = entry["params"]
+    term = bind_one("events", key, name, entry, EventOptions)
+    if term.options.mode not in ("startup", "reset"):
+      raise ConfigError(f"{key}.mode={term.options.mode} must be startup or reset: func {MODEL_FIELD} has these two.")
+    field = term()
+    field.check(f"{key}.params")
+    if term.options.mode == mode and term.options.enabled:
+      found[name] = field
   return found
-
-
-def parse_events(events: Mapping[str, Any], mode: str = "startup") -> dict[str, Term]:
-  """Checks the events that draw model fields, as far as can be done without a model; by name.
-
-  Raises:
-    ConfigError: an event that is invalid.
-  """
-  return {key.split(".")[2]: Term.parse(params, key) for key, params in model_fields(events, mode).items()}
 
 
 def domain_randomizer(
@@ -307,17 +201,7 @@ def domain_randomizer(
   return randomize
 
 
-def _choose(key: str, name: Any, known: Iterable[str]) -> None:
-  known = list(known)
-  if name not in known:
-    raise UnknownNameError(f"{key} {name!r} is unknown: choose from {', '.join(known)}.{nearest(str(name), known)}")
-
-
-def _is_list_of(value: Any, kind: Any) -> bool:
-  return isinstance(value, list | tuple) and bool(value) and all(isinstance(v, kind) for v in value)
-
-
-def _bind(mj_model: mujoco.MjModel, term: Term, key: str) -> _Draw:
+def _bind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> _Draw:
   """Finds the entries of the model that a term means."""
   fields = [*_randomizable(mj_model), *_LINKED]
   if term.field not in fields:
@@ -328,7 +212,9 @@ def _bind(mj_model: mujoco.MjModel, term: Term, key: str) -> _Draw:
   _check_kind(mj_model, term, key)
   if term.field in _LINKED:
     if term.column is not None:
-      raise ConfigError(f"{key}.column={term.column!r}: field {term.field!r} has no columns, leave the key out.")
+      raise ConfigError(
+        f"{key}.column={format_value(term.column)}: field {term.field!r} has no columns, leave the key out."
+      )
     if term.field in _SCALED_ONLY and term.operation != "scale":
       raise ConfigError(f"{key}.operation={term.operation!r}: field {term.field!r} can only be scaled.")
     slots = [
@@ -341,17 +227,17 @@ def _bind(mj_model: mujoco.MjModel, term: Term, key: str) -> _Draw:
   if term.column is None:
     columns = list(range(width))
   else:
-    columns = [term.column] if isinstance(term.column, int) else term.column
-    if not _is_list_of(columns, int) or not all(0 <= c < width for c in columns):
+    columns = [term.column] if isinstance(term.column, int) else list(term.column)
+    if not all(column < width for column in columns):
       allowed = f"columns 0 to {width - 1}" if width else "no columns, leave the key out"
-      raise ConfigError(f"{key}.column={term.column!r}: field {term.field!r} has {allowed}.")
+      raise ConfigError(f"{key}.column={format_value(term.column)}: field {term.field!r} has {allowed}.")
   index = np.ix_(rows, np.array(columns)) if width else (rows,)
   if term.operation == "rotate":
     return _Draw(term, (_Slot(term.field, index, 1.0),), (len(rows),))
   return _Draw(term, (_Slot(term.field, index, 1.0),), (len(rows), len(columns)) if width else (len(rows),))
 
 
-def _check_kind(mj_model: mujoco.MjModel, term: Term, key: str) -> None:
+def _check_kind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> None:
   """Raises ConfigError where an operation or distribution does not go with the field."""
   values = getattr(mj_model, term.field, None)
   is_switch = values is not None and values.dtype == bool
@@ -382,7 +268,7 @@ def _prefix(field: str) -> str:
   return field.split("_")[0].removesuffix("0")
 
 
-def _rows(mj_model: mujoco.MjModel, term: Term, key: str) -> np.ndarray:
+def _rows(mj_model: mujoco.MjModel, term: ModelField, key: str) -> np.ndarray:
   """Rows of a term's field that belong to its target."""
   prefix = _prefix(term.field)
   kind, counter = _OBJECTS[prefix]

@@ -294,6 +294,7 @@ ERRORS = {
   "env=PandaPickCube env.success_distance=-1": ["env.success_distance=-1.0 must be a number above 0 and at most"],
   "env=PandaPickCubeCartesian env.gripper_delay=-1": ["env.gripper_delay=-1 must be a whole number from 0 to 1000."],
   "env=LeapCubeReorient env.pose_noise.injection=2": ["env.pose_noise.injection=2.0 must be a number from 0 to 1."],
+  "env=Go1Getup env.reward_total=prodct": ["env.reward_total=prodct is unknown: choose from sum, product. Did you"],
   "env=PandaPickCube env.njmax=-1": ["env.njmax=-1 must be a whole number from 0 to"],
   "env=PandaPickCube env.naccdmax_per_env=30": ["env.naccdmax_per_env=30 must not be above env.naconmax_per_env=24."],
   "env.vision.brightness=[1]": ["env.vision.brightness=[1.0] must be 2 numbers from 0 to"],

@@ -10,7 +10,7 @@ from playground import registry
 from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_evaluation
-from playground.mdp.lookup import lookup
+from playground.errors import lookup
 
 Arrays = np.ndarray | dict[str, np.ndarray]
 

@@ -22,8 +22,7 @@ from playground import registry
 from playground.adapters.episodes import Arrays, Episodes, load_task
 from playground.envs.base import PIXELS, Env, State
 from playground.envs.wrappers import where_done, wrap_for_evaluation
-from playground.errors import ConfigError, PlaygroundError
-from playground.mdp.lookup import lookup
+from playground.errors import ConfigError, PlaygroundError, lookup
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.rendering.video import choose_camera
 

@@ -153,18 +153,18 @@ def _observation(term: Any, group: str) -> dict[str, Any]:
 def _events(events: Mapping[str, Any] | None) -> Iterator[Row]:
   """Events in the order in which they apply, within a mode."""
   from playground.mdp.terms import bind_one
-  from playground.randomization import Term
 
   for name, entry in (events or {}).items():
     if entry is None:
       continue
-    enabled = {"mode": entry.get("mode"), "enabled": "" if entry.get("enabled", True) else "no"}
+    term = bind_one("events", f"env.events.{name}", name, entry, EventOptions, skip=3)
+    enabled = {"mode": term.options.mode, "enabled": "" if term.options.enabled else "no"}
     if is_model_field(name, entry):
-      drawn = Term.parse(entry.get("params") or {}, f"env.events.{name}.params").describe()
+      drawn = term().describe()
       what = f"{drawn['field']} {drawn['target']}: {drawn['operation']} {drawn['draw']}"
       yield {"name": name, "function": "model_field", "params": what, **enabled}
     else:
-      yield _row(bind_one("events", f"env.events.{name}", name, entry, EventOptions, skip=3)) | enabled
+      yield _row(term) | enabled
 
 
 def function_and_source(func: Callable[..., Any], known: str = "") -> str:

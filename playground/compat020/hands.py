@@ -45,7 +45,7 @@ class Reorient(_HandTask, reorient.Reorient):
     return sensed_pose(info["pose_key"], pose, self.pose_noise, self.config.noise_level, turn)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class PushObjectByWrench(events.PushObjectByWrench):
   """Forces and torques whose strengths come from one draw."""
 

@@ -68,31 +68,31 @@ def reset_ctrl_to_zero(key: jax.Array, env: Any, initial: InitialState) -> Initi
   return initial.replace(ctrl=jnp.zeros(env.mj_model.nu))
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class PushNominalMass(PushByForce):
   """As `PushByForce`, in proportion to the mass before randomisation."""
 
-  def reset(self, key: jax.Array, model: mjx.Model) -> Info:
+  def mass(self, model: mjx.Model) -> jax.Array:
     del model
-    return super().reset(key, self._env.mjx_model)  # pyright: ignore[reportAttributeAccessIssue]
+    return super().mass(self.env.mjx_model)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class PushNominalMassRegularly(PushByForceRegularly):
   """As `PushByForceRegularly`, in proportion to the mass before randomisation."""
 
   def mass(self, model: mjx.Model) -> jax.Array:
     del model
-    return super().mass(self._env.mjx_model)  # pyright: ignore[reportAttributeAccessIssue]
+    return super().mass(self.env.mjx_model)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class GaitInStep(Gait):
   """As `Gait`, but after standing still all feet go on in step (T1, Apollo), and phases may begin beyond pi (Spot)."""
 
   def bind(self, env: Any) -> None:
     super().bind(env)
-    object.__setattr__(self, "_phases", jnp.array([env.robot.gait(name) for name in self.modes]))
+    self._phases = jnp.array([env.robot.gait(name) for name in self.modes])
 
   def step(self, c: StepContext, key: jax.Array) -> Info:
     del key

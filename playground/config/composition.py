@@ -42,9 +42,11 @@ from playground.config.overrides import (
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, Section, from_dict, load
 from playground.config.schema import check_key, fit, is_terms
 from playground.config.text import first_line, join
+from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.mdp.options import OPTIONS
 from playground.pretrained import locate
+from playground.settings import defaults
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that say which keys a run has, in this order
@@ -253,6 +255,8 @@ def _hydra(
     GlobalHydra.instance().hydra = outer
   OmegaConf.set_struct(config, False)
   del config["hydra"]
+  if "observations" in (env := config.get("env") or {}):
+    env.update({key: value for key, value in defaults(TermsConfig).items() if key not in env})
   choices = {group: chosen.get(group) for group in groups(roots)}
   if choices.get("tuned") not in options("tuned", roots):  # it is optional, and this pair has none
     choices["tuned"] = None

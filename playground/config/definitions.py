@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from hydra.core.config_store import ConfigStore
 
-from playground.envs.options import EnvConfig, TaskKeys
+from playground.envs.options import EnvConfig, TaskKeys, TermsConfig
 from playground.errors import PlaygroundError
 from playground.hardware.options import HardwareConfig
 from playground.learning.hyperparameters import agent_names, config_class
@@ -96,7 +96,8 @@ def definition(key: str, names: Mapping[str, Any]) -> Setting | None:
   if section in ("curriculum", "hardware", "tracking"):
     return _look_up(next(iter(defined()[section].values())), rest)
   if section == "env":
-    return _look_up(EnvConfig, rest) or _look_up(TaskKeys, rest)
+    found = (_look_up(cls, rest) for cls in (EnvConfig, TermsConfig, TaskKeys))
+    return next(filter(None, found), None)
   return _look_up(RunSettings, key) or _look_up(SweepConfig, key)
 
 

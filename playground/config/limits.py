@@ -19,7 +19,7 @@ _OF_TERMS = re.compile(rf"env\.({'|'.join(OPTIONS)})\.")  # checked when a task 
 _NESTED = ("text (put quotes around a number)", "a list of texts", "a list of lists of texts")
 # Numbers of the tasks' own keys, by name: the first that matches.
 _ENV = {
-  "observation_frames links": count(1, 1000),
+  "links": count(1, 1000),
   "success_steps": count(0),
   "gripper_delay": count(0, 1000),
   "action_delay observation_delay": Limit(0, 1000, whole=True, form="list", length=2, rising=True),
@@ -31,7 +31,7 @@ _ENV = {
   "hinge_damping max_torque robot.cube.half_size robot.cube.mass stuck_after target_radius": positive(),
   "success_angle success_distance success_threshold": positive(),
   "curriculum.angle curriculum.distance robot.pd.* robot.pose_weights": at_least_0().each,
-  "goal.min_turn margin move_speed noise_level pose_noise.* sensor_noise.* settle_s": at_least_0(),
+  "goal.min_turn margin move_speed pose_noise.* sensor_noise.* settle_s": at_least_0(),
   "scene.terrain_params.* success_wait success_reward termination_reward": Limit(),
   "robot.cube.start robot.gaits.* robot.target_range.*": Limit().each,
 }

@@ -13,9 +13,9 @@ from playground.config import config_dict
 from playground.deploy.contract import describe_policy
 from playground.deploy.graph import policy_graph
 from playground.deploy.policy import ExportedPolicy
-from playground.envs.backend import sees
 from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
+from playground.envs.options import sees
 from playground.envs.wrappers import wrap_for_training
 from playground.extras import need
 from playground.runs.csv_tracker import read_metrics

@@ -10,7 +10,7 @@ import jax
 import mujoco
 from flax import struct
 
-from playground.envs.backend import auto_impl, sees
+from playground.envs.options import auto_impl, sees
 from playground.envs.physics import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.envs.warp_kernels import quiet_warp
 from playground.errors import ConfigError

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from playground.limits import count, positive, span
+from playground.limits import at_least_0, count, positive, span
 
 TERMS = dict[str, Any]
 
@@ -52,6 +52,24 @@ class EnvConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class TermsConfig:
+  """Settings of tasks that are made of terms (they have `env.observations`), beside the terms."""
+
+  commands: Annotated[TERMS, "command terms by name"] = dataclasses.field(default_factory=dict)
+  noise_level: Annotated[float, at_least_0(), "factor on all noise of observations"] = 1.0
+  observation_frames: Annotated[int, count(1, 1000), "the group state is that of so many steps, newest first"] = 1
+  observation_order: Annotated[
+    Mapping[str, Sequence[str]], "by group: terms that come first in its vector; the others follow as they are listed"
+  ] = dataclasses.field(default_factory=dict)
+  reward_total: Annotated[
+    Literal["sum", "product"], "product: sum of the terms of positive weight * exp(0.2 * sum of the others)"
+  ] = "sum"
+  reward_clip: Annotated[
+    Sequence[float] | None, span(-1e9), "range that a step's reward is clipped to; null is none"
+  ] = None
+
+
+@dataclasses.dataclass(frozen=True)
 class RobotKeys:
   """Settings of `env.robot` that are texts or may be null."""
 
@@ -65,8 +83,14 @@ class RobotKeys:
 class TaskKeys:
   """Settings of some tasks that are texts or may be null."""
 
-  reward_clip: Annotated[Sequence[float] | None, span(-1e9), "range that a step's reward is clipped to; null is none"]
-  observation_order: Annotated[
-    Mapping[str, Sequence[str]], "by group: terms that come first in its vector; the others follow as they are listed"
-  ]
   robot: RobotKeys
+
+
+def sees(env: Mapping[str, Any]) -> bool:
+  """Whether a task of this `env` config sees through a camera."""
+  return "vision" in env and env["vision"]["enable"]
+
+
+def auto_impl(cuda_impl: str, renders: bool, on_gpu: bool) -> str:
+  """What `impl: auto` means: the backend that was measured faster, or the one that renders."""
+  return "warp" if renders else cuda_impl if on_gpu else "jax"

@@ -11,8 +11,7 @@ from flax import struct
 
 from playground.envs.base import Env, State
 from playground.envs.physics import DERIVED_FIELDS, PhysicsData, mjx
-from playground.mdp.context import StepContext
-from playground.mdp.lookup import lookup
+from playground.mdp.context import Robot, StepContext
 from playground.mdp.managers import (
   CommandManager,
   EventManager,
@@ -83,9 +82,12 @@ class Task(Env):
     self.robot = self.make_robot(mj_model, config)
     self.commands = CommandManager(config.get("commands"), self)
     self.events = EventManager(config.get("events"), self)
+    if isinstance(self.robot, Robot):
+      for term in (*self.terms(), *self.events.resets):
+        self.robot.check_names(term.params, f"{term.key}.params")
     self._episode_models = Randomizer(mj_model, config.get("events"), "reset")
     self.redraws = bool(self._episode_models.fields)
-    self._reward_total = lookup({"sum": "sum", "product": "product"}, config.reward_total, "env.reward_total")
+    self._reward_total: str = config.reward_total
     self._reward_clip = config.reward_clip and tuple(config.reward_clip)
 
   def terms(self) -> list[Any]:

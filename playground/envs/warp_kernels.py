@@ -25,7 +25,7 @@ from typing import Any
 import mujoco
 
 from playground.collector import uncollected
-from playground.envs.backend import auto_impl, sees
+from playground.envs.options import auto_impl, sees
 from playground.interpreter import PYTHON
 
 LIMIT_S = 900.0  # for a machine with few cores; a process that takes longer hangs

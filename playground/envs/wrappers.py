@@ -4,6 +4,7 @@ Each wrapper takes and returns batches of `State` (leading axis N). A randomised
 from field name ("geom_friction", dotted for nested ones) to values with leading axis N, or None for the task's own.
 """
 
+import operator
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -301,13 +302,6 @@ def wrap_for_brax_training(
 
 def _batched_fields(model: mjx.Model, in_axes: mjx.Model) -> dict[str, jax.Array]:
   """The fields of `model` that `in_axes` marks with 0, by dotted name."""
-  axes, _ = jax.tree_util.tree_flatten_with_path(in_axes, is_leaf=lambda x: x is None)
-  paths = [path for path, axis in axes if axis == 0]
-  fields = {}
-  for path in paths:
-    names = [cast(Any, key).name for key in path]
-    value: Any = model
-    for name in names:
-      value = getattr(value, name)
-    fields[".".join(names)] = value
-  return fields
+  axes = jax.tree_util.tree_leaves_with_path(in_axes, is_leaf=lambda x: x is None)
+  names = [".".join(cast(Any, key).name for key in path) for path, axis in axes if axis == 0]
+  return {name: operator.attrgetter(name)(model) for name in names}

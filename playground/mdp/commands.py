@@ -5,24 +5,25 @@ entries of `info` that an episode starts with, `step(c, key)` those for the next
 episode that ends starts the time of its command over, but keeps the command.
 """
 
+import abc
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from playground.errors import ConfigError
-from playground.limits import AtLeast0, Positive, Share, Span, Vector
+from playground.limits import AtLeast0, Limit, Positive, Share, Span, Vector
 from playground.mdp.context import StepContext
 
 Info = dict[str, Any]
 _AT_REST = np.pi  # the phase of a foot that stays on the floor
 
 
-@dataclasses.dataclass(frozen=True)
-class _VelocityCommand:
+@dataclasses.dataclass
+class _VelocityCommand(abc.ABC):
   """Writes `command` [3] (forward m/s, left m/s, turn rad/s) and `command_steps_left`.
 
   Attributes:
@@ -42,8 +43,8 @@ class _VelocityCommand:
     if any(a > b for a, b in zip(low, self.max, strict=True)):
       key = "env.commands.velocity.params"
       raise ConfigError(f"{key}.min={list(low)} must not be above {key}.max={list(self.max)}.")
-    object.__setattr__(self, "_range", (jnp.array(low, jnp.float32), jnp.array(self.max, jnp.float32)))
-    object.__setattr__(self, "_dt", env.dt)
+    self._range = jnp.array([low, self.max], jnp.float32)
+    self._dt: float = env.dt
 
   def reset(self, key: jax.Array) -> Info:
     key, time_key = jax.random.split(key)
@@ -60,20 +61,20 @@ class _VelocityCommand:
 
   def _steps(self, key: jax.Array) -> jax.Array:
     seconds = self.resample_s * (jax.random.exponential(key) if self.exponential else jnp.ones(()))
-    return jnp.round(seconds / self._dt).astype(jnp.int32)  # pyright: ignore[reportAttributeAccessIssue]
+    return jnp.round(seconds / self._dt).astype(jnp.int32)
 
   def _uniform(self, key: jax.Array) -> jax.Array:
-    low, high = self._range  # pyright: ignore[reportAttributeAccessIssue]
-    return jax.random.uniform(key, (3,), minval=low, maxval=high)
+    return jax.random.uniform(key, (3,), minval=self._range[0], maxval=self._range[1])
 
   def _first(self, key: jax.Array) -> jax.Array:
     return self._uniform(key)
 
+  @abc.abstractmethod
   def _next(self, key: jax.Array, command: jax.Array) -> jax.Array:
-    raise NotImplementedError
+    """Draws the command that follows another one."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class UniformVelocity(_VelocityCommand):
   """Draws all components anew, uniformly; some commands are to stand still.
 
@@ -95,7 +96,7 @@ class UniformVelocity(_VelocityCommand):
     return self._first(key)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class VelocityWalk(_VelocityCommand):
   """Changes some components at a time and often sets them to zero, so that moving on one axis alone is practised.
 
@@ -106,17 +107,8 @@ class VelocityWalk(_VelocityCommand):
     nonzero_probability: of each component, when it changes: else it becomes 0.
   """
 
-  change_probability: float = 0.5
-  nonzero_probability: Sequence[float] = (0.9, 0.25, 0.5)
-
-  def bind(self, env: Any) -> None:
-    super().bind(env)
-    if len(self.nonzero_probability) != 3 or not all(
-      0 <= p <= 1 for p in (self.change_probability, *self.nonzero_probability)
-    ):
-      raise ConfigError(
-        "env.commands: change_probability and the three of nonzero_probability must be between 0 and 1."
-      )
+  change_probability: Share = 0.5
+  nonzero_probability: Annotated[Sequence[float], Limit(0, 1, form="list", length=3)] = (0.9, 0.25, 0.5)
 
   def _next(self, key: jax.Array, command: jax.Array) -> jax.Array:
     value_key, change_key, nonzero_key = jax.random.split(key, 3)
@@ -125,7 +117,7 @@ class VelocityWalk(_VelocityCommand):
     return jnp.where(change, self._uniform(value_key) * nonzero, command)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Gait:
   """When each foot is to be in the air, and how high.
 
@@ -147,8 +139,8 @@ class Gait:
 
   def bind(self, env: Any) -> None:
     phases = np.array([env.robot.gait(name) for name in self.modes])
-    object.__setattr__(self, "_phases", jnp.array(np.where(phases > np.pi, phases - 2 * np.pi, phases)))
-    object.__setattr__(self, "_dt", env.dt)
+    self._phases = jnp.array(np.where(phases > np.pi, phases - 2 * np.pi, phases))
+    self._dt: float = env.dt
 
   def reset(self, key: jax.Array) -> Info:
     mode_key, frequency_key, height_key = jax.random.split(key, 3)
@@ -156,8 +148,8 @@ class Gait:
     low, high = self.frequency
     frequency = jax.random.uniform(frequency_key, minval=low, maxval=high)
     info = {
-      "phase": self._phases[mode],  # pyright: ignore[reportAttributeAccessIssue]
-      "phase_dt": 2 * jnp.pi * self._dt * frequency,  # pyright: ignore[reportAttributeAccessIssue]
+      "phase": self._phases[mode],
+      "phase_dt": 2 * jnp.pi * self._dt * frequency,
       "gait": mode,
       "gait_freq": frequency,
     }
@@ -170,7 +162,7 @@ class Gait:
     del key
     phase = c.info["phase"]
     if self.rest_when_still:
-      phase = jnp.where((phase == _AT_REST).all(), self._phases[c.info["gait"]], phase)  # pyright: ignore[reportAttributeAccessIssue]
+      phase = jnp.where((phase == _AT_REST).all(), self._phases[c.info["gait"]], phase)
     phase = jnp.fmod(phase + c.info["phase_dt"] + jnp.pi, 2 * jnp.pi) - jnp.pi
     if self.rest_when_still:
       phase = jnp.where(is_still(c.command), _AT_REST, phase)

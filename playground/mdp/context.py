@@ -1,16 +1,104 @@
-"""What the functions of reward, observation and termination terms read: one environment after one control step."""
+"""What the functions of terms read: a robot's constant facts, and one environment after one control step."""
 
 import functools
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
+import mujoco
+import numpy as np
 
 from playground.envs.physics import PhysicsData
-from playground.errors import ConfigError
+from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 
 if TYPE_CHECKING:
   from playground.envs.task import Task
+
+
+class Robot:
+  """A robot's constant facts, found in the compiled model by name.
+
+  Attributes:
+    mj_model: the compiled scene.
+    joint_names: of the joints that `c.joint_pos` holds, in its order.
+    joint_groups: regular expressions of joint names, by the name of a group.
+  """
+
+  def __init__(self, mj_model: mujoco.MjModel, joints: Sequence[str], sensors: Mapping[str, Any] | None = None):
+    """Looks sensors up.
+
+    Args:
+      mj_model: the compiled scene.
+      joints: names of the joints.
+      sensors: names that terms read for the model's sensors, or for several of them, one behind the other.
+
+    Raises:
+      UnknownNameError: the model has no sensor of that name.
+      ConfigError: a list of sensors is empty.
+    """
+    self.mj_model = mj_model
+    self.joint_names = tuple(joints)
+    self.joint_groups: dict[str, Sequence[str]] = {}
+    starts, sizes = mj_model.sensor_adr, mj_model.sensor_dim
+    self._rows = {mj_model.sensor(i).name: starts[i] + np.arange(sizes[i]) for i in range(mj_model.nsensor)}
+    for name, parts in (sensors or {}).items():
+      if not parts:
+        raise ConfigError(f"env.robot.sensors.{name} must name one or more.")
+      key = f"env.robot.sensors.{name}"
+      self._rows[name] = np.concatenate([self.rows(p, key) for p in ([parts] if isinstance(parts, str) else parts)])
+
+  def find(self, kind: str, name: str, key: str = "env.robot") -> int:
+    """Returns the id of a `body`, `site`, `geom`, `sensor` or `key`; raises UnknownNameError."""
+    index = mujoco.mj_name2id(self.mj_model, _OBJECTS[kind], name)
+    if index < 0:
+      names = [getattr(self.mj_model, kind)(i).name for i in range(getattr(self.mj_model, f"n{kind}"))]
+      raise UnknownNameError(f"{key} names the {kind} {name!r}, which the model does not have.{nearest(name, names)}")
+    return index
+
+  def rows(self, sensor: str, key: str = "sensor") -> np.ndarray:
+    """Returns where a sensor's reading is in `sensordata`; raises UnknownNameError."""
+    return lookup(self._rows, sensor, key)
+
+  def sensor(self, data: PhysicsData, name: str) -> jax.Array:
+    """Returns the reading of a sensor, by its name in the robot's YAML or in the model; raises UnknownNameError."""
+    return data.sensordata[self.rows(name)]
+
+  def find_joints(self, joints: str | Sequence[str], key: str = "joints") -> np.ndarray:
+    """Returns the indices of joints, in the order of `joint_names`.
+
+    Args:
+      joints: a group of `joint_groups`, a regular expression that matches whole names, or several of them.
+      key: the configuration key that holds them.
+
+    Raises:
+      UnknownNameError: one that matches no joint.
+    """
+    found: set[int] = set()
+    for name in (joints,) if isinstance(joints, str) else joints:
+      patterns = self.joint_groups.get(name, [name])
+      matches = {i for i, joint in enumerate(self.joint_names) if any(re.fullmatch(p, joint) for p in patterns)}
+      if not matches:
+        known = [*self.joint_groups, *self.joint_names]
+        raise UnknownNameError(f"{key}={name!r} matches no joint of the robot.{nearest(name, known)}")
+      found |= matches
+    return np.array(sorted(found))
+
+  def check_names(self, params: Mapping[str, Any], key: str) -> None:
+    """Raises UnknownNameError where parameters of a term name joints or sensors that the robot does not have.
+
+    Args:
+      params: of the term; `joints`, `sensor` and `sensors` count.
+      key: that of `params` in the configuration.
+    """
+    if "joints" in params:
+      self.find_joints(params["joints"], f"{key}.joints")
+    for name in ("sensor", "sensors"):
+      for sensor in (params[name],) if isinstance(params.get(name), str) else params.get(name, ()):
+        self.rows(sensor, f"{key}.{name}")
+
+
+_OBJECTS = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in ("body", "site", "geom", "sensor", "key")}
 
 
 class StepContext:
@@ -87,5 +175,5 @@ class StepContext:
     return self.info[name]
 
   def sensor(self, name: str) -> jax.Array:
-    """Returns the reading of a sensor, by its name in the robot's YAML or in the model."""
+    """Returns the reading of a sensor; see `Robot.sensor`."""
     return self.robot.sensor(self.data, name)

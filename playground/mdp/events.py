@@ -1,27 +1,30 @@
 """Event terms: all that acts on a simulation from outside.
 
-- mode `startup`, func `model_field`: a field of the model, drawn once an environment (`playground.randomization`); in
-  mode `reset` it is drawn in each episode.
+- mode `startup`, func `model_field`: a field of the model, drawn once an environment; in mode `reset` in each episode.
 - mode `reset`: a function `(key, env, initial, **params) -> initial` changes the state that an episode starts with.
 - mode `interval`: a class whose fields are the term's `params`. `bind(env)` looks names up once; `reset(key, model)`
   returns the entries of `info` that an episode starts with, `step(data, info)` acts before the physics of a step.
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul
 
+from playground.config.text import format_value
 from playground.envs.physics import PhysicsData, mjx
-from playground.limits import AtLeast0, Share, Span, Vector
+from playground.errors import ConfigError
+from playground.limits import MOST, AtLeast0, Share, Span, Vector, count, span
 from playground.mdp.rotations import uniform_quat
 
 if TYPE_CHECKING:
   from playground.envs.task import InitialState, Task
 
 Info = dict[str, Any]
+_MOMENTS = {"normal": ("mean", "std"), "bernoulli": ("mean",)}  # parameters of distributions that have no range
 
 
 def reset_root_xy(key: jax.Array, env: "Task", initial: "InitialState", distance: AtLeast0) -> "InitialState":
@@ -48,10 +51,9 @@ def reset_root_velocity(key: jax.Array, env: "Task", initial: "InitialState", sp
 
 def reset_joints_by_scale(key: jax.Array, env: "Task", initial: "InitialState", scale: Span) -> "InitialState":
   """Multiplies each joint's angle by a factor U[scale[0], scale[1]), within the joint's range."""
-  low, high = scale
   joints = initial.qpos[env.robot.qpos]
-  factors = jax.random.uniform(key, joints.shape, minval=low, maxval=high)
-  return initial.replace(qpos=initial.qpos.at[env.robot.qpos].set(jnp.clip(joints * factors, *env.robot.joint_range)))
+  joints = jnp.clip(joints * _uniform(key, scale, joints.shape), *env.robot.joint_range)
+  return initial.replace(qpos=initial.qpos.at[env.robot.qpos].set(joints))
 
 
 def reset_joints_gaussian(key: jax.Array, env: "Task", initial: "InitialState", std: AtLeast0) -> "InitialState":
@@ -95,6 +97,74 @@ def reset_to_keyframe(
 
 
 @dataclasses.dataclass(frozen=True)
+class ModelField:
+  """Draws entries of a field of the model, in mode `startup` or `reset` (`playground.randomization`).
+
+  Attributes:
+    field: a field of `mjx.Model`, of numbers or switches, with a row per geom, body, site, actuator, tendon, pair,
+      light, camera, material, joint, dof or qpos entry, or `actuator_kp`, which moves a position servo's gain and bias
+      together, or `body_density`, which scales a body's mass and inertia together.
+    target: whose rows: a name, a list of names, `all`, or `joints` (every joint but the free ones).
+    operation: `set`, `scale`, `add`, or `rotate`, which turns a direction or quaternion about a random axis by the
+      angle that is drawn, rad.
+    range: (low, high) of `uniform` and `log_uniform`.
+    mean: of `normal`, and of `bernoulli` the probability of true.
+    std: of `normal`.
+    distribution: `uniform`, `log_uniform` or `normal`; of a switch `bernoulli`.
+    column: column, or columns, of a two-dimensional field; None is all.
+    shared: one draw for all entries, instead of one for each.
+    axis: of `rotate`, ranges of the axis's x, y and z before it has length 1; None is any direction alike.
+  """
+
+  field: str
+  target: str | Sequence[str]
+  operation: Literal["set", "scale", "add", "rotate"]
+  range: Annotated[Sequence[float], span(-MOST)] | None = None
+  mean: float | None = None
+  std: AtLeast0 | None = None
+  distribution: Literal["uniform", "log_uniform", "normal", "bernoulli"] = "uniform"
+  column: Annotated[int | Sequence[int], count(0).each] | None = None
+  shared: bool = False
+  axis: Sequence[Sequence[float]] | None = None
+
+  def check(self, key: str) -> None:
+    """Raises ConfigError where parameters do not go together; `key` is that of `params` in the config."""
+    needed = _MOMENTS.get(self.distribution, ("range",))
+    for name in ("range", "mean", "std"):
+      if (name in needed) != (getattr(self, name) is not None):
+        verb = "needs" if name in needed else "has no"
+        raise ConfigError(f"{key}: distribution {self.distribution!r} {verb} key {name!r}.")
+    first, _ = self.parameters
+    if self.distribution == "bernoulli" and not 0 <= first <= 1:
+      raise ConfigError(f"{key}.mean={first:g} is no probability.")
+    if self.distribution == "log_uniform" and first <= 0:
+      raise ConfigError(f"{key}.range={list(self.parameters)} must be above 0 for log_uniform.")
+    if self.axis is not None and self.operation != "rotate":
+      raise ConfigError(f"{key}: operation {self.operation!r} has no key 'axis'.")
+    if self.axis is not None:
+      pairs = isinstance(self.axis, tuple) and len(self.axis) == 3 and all(map(span(-MOST).allows, self.axis))
+      if not pairs or not any(map(any, self.axis)):
+        raise ConfigError(f"{key}.axis={self.axis!r} is not three pairs [low, high], of x, y and z, not all 0.")
+
+  @property
+  def parameters(self) -> tuple[float, float]:
+    """The distribution's two parameters: (low, high) or (mean, std); a bernoulli's std is 0 here."""
+    first, second = (self.mean, self.std or 0.0) if self.distribution in _MOMENTS else (self.range or (0.0, 0.0))
+    return first or 0.0, second
+
+  def describe(self) -> dict[str, str]:
+    """Returns field, target, operation and draw (distribution and parameters), for people."""
+    first, second = self.parameters
+    parameters = f"{first:g}" if self.distribution == "bernoulli" else f"{first:g}, {second:g}"
+    return {
+      "field": self.field if self.column is None else f"{self.field}[:, {format_value(self.column)}]",
+      "target": self.target if isinstance(self.target, str) else ", ".join(self.target),
+      "operation": self.operation,
+      "draw": f"{self.distribution}({parameters})",
+    }
+
+
+@dataclasses.dataclass
 class PushByForce:
   """Pushes the root body with a force, a half sine in time, from time to time; strengths and times are an episode's.
 
@@ -110,67 +180,10 @@ class PushByForce:
   velocity: Span
   duration_s: Span
   interval_s: Span
+  counters: ClassVar[tuple[str, ...]] = ("push_wait", "push_time")
 
   def bind(self, env: Any) -> None:
-    object.__setattr__(self, "_env", env)
-
-  def reset(self, key: jax.Array, model: mjx.Model) -> Info:
-    env: Any = self._env  # pyright: ignore[reportAttributeAccessIssue]
-    interval, duration, velocity = (
-      jax.random.uniform(k, minval=low, maxval=high)
-      for k, (low, high) in zip(
-        jax.random.split(key, 3), (self.interval_s, self.duration_s, self.velocity), strict=True
-      )
-    )
-    return {
-      "push_interval": jnp.round(interval / env.dt).astype(jnp.int32),
-      "push_duration": duration,
-      "push_velocity": velocity,
-      "push_mass": env.robot.mass(model),
-      "push_direction": jnp.zeros(3),
-      "push_wait": jnp.zeros((), jnp.int32),
-      "push_time": jnp.zeros((), jnp.int32),
-      "pushing": jnp.zeros((), bool),
-    }
-
-  def step(self, data: PhysicsData, info: Info) -> tuple[PhysicsData, Info]:
-    env: Any = self._env  # pyright: ignore[reportAttributeAccessIssue]
-    pushing = info["push_wait"] >= info["push_interval"]
-    force = push_force(info["push_time"] * env.dt, info["push_mass"], info["push_velocity"], info["push_duration"])
-    force = jnp.where(pushing, force * info["push_direction"], 0.0)
-    over = pushing & (info["push_time"] >= jnp.round(info["push_duration"] / env.dt))
-    rng, key = jax.random.split(info["rng"])
-    waited = jnp.where(pushing, info["push_wait"], info["push_wait"] + 1)
-    starting = ~pushing & (waited >= info["push_interval"])
-    data = data.replace(xfrc_applied=data.xfrc_applied.at[env.robot.root, :3].set(force))
-    return data, {
-      "rng": jnp.where(pushing, info["rng"], rng),
-      "push_direction": jnp.where(starting, horizontal(key), info["push_direction"]),
-      "push_wait": jnp.where(over, 0, waited),
-      "push_time": jnp.where(starting, 0, info["push_time"] + pushing),
-      "pushing": pushing,
-    }
-
-
-@dataclasses.dataclass(frozen=True)
-class PushByForceRegularly:
-  """As `PushByForce`, but the interval runs from the start of one push to that of the next, in whole steps.
-
-  (Playground 0.2.0, Barkour.)
-
-  Attributes:
-    velocity: see `PushByForce`.
-    duration_s: range, s.
-    interval_s: range, s.
-  """
-
-  velocity: Span
-  duration_s: Span
-  interval_s: Span
-
-  def bind(self, env: Any) -> None:
-    object.__setattr__(self, "_env", env)
-    object.__setattr__(self, "_body", env.robot.root)
+    self.env, self.body = env, env.robot.root
 
   def direction(self, key: jax.Array) -> jax.Array:
     """Draws the direction of a push: horizontal, world frame [3]."""
@@ -178,48 +191,80 @@ class PushByForceRegularly:
 
   def strength(self, key: jax.Array) -> jax.Array:
     """Draws the strength of an episode's pushes, m/s."""
-    low, high = self.velocity
-    return jax.random.uniform(key, minval=low, maxval=high)
+    return _uniform(key, self.velocity)
+
+  def times(self, interval_key: jax.Array, duration_key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Draws an episode's interval, in control steps, and its pushes' duration, s."""
+    interval = jnp.round(_uniform(interval_key, self.interval_s) / self.env.dt).astype(jnp.int32)
+    return interval, _uniform(duration_key, self.duration_s)
 
   def mass(self, model: mjx.Model) -> jax.Array:
-    """The mass that is pushed, kg."""
-    return self._env.robot.mass(model)  # pyright: ignore[reportAttributeAccessIssue]
+    """Returns the mass that is pushed, kg."""
+    return self.env.robot.mass(model)
 
   def reset(self, key: jax.Array, model: mjx.Model) -> Info:
-    dt: float = self._env.dt  # pyright: ignore[reportAttributeAccessIssue]
     interval_key, duration_key, strength_key = jax.random.split(key, 3)
-    steps = lambda k, reach: jax.random.randint(k, (), *(round(time / dt) for time in reach))
+    interval, duration = self.times(interval_key, duration_key)
     return {
-      "push_interval": steps(interval_key, self.interval_s),
-      "push_duration": steps(duration_key, self.duration_s),
+      "push_interval": interval,
+      "push_duration": duration,
       "push_velocity": self.strength(strength_key),
       "push_mass": self.mass(model),
       "push_direction": jnp.zeros_like(self.direction(key)),
-      "push_step": jnp.zeros((), jnp.int32),
       "pushing": jnp.zeros((), bool),
-    }
+    } | {name: jnp.zeros((), jnp.int32) for name in self.counters}
 
   def step(self, data: PhysicsData, info: Info) -> tuple[PhysicsData, Info]:
-    dt: float = self._env.dt  # pyright: ignore[reportAttributeAccessIssue]
-    body: int = self._body  # pyright: ignore[reportAttributeAccessIssue]
-    since = info["push_step"] % info["push_interval"]
-    begun = info["push_step"] >= info["push_interval"]
+    pushing, dt = info["push_wait"] >= info["push_interval"], self.env.dt
+    force = push_force(info["push_time"] * dt, info["push_mass"], info["push_velocity"], info["push_duration"])
+    force = jnp.where(pushing, force * info["push_direction"], 0.0)
+    over = pushing & (info["push_time"] >= jnp.round(info["push_duration"] / dt))
+    rng, key = jax.random.split(info["rng"])
+    waited = jnp.where(pushing, info["push_wait"], info["push_wait"] + 1)
+    starting = ~pushing & (waited >= info["push_interval"])
+    return self.apply(data, force), {
+      "rng": jnp.where(pushing, info["rng"], rng),
+      "push_direction": jnp.where(starting, self.direction(key), info["push_direction"]),
+      "push_wait": jnp.where(over, 0, waited),
+      "push_time": jnp.where(starting, 0, info["push_time"] + pushing),
+      "pushing": pushing,
+    }
+
+  def apply(self, data: PhysicsData, force: jax.Array) -> PhysicsData:
+    """Returns the physics with a force [3], or force and torque [6], on the body."""
+    return data.replace(xfrc_applied=data.xfrc_applied.at[self.body, : force.size].set(force))
+
+
+@dataclasses.dataclass
+class PushByForceRegularly(PushByForce):
+  """As `PushByForce`, but the interval runs from the start of one push to that of the next, in whole steps.
+
+  (Playground 0.2.0, Barkour.)
+  """
+
+  counters = ("push_step",)
+
+  def times(self, interval_key: jax.Array, duration_key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Draws an episode's interval and its pushes' duration, both in control steps."""
+    steps = lambda key, reach: jax.random.randint(key, (), *(round(time / self.env.dt) for time in reach))
+    return steps(interval_key, self.interval_s), steps(duration_key, self.duration_s)
+
+  def step(self, data: PhysicsData, info: Info) -> tuple[PhysicsData, Info]:
+    dt, since = self.env.dt, info["push_step"] % info["push_interval"]
     starting = (since == 0) & (info["push_step"] > 0)
     rng, key = jax.random.split(info["rng"])
     direction = jnp.where(starting, self.direction(key), info["push_direction"])
     pushing = since < info["push_duration"]
     force = push_force(since * dt, info["push_mass"], info["push_velocity"], info["push_duration"] * dt)
-    force = jnp.where(pushing, force, 0.0) * direction
-    data = data.replace(xfrc_applied=data.xfrc_applied.at[body, : force.size].set(force))
-    return data, {
+    return self.apply(data, jnp.where(pushing, force, 0.0) * direction), {
       "rng": jnp.where(starting, rng, info["rng"]),
       "push_step": info["push_step"] + 1,
       "push_direction": direction,
-      "pushing": pushing & begun,
+      "pushing": pushing & (info["push_step"] >= info["push_interval"]),
     }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class PushObjectByWrench(PushByForceRegularly):
   """Forces and torques on the object of the task, in any direction, at regular times. (Playground 0.2.0, LEAP hand.)
 
@@ -230,8 +275,7 @@ class PushObjectByWrench(PushByForceRegularly):
   angular_velocity: Span = (0.0, 0.0)
 
   def bind(self, env: Any) -> None:
-    object.__setattr__(self, "_env", env)
-    object.__setattr__(self, "_body", env.robot.cube)
+    self.env, self.body = env, env.robot.cube
 
   def direction(self, key: jax.Array) -> jax.Array:
     """Draws a unit vector of force and torque together, world frame [6]."""
@@ -240,16 +284,14 @@ class PushObjectByWrench(PushByForceRegularly):
 
   def strength(self, key: jax.Array) -> jax.Array:
     """Draws the strengths of force and torque of an episode's pushes, m/s and rad/s [6]."""
-    low, high = self.angular_velocity
-    turn = jax.random.uniform(jax.random.fold_in(key, 1), minval=low, maxval=high)
+    turn = _uniform(jax.random.fold_in(key, 1), self.angular_velocity)
     return jnp.repeat(jnp.array([super().strength(key), turn]), 3)
 
   def mass(self, model: mjx.Model) -> jax.Array:
-    """Mass of the object, kg."""
-    return self._env.robot.cube_mass(model)  # pyright: ignore[reportAttributeAccessIssue]
+    return self.env.robot.cube_mass(model)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class PushBySettingVelocity:
   """Adds to the root's horizontal velocity, at one interval in an episode, each time in another direction.
 
@@ -264,27 +306,23 @@ class PushBySettingVelocity:
   interval_s: Span
 
   def bind(self, env: Any) -> None:
-    object.__setattr__(self, "_dt", env.dt)
+    self.dt: float = env.dt
 
   def reset(self, key: jax.Array, model: mjx.Model) -> Info:
     del model
-    low, high = self.interval_s
-    interval = jax.random.uniform(key, minval=low, maxval=high)
     return {
       "push": jnp.zeros(2),
       "push_step": jnp.zeros((), jnp.int32),
-      "push_interval_steps": jnp.round(interval / self._dt).astype(jnp.int32),  # pyright: ignore[reportAttributeAccessIssue]
+      "push_interval_steps": jnp.round(_uniform(key, self.interval_s) / self.dt).astype(jnp.int32),
       "pushing": jnp.zeros((), bool),
     }
 
   def step(self, data: PhysicsData, info: Info) -> tuple[PhysicsData, Info]:
     rng, angle_key, size_key = jax.random.split(info["rng"], 3)
-    low, high = self.velocity
-    size = jax.random.uniform(size_key, minval=low, maxval=high)
     step = info["push_step"] + 1
     due = step % info["push_interval_steps"] == 0
     push = horizontal(angle_key)[:2] * due
-    data = data.replace(qvel=data.qvel.at[:2].add(push * size))
+    data = data.replace(qvel=data.qvel.at[:2].add(push * _uniform(size_key, self.velocity)))
     return data, {"rng": rng, "push": push, "push_step": step, "pushing": due}
 
 
@@ -301,3 +339,7 @@ def horizontal(key: jax.Array) -> jax.Array:
   """Draws a horizontal unit vector, shape [3]."""
   angle = jax.random.uniform(key, maxval=2 * jnp.pi)
   return jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
+
+
+def _uniform(key: jax.Array, reach: Span, shape: tuple[int, ...] = ()) -> jax.Array:
+  return jax.random.uniform(key, shape, minval=reach[0], maxval=reach[1])

@@ -1,8 +1,7 @@
 """A robot on legs: its constant facts, and what terms read of it in a step."""
 
 import functools
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -11,14 +10,13 @@ import mujoco
 import numpy as np
 
 from playground.envs.physics import PhysicsData, mjx
-from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.errors import ConfigError, lookup
 from playground.mdp.commands import is_still
-from playground.mdp.context import StepContext
-from playground.mdp.lookup import lookup
+from playground.mdp.context import Robot, StepContext
 
 
-class LeggedRobot:
-  """A robot's constant facts, found in the compiled model under the names of its YAML (`configs/robot/`).
+class LeggedRobot(Robot):
+  """A robot on legs, of which the model has what its YAML (`configs/robot/`) names.
 
   The first joint is the free one of the base; actuators stand in the order of the other joints.
 
@@ -31,9 +29,9 @@ class LeggedRobot:
     base_site: id of the site that carries the inertial sensors.
     feet: ids of the foot sites, shape [feet].
     foot_names: names of the foot sites.
-    joint_names: of the joints but the root's.
     qpos, qvel: where the joints are in `qpos` and `qvel`.
     pose_weights: how much each joint's distance from the default pose counts, shape [nu].
+    contact_groups: addresses of contact sensors' readings, by the name of a group.
   """
 
   qpos = slice(7, None)
@@ -50,76 +48,58 @@ class LeggedRobot:
       UnknownNameError: the model has no object of that name.
       ConfigError: the model's joints come in another order, or a list has not one entry for each foot or joint.
     """
-    joints = [mujoco.mj_id2name(mj_model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(1, mj_model.njnt)]
+    joints = [mj_model.joint(i).name for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
       raise ConfigError(f"env.robot.joints must name the model's joints in their order: {', '.join(joints)}.")
     _check_lengths(config)
-    self._mj_model = mj_model
+    super().__init__(mj_model, joints, config.sensors)
     self.init_qpos = self.keyframe(config.keyframe)
     self.default_pose = self.init_qpos[7:]
     limited = mj_model.jnt_limited[1:, None].astype(bool)
     self.joint_range = jnp.array(np.where(limited, mj_model.jnt_range[1:], mj_model.actuator_ctrlrange).T)
     own = config.get("target_range")
     self.target_range = jnp.array([own.lower, own.upper] if own else mj_model.actuator_ctrlrange.T)
-    self.root = _find(mj_model, "body", config.root)
-    self.base_site = _find(mj_model, "site", config.base_site)
-    self.feet = np.array([_find(mj_model, "site", name) for name in config.feet])
-    self.foot_names, self.joint_names = tuple(config.feet), tuple(joints)
-    self._sensors = {key: _address(mj_model, name) for key, name in config.sensors.items()}
-    self._foot_linvel = np.array([_address(mj_model, name) for name in config.foot_linvel])
-    contact_sensors = [[_find(mj_model, "sensor", name) for name in foot] for foot in config.foot_contact]
-    self._foot_contact = [mj_model.sensor_adr[ids] for ids in contact_sensors]
-    self._foot_pos = np.array([_address(mj_model, name) for name in config.get("foot_pos", ())])
-    self._foot_force = np.array([_address(mj_model, name) for name in config.get("foot_force", ())])
-    self._subtree = _subtree(mj_model, self.root)
+    self.root, self.base_site = self.find("body", config.root), self.find("site", config.base_site)
+    self.foot_names = tuple(config.feet)
+    self.feet = np.array([self.find("site", name) for name in config.feet])
     self.pose_weights = jnp.array(config.get("pose_weights", [1.0] * len(joints)))
-    self._joint_groups = {group: list(config[group]) for group in ("hips", "hip_rolls", "knees") if config.get(group)}
-    self._contacts = {
-      group: [_address(mj_model, name)[0] for name in config.get(group, ())]
-      for group in ("self_contact", "fatal_contact")
+    self.joint_groups = {group: list(config[group]) for group in ("hips", "hip_rolls", "knees") if config.get(group)}
+    self.contact_groups: dict[str, np.ndarray] = {}
+    for group in ("self_contact", "fatal_contact"):
+      self.add_contact_group(group, config.get(group, ()))
+    self._foot_contact = [self._addresses(sensors, "foot_contact") for sensors in config.foot_contact]
+    self._foot_rows = {
+      key: np.array([self.rows(name, f"env.robot.{key}") for name in config.get(key, ())])
+      for key in ("foot_linvel", "foot_pos", "foot_force")
     }
+    self._subtree = [self.root]  # a child's id is always above its parent's
+    for body in range(self.root + 1, mj_model.nbody):
+      if mj_model.body_parentid[body] in self._subtree:
+        self._subtree.append(body)
     self._gaits = dict(config.get("gaits", {}))
 
   def keyframe(self, name: str) -> jax.Array:
     """Returns the configuration of a keyframe, shape [nq]; raises UnknownNameError if there is none of that name."""
-    return jnp.array(self._mj_model.key_qpos[_find(self._mj_model, "key", name)])
-
-  def sensor(self, data: PhysicsData, key: str) -> jax.Array:
-    """Returns the reading of a sensor, by its key in `sensors` of the robot's YAML; raises UnknownNameError."""
-    return data.sensordata[lookup(self._sensors, key, "env.robot.sensors")]
-
-  def find_joints(self, joints: str | Sequence[str]) -> np.ndarray:
-    """Returns the indices of joints, in the model's order.
-
-    Args:
-      joints: a group of the robot's YAML (`hips`, `hip_rolls`, `knees`), a regular expression that matches whole
-        names, or several of them.
-
-    Raises:
-      UnknownNameError: one that matches no joint.
-    """
-    found: set[int] = set()
-    for name in (joints,) if isinstance(joints, str) else joints:
-      patterns = self._joint_groups.get(name, [name])
-      matches = {i for i, joint in enumerate(self.joint_names) if any(re.fullmatch(p, joint) for p in patterns)}
-      if not matches:
-        known = [*self._joint_groups, *self.joint_names]
-        raise UnknownNameError(f"joints={name!r} matches no joint of the robot.{nearest(name, known)}")
-      found |= matches
-    return np.array(sorted(found))
-
-  def add_joint_group(self, name: str, joints: Sequence[str]) -> None:
-    """Gives joints a name that `find_joints` knows."""
-    self._joint_groups[name] = [re.escape(joint) for joint in joints]
+    return jnp.array(self.mj_model.key_qpos[self.find("key", name)])
 
   def add_contact_group(self, name: str, sensors: Sequence[str]) -> None:
     """Gives contact sensors a name that `touching` knows."""
-    self._contacts[name] = [_address(self._mj_model, sensor)[0] for sensor in sensors]
+    self.contact_groups[name] = self._addresses(sensors, name)
 
-  def find_feet(self, feet: Sequence[str]) -> np.ndarray:
+  def _addresses(self, sensors: Sequence[str], key: str) -> np.ndarray:
+    return np.array([self.rows(sensor, f"env.robot.{key}")[0] for sensor in sensors], int)
+
+  def find_feet(self, feet: Sequence[str], key: str = "feet") -> np.ndarray:
     """Returns the indices of feet in `feet` by their names; raises UnknownNameError."""
     order = {name: i for i, name in enumerate(self.foot_names)}
-    return np.array([lookup(order, name, "feet") for name in feet], int)
+    return np.array([lookup(order, name, key) for name in feet], int)
+
+  def check_names(self, params: Mapping[str, Any], key: str) -> None:
+    """As `Robot.check_names`; `feet` and `keyframe` count, too."""
+    super().check_names(params, key)
+    self.find_feet(params.get("feet", ()), f"{key}.feet")
+    if "keyframe" in params:
+      self.find("key", params["keyframe"], f"{key}.keyframe")
 
   def gait(self, name: str) -> list[float]:
     """Returns the feet's phases at the start of a gait, rad; raises UnknownNameError if the robot has none of the name.
@@ -132,27 +112,25 @@ class LeggedRobot:
       raise ConfigError(f"env.robot.gaits.{name} must hold {len(self.feet)} phases, one for each foot.")
     return list(phases)
 
-  def feet_velocity(self, data: PhysicsData) -> jax.Array:
-    """Returns the world velocities of the foot sites, m/s, shape [feet, 3]."""
-    return data.sensordata[self._foot_linvel]
+  def foot_sensors(self, data: PhysicsData, key: str) -> jax.Array:
+    """Returns the readings of the feet's sensors, shape [feet, 3]; raises ConfigError if the robot has none.
 
-  def feet_pos(self, data: PhysicsData) -> jax.Array:
-    """Returns the positions of the feet in the frame of the base site, m, shape [feet, 3]."""
-    return data.sensordata[self._present("foot_pos", self._foot_pos)]
-
-  def feet_force(self, data: PhysicsData) -> jax.Array:
-    """Returns the force between each foot and its leg in the foot site's frame, N, shape [feet, 3]."""
-    return data.sensordata[self._present("foot_force", self._foot_force)]
+    Args:
+      data: the physics.
+      key: `foot_linvel` (world velocities, m/s), `foot_pos` (positions in the frame of the base site, m), `foot_force`
+        (force between foot and leg in the foot site's frame, N).
+    """
+    return data.sensordata[self._present(key, self._foot_rows[key])]
 
   def touching(self, data: PhysicsData, group: str) -> jax.Array:
     """Returns which contacts of a group there are, bool, shape [contacts].
 
     Groups are `self_contact` and `fatal_contact` of the robot's YAML, and those of `add_contact_group`.
     """
-    return data.sensordata[np.array(self._present(group, self._contacts[group]))] > 0
+    return data.sensordata[self._present(group, self.contact_groups[group])] > 0
 
-  def _present(self, key: str, found: Any) -> Any:
-    if len(found) == 0:
+  def _present(self, key: str, found: np.ndarray) -> np.ndarray:
+    if not found.size:
       raise ConfigError(f"env.robot.{key} is empty or missing, but a reward or termination of env needs it.")
     return found
 
@@ -162,7 +140,7 @@ class LeggedRobot:
 
   def mass(self, model: mjx.Model) -> jax.Array:
     """Returns the mass that a push on `root` moves, kg: the root's and that of all it carries."""
-    return model.body_mass[self._subtree].sum()
+    return model.body_mass[np.array(self._subtree)].sum()
 
 
 def _check_lengths(config: Any) -> None:
@@ -243,34 +221,4 @@ class LeggedContext(StepContext):
   @property
   def feet_velocity(self) -> jax.Array:
     """World velocities of the foot sites, m/s, shape [feet, 3]."""
-    return self.robot.feet_velocity(self.data)
-
-
-_OBJECTS = {
-  "key": (mujoco.mjtObj.mjOBJ_KEY, "nkey"),
-  "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
-  "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
-  "sensor": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
-}
-
-
-def _find(mj_model: mujoco.MjModel, kind: str, name: str) -> int:
-  obj, count = _OBJECTS[kind]
-  index = mujoco.mj_name2id(mj_model, obj, name)
-  if index < 0:
-    names = [mujoco.mj_id2name(mj_model, obj, i) or "" for i in range(getattr(mj_model, count))]
-    raise UnknownNameError(f"env.robot names the {kind} {name!r}, which the model does not have.{nearest(name, names)}")
-  return index
-
-
-def _address(mj_model: mujoco.MjModel, sensor: str) -> np.ndarray:
-  index = _find(mj_model, "sensor", sensor)
-  return mj_model.sensor_adr[index] + np.arange(mj_model.sensor_dim[index])
-
-
-def _subtree(mj_model: mujoco.MjModel, root: int) -> np.ndarray:
-  bodies = [root]  # a child's id is always above its parent's
-  for body in range(root + 1, mj_model.nbody):
-    if mj_model.body_parentid[body] in bodies:
-      bodies.append(body)
-  return np.array(bodies)
+    return self.robot.foot_sensors(self.data, "foot_linvel")

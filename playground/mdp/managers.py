@@ -1,6 +1,6 @@
 """Managers: each computes the terms of one kind. `playground.envs.task.Task` calls them in every step."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import jax
@@ -9,29 +9,17 @@ import numpy as np
 
 from playground.config.text import format_value
 from playground.envs.physics import PhysicsData
-from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.limits import MOST, Limit, at_least_0, count, span
+from playground.errors import ConfigError, UnknownNameError, lookup, nearest
+from playground.limits import at_least_0
 from playground.mdp import delays
 from playground.mdp.context import StepContext
-from playground.mdp.lookup import lookup
-from playground.mdp.options import (
-  CommandOptions,
-  EventOptions,
-  ObservationOptions,
-  RewardOptions,
-  TerminationOptions,
-  is_model_field,
-)
+from playground.mdp.options import EventOptions, NoOptions, ObservationOptions, RewardOptions, is_model_field
 from playground.mdp.terms import Term, bind, bind_one
 
 ACTOR = "state"  # the observation group that the policy reads: noisy; the other groups are exact
 Info = dict[str, Any]
-_LIMITS = {
-  "history": count(1, 1000),
-  "delay": Limit(0, 1000, whole=True, form="list", length=2, rising=True),
-  "clip": span(-MOST),
-  "scale": Limit().each,
-}
+_WHEN = ("command_above", "command_below")
+_NOISE = ("uniform", "gaussian", "same_as")
 
 
 class RewardManager:
@@ -45,13 +33,12 @@ class RewardManager:
     """
     terms = bind("rewards", section, RewardOptions)
     for term in terms:
-      key = f"env.rewards.{term.name}"
       for name, value in (term.options.when or {}).items():
-        if name not in ("command_above", "command_below"):
-          near = nearest(name, ("command_above", "command_below"))
-          raise UnknownNameError(f"{key}.when.{name} does not exist: choose command_above or command_below.{near}")
+        key = f"{term.key}.when.{name}"
+        if name not in _WHEN:
+          raise UnknownNameError(f"{key} does not exist: choose {' or '.join(_WHEN)}.{nearest(name, _WHEN)}")
         if not at_least_0().allows(value):
-          raise ConfigError(f"{key}.when.{name}={format_value(value)} must be {at_least_0()}.")
+          raise ConfigError(f"{key}={format_value(value)} must be {at_least_0()}.")
     self.terms = [term for term in terms if term.options.weight != 0]
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
@@ -71,7 +58,7 @@ class TerminationManager:
 
   def __init__(self, section: Mapping[str, Any]):
     """Binds `env.terminations`; raises as `terms.bind`."""
-    self.terms = bind("terminations", section, TerminationOptions)
+    self.terms = bind("terminations", section, NoOptions)
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns whether each term ends the episode, by name, each a bool of shape []."""
@@ -121,11 +108,11 @@ class ObservationManager:
       first = list((order or {}).get(group) or ())
       for name in first:
         lookup(entries, name, f"env.observation_order.{group}")
-      terms = [_bind_observation(group, name, entries[name]) for name in dict.fromkeys([*first, *entries])]
-      if terms:
-        self.groups[group] = terms
-    for group, terms in self.groups.items():
-      _check_shared_noise(group, terms)
+      noisy: list[str] = []
+      for name in dict.fromkeys([*first, *entries]):
+        term = _bind_observation(group, name, entries[name], noisy)
+        noisy += [name] if term.options.noise and "same_as" not in term.options.noise else []
+        self.groups.setdefault(group, []).append(term)
     if ACTOR not in self.groups:
       raise ConfigError(f"env.observations.{ACTOR} is empty: the policy would read nothing.")
 
@@ -208,36 +195,24 @@ class ObservationManager:
     return found
 
 
-def _bind_observation(group: str, name: str, entry: Any) -> Term:
+def _bind_observation(group: str, name: str, entry: Any, noisy: list[str]) -> Term:
+  """Binds a term; `noisy` are those above it in its group that have noise of their own."""
   key = f"env.observations.{group}.{name}"
   if group != ACTOR and name == ACTOR and not dict(entry.items() if hasattr(entry, "items") else {"func": entry}):
-    return Term(name, lambda c: None, {}, ObservationOptions())
+    return Term(name, key, lambda c: None, {}, ObservationOptions())
   term = bind_one("observations", key, name, entry, ObservationOptions)
-  options = term.options
-  for field, limit in _LIMITS.items():
-    value = getattr(options, field)
-    if value is not None and not limit.allows(value):
-      raise ConfigError(f"{key}.{field}={format_value(value)} must be {limit}.")
-  noise = options.noise
-  if noise is not None:
-    kinds = ("uniform", "gaussian", "same_as")
-    if not isinstance(noise, dict) or len(noise) != 1 or next(iter(noise)) not in kinds:
-      raise ConfigError(f"{key}.noise={noise!r} must have one of the keys {', '.join(kinds)}.")
-    kind, size = next(iter(noise.items()))
-    if kind != "same_as" and not at_least_0().each.allows(size):
-      raise ConfigError(f"{key}.noise.{kind}={format_value(size)} must be {at_least_0().each}.")
+  if term.options.noise is None:
+    return term
+  if (
+    not isinstance(term.options.noise, dict) or len(term.options.noise) != 1 or not set(term.options.noise) <= {*_NOISE}
+  ):
+    raise ConfigError(f"{key}.noise={term.options.noise!r} must have one of the keys {', '.join(_NOISE)}.")
+  kind, size = next(iter(term.options.noise.items()))
+  if kind == "same_as" and size not in noisy:
+    raise UnknownNameError(f"{key}.noise.{kind}={size} is no term with noise above it.{nearest(str(size), noisy)}")
+  if kind != "same_as" and not at_least_0().each.allows(size):
+    raise ConfigError(f"{key}.noise.{kind}={format_value(size)} must be {at_least_0().each}.")
   return term
-
-
-def _check_shared_noise(group: str, terms: list[Term]) -> None:
-  seen: list[str] = []
-  for term in terms:
-    source = (term.options.noise or {}).get("same_as")
-    if source is not None and source not in seen:
-      key = f"env.observations.{group}.{term.name}.noise.same_as"
-      raise UnknownNameError(f"{key}={source} is no term with noise above it.{nearest(str(source), seen)}")
-    if term.options.noise and source is None:
-      seen.append(term.name)
 
 
 def _per_element(name: str, numbers: Any, size: int) -> np.ndarray:
@@ -259,15 +234,14 @@ def _depth(term: Term) -> int:
 
 
 def _look_back(term: Term, value: jax.Array, key: jax.Array, buffer: jax.Array | None) -> tuple[jax.Array, jax.Array]:
-  options = term.options
+  """A term's late value or its history, and the buffer for the next step."""
+  delay, depth = term.options.delay, _depth(term)
   if buffer is None:  # a delayed sensor has read the start for long; a history has no past
-    depth = _depth(term)
-    buffer = delays.start(value, depth) if options.delay else jnp.zeros((depth, *value.shape), value.dtype)
+    buffer = delays.start(value, depth) if delay else jnp.zeros((depth, *value.shape), value.dtype)
   buffer = delays.push(buffer, value)
-  start = delays.draw_delay(key, options.delay) if options.delay else 0
-  if not options.delay:
+  if not delay:
     return buffer, buffer
-  return jax.lax.dynamic_slice_in_dim(buffer, start, options.history), buffer
+  return jax.lax.dynamic_slice_in_dim(buffer, delays.draw_delay(key, delay), term.options.history), buffer
 
 
 class CommandManager:
@@ -275,30 +249,27 @@ class CommandManager:
 
   def __init__(self, section: Mapping[str, Any], env: Any):
     """Binds `env.commands` and builds each generator with its parameters; raises as `terms.bind`."""
-    self.terms = bind("commands", section, CommandOptions, skip=0)
+    self.terms = bind("commands", section, NoOptions, skip=0)
     self._generators = [term() for term in self.terms]
     for generator in self._generators:
       generator.bind(env)
 
   def reset(self, key: jax.Array) -> Info:
     """Returns the entries of `info` that an episode starts with."""
-    info: Info = {}
-    for generator, k in zip(self._generators, _keys(key, self._generators), strict=True):
-      info |= generator.reset(k)
-    return info
+    return _union(generator.reset(k) for generator, k in _with_keys(self._generators, key))
 
   def step(self, c: StepContext, key: jax.Array) -> Info:
     """Returns the entries of `info` for the next step."""
-    info: Info = {}
-    for generator, k in zip(self._generators, _keys(key, self._generators), strict=True):
-      info |= generator.step(c, k)
-    return info
+    return _union(generator.step(c, k) for generator, k in _with_keys(self._generators, key))
 
 
 class EventManager:
   """What acts on the simulation from outside: on its start state and while it runs.
 
   Model fields of mode `startup` are the trainers' (`playground.randomization`), which hand them to `reset` and `step`.
+
+  Attributes:
+    resets: the terms of mode reset.
   """
 
   def __init__(self, section: Mapping[str, Any], env: Any):
@@ -307,7 +278,7 @@ class EventManager:
     Raises:
       ConfigError, UnknownNameError: see `terms.bind`; also an unknown mode, or a function of another mode.
     """
-    self._resets: list[Term] = []
+    self.resets: list[Term] = []
     self._intervals: list[Any] = []
     for name, entry in (section or {}).items():
       if entry is None or is_model_field(name, entry):
@@ -323,20 +294,17 @@ class EventManager:
         event.bind(env)
         self._intervals.append((event, term.options.enabled))
       elif term.options.enabled:
-        self._resets.append(term)
+        self.resets.append(term)
 
   def start(self, key: jax.Array, env: Any, initial: Any) -> Any:
     """Applies the reset events, in order, to the state that an episode starts with."""
-    for term, k in zip(self._resets, _keys(key, self._resets), strict=True):
+    for term, k in _with_keys(self.resets, key):
       initial = term.func(k, env, initial, **term.params)
     return initial
 
   def reset(self, key: jax.Array, model: Any) -> Info:
     """Returns the entries of `info` of the interval events that an episode starts with."""
-    info: Info = {}
-    for (event, _), k in zip(self._intervals, _keys(key, self._intervals), strict=True):
-      info |= event.reset(k, model)
-    return info
+    return _union(event.reset(k, model) for (event, _), k in _with_keys(self._intervals, key))
 
   def step(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
     """Returns the physics after the interval events, and `info`."""
@@ -348,5 +316,10 @@ class EventManager:
     return data, changed
 
 
-def _keys(key: jax.Array, terms: list[Any]) -> Any:
-  return jax.random.split(key, len(terms)) if terms else []
+def _with_keys(terms: list[Any], key: jax.Array) -> Iterable[tuple[Any, jax.Array]]:
+  """Each term with a random key of its own."""
+  return zip(terms, jax.random.split(key, len(terms)) if terms else (), strict=True)
+
+
+def _union(parts: Iterable[Info]) -> Info:
+  return {name: value for part in parts for name, value in part.items()}

@@ -118,7 +118,7 @@ def feet_velocity(c: LeggedContext) -> jax.Array:
 
 def feet_pos(c: LeggedContext) -> jax.Array:
   """Positions of the feet in the base frame, m [3 * feet]."""
-  return c.robot.feet_pos(c.data).ravel()
+  return c.robot.foot_sensors(c.data, "foot_pos").ravel()
 
 
 def feet_air_time(c: LeggedContext) -> jax.Array:

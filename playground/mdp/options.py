@@ -3,8 +3,12 @@
 This module imports no JAX: the composition of a configuration checks keys with it.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, NamedTuple
+
+from playground.limits import MOST, Limit, count, span
+
+_STEPS = Limit(0, 1000, whole=True, form="list", length=2, rising=True)
 
 
 class RewardOptions(NamedTuple):
@@ -19,8 +23,8 @@ class RewardOptions(NamedTuple):
   when: Mapping[str, float] | None = None
 
 
-class TerminationOptions(NamedTuple):
-  """A termination term has no keys besides `func` and `params`."""
+class NoOptions(NamedTuple):
+  """Terminations and commands have no keys besides `func` and `params`."""
 
 
 class ObservationOptions(NamedTuple):
@@ -36,14 +40,10 @@ class ObservationOptions(NamedTuple):
   """
 
   noise: Mapping[str, Any] | None = None
-  clip: tuple[float, float] | None = None
-  scale: Any = None
-  delay: tuple[int, int] | None = None
-  history: int = 1
-
-
-class CommandOptions(NamedTuple):
-  """A command term has no keys besides `func` and `params`."""
+  clip: Annotated[Sequence[float], span(-MOST)] | None = None
+  scale: Annotated[float, Limit().each] | None = None
+  delay: Annotated[Sequence[int], _STEPS] | None = None
+  history: Annotated[int, count(1, 1000)] = 1
 
 
 class EventOptions(NamedTuple):
@@ -69,8 +69,8 @@ def is_model_field(name: str, entry: Any) -> bool:
 OPTIONS: dict[str, type] = {
   "rewards": RewardOptions,
   "observations": ObservationOptions,
-  "terminations": TerminationOptions,
-  "commands": CommandOptions,
+  "terminations": NoOptions,
+  "commands": NoOptions,
   "events": EventOptions,
 }
 

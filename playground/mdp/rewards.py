@@ -326,7 +326,7 @@ def feet_distance(c: LeggedContext, minimum: AtLeast0) -> jax.Array:
 
 def feet_contact_force(c: LeggedContext, limit: AtLeast0) -> jax.Array:
   """Sum over feet of max(|F_z| - limit, 0), N, F the force between the foot and its leg."""
-  vertical = jnp.abs(c.robot.feet_force(c.data)[:, 2])
+  vertical = jnp.abs(c.robot.foot_sensors(c.data, "foot_force")[:, 2])
   return jnp.maximum(vertical - limit, 0.0).sum()
 
 

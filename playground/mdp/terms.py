@@ -48,13 +48,15 @@ class Term(NamedTuple):
   """A term whose function is found and whose parameters are checked.
 
   Attributes:
-    name: its key in the config.
+    name: its name in the config.
+    key: its place there, `env.rewards.<name>`.
     func: the function or class.
     params: keyword arguments of `func`.
     options: the other keys of the entry (weight, noise, mode, ...), a NamedTuple of the kind.
   """
 
   name: str
+  key: str
   func: Callable[..., Any]
   params: dict[str, Any]
   options: Any
@@ -120,13 +122,13 @@ def bind_one(kind: str, key: str, name: str, entry: Any, options: type[Options],
     raise ConfigError(f"{key}.func={format_value(given_func)} must be text: a registered function or module:function.")
   func = find(kind, given_func or name, key)
   params = check_params(func, entry.get("params") or {}, f"{key}.params", skip)
-  hints = typing.get_type_hints(options)
+  hints = typing.get_type_hints(options, include_extras=True)
   given = {
     field: _checked(f"{key}.{field}", plain(entry[field]), hints[field])
     for field in fields
     if entry.get(field) is not None
   }
-  return Term(name, func, params, options(**given))
+  return Term(name, key, func, params, options(**given))
 
 
 def find(kind: str, name: str, key: str) -> Callable[..., Any]:
@@ -192,9 +194,12 @@ def _checked(key: str, value: Any, hint: Any) -> Any:
   """Returns a value, whole numbers as floats where the annotation says float; unknown annotations say nothing.
 
   Raises:
+    UnknownNameError: it is none of the names of a `Literal`.
     ConfigError: it is not of the annotated type or outside its `Limit`.
   """
   kinds = [kind for kind in (typing.get_args(hint) if _is_union(hint) else (hint,)) if kind is not type(None)]
+  if typing.get_origin(hint) is typing.Literal and value not in (known := typing.get_args(hint)):
+    raise UnknownNameError(f"{key}={value!r} is unknown: choose from {', '.join(known)}.{nearest(str(value), known)}")
   problems = [_problem(value, kind) for kind in kinds]
   if problems and all(problems):
     raise ConfigError(f"{key}={format_value(value)} must be {' or '.join(dict.fromkeys(map(str, problems)))}.")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from playground.mdp.lookup import lookup
+from playground.errors import lookup
 
 # S(distance; value), with S(0) = 1 and S(1) = value.
 Sigmoid = Callable[[jax.Array, float], jax.Array]

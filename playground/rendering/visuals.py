@@ -6,8 +6,7 @@ from typing import Any
 import mujoco
 
 from playground.envs.base import Env
-from playground.errors import ConfigError, HardwareError
-from playground.mdp.lookup import lookup
+from playground.errors import ConfigError, HardwareError, lookup
 
 # Folder of `playground/robots` -> (robot of Menagerie, its file): bodies have the same names and frames in both.
 MENAGERIE = {

@@ -172,10 +172,9 @@ def test_any_robot_can_be_named() -> None:
     ({"commands.velocity.func": "velocity_wlak"}, r"env\.commands\.velocity: .*Did you mean 'velocity_walk'\?"),
     ({"commands.gait": {"params": {"modes": ["trott"]}}}, r"gait\.params\.modes: 'trott'.*Did you mean 'trot'\?"),
     ({"terminations.falls": {"func": "upvector_belo"}}, r"env\.terminations\.falls: .*Did you mean 'upvector_below'\?"),
-    ({"reward_total": "product_"}, r"env\.reward_total: 'product_' is unknown.*Did you mean 'product'\?"),
     ({"scene.terrain": "flatt"}, r"'flatt' is unknown.*Did you mean 'flat'\?"),
     ({"robot.base_site": "imuu"}, r"the site 'imuu'.*Did you mean 'imu'\?"),
-    ({"robot.sensors.gyro": "gyroo"}, r"the sensor 'gyroo'.*Did you mean 'gyro'\?"),
+    ({"robot.sensors.gyro": "gyroo"}, r"env\.robot\.sensors\.gyro: 'gyroo' is unknown.*Did you mean 'gyro'\?"),
     ({"action_base": "last_targt"}, r"env\.action_base: 'last_targt' is unknown.*Did you mean 'last_target'\?"),
   ],
 )
@@ -183,6 +182,35 @@ def test_unknown_names(overrides: dict[str, Any], message: str) -> None:
   with pytest.raises(UnknownNameError, match=message) as error:
     load_task(TASK, overrides)
   assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+  ("term", "message"),
+  [
+    (
+      {"func": "joint_deviation_l1", "params": {"joints": "kness"}},
+      r"mine\.params\.joints='kness' matches no joint",
+    ),
+    (
+      {"func": "feet_contact", "params": {"feet": ["FX"]}},
+      r"mine\.params\.feet: 'FX' is unknown; choose",
+    ),
+    (
+      {"func": "ang_vel_xy_l2", "params": {"sensor": "gyr"}},
+      r"mine\.params\.sensor: 'gyr' is unknown.* 'gyro'",
+    ),
+    ({"func": "lin_vel_z_l2", "params": {"sensors": ["x_vel"]}}, r"rewards\.mine\.params\.sensors: 'x_vel' is unknown"),
+  ],
+)
+def test_names_in_parameters_are_checked_when_the_task_is_built(term: dict[str, Any], message: str) -> None:
+  with pytest.raises(UnknownNameError, match=message):
+    load_task(TASK, {"rewards.mine": {"weight": 1.0, **term}})
+
+
+def test_a_keyframe_is_checked_when_the_task_is_built() -> None:
+  event = {"mode": "reset", "func": "reset_to_keyframe", "params": {"probability": 1.0, "keyframe": "hom"}}
+  with pytest.raises(UnknownNameError, match=r"params\.keyframe names the key 'hom'.*Did you mean 'home'"):
+    load_task(TASK, {"events.mine": event})
 
 
 def test_joints_are_found_by_group_or_expression() -> None:

@@ -21,6 +21,10 @@ SENSORS = {
 UPRIGHT = SENSORS | {"upvector": jnp.array([0.0, 0.06, 0.998])}
 JOINTS = {".*": [0, 1], "hips": [0, 1], "hip_rolls": [1], "knees": [1]}
 FEET = ("left", "right")
+FOOT_SENSORS = {
+  "foot_force": jnp.array([[900.0, 0, -130.0], [0, 0, 80.0]]),
+  "foot_linvel": jnp.array([[0.3, 0.4, 9.0], [0.0, 0.04, 9.0]]),
+}
 
 
 def context(
@@ -46,7 +50,7 @@ def context(
     qvel=slice(6, None),
     find_joints=lambda group: np.array(JOINTS[group]),
     find_feet=lambda feet: np.array([FEET.index(foot) for foot in feet]),
-    feet_force=lambda data: jnp.array([[900.0, 0, -130.0], [0, 0, 80.0]]),
+    foot_sensors=lambda data, key: FOOT_SENSORS[key],
     touching=lambda data, group: jnp.array([False, True]),
     contact=lambda data: jnp.array(contact),
     default_pose=jnp.array([0.0, -0.75]),
@@ -57,7 +61,6 @@ def context(
     base_site=0,
     feet=np.array([1, 2]),
     sensor=lambda data, key: sensors[key],
-    feet_velocity=lambda data: jnp.array([[0.3, 0.4, 9.0], [0.0, 0.04, 9.0]]),
   )
   physics = {
     "qpos": jnp.array([0, 0, 0.2, 1, 0, 0, 0, 0.2, -0.99]),

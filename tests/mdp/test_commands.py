@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from playground.errors import ConfigError, UnknownNameError
-from playground.mdp.commands import Gait, UniformVelocity, VelocityWalk, swing_height
+from playground.mdp.commands import Gait, UniformVelocity, VelocityWalk, _VelocityCommand, swing_height
 from playground.mdp.legged import LeggedRobot
+from playground.mdp.options import NoOptions
+from playground.mdp.terms import bind
 from tests.mdp.context import context
 
 KEYS = jax.random.split(jax.random.PRNGKey(0), 20_000)
@@ -75,8 +77,17 @@ def test_times_may_be_exponential() -> None:
 def test_refusals() -> None:
   with pytest.raises(ConfigError, match=r"params\.min=\[2\.0, 0, 0\] must not be above"):
     bound(UniformVelocity(MAX, (2.0, 0, 0)))
-  with pytest.raises(ConfigError, match="the three of nonzero_probability must be between 0 and 1"):
-    bound(VelocityWalk(MAX, nonzero_probability=(1.0, 1.0)))
+  with pytest.raises(ConfigError, match=r"velocity\.params\.nonzero_probability=.* must be 3 numbers from 0 to 1"):
+    walk = {"func": "velocity_walk", "params": {"max": MAX, "nonzero_probability": (1.0, 1.0)}}
+    bind("commands", {"velocity": walk}, NoOptions, skip=0)
+
+
+def test_a_velocity_command_says_what_follows_a_command() -> None:
+  class Unfinished(_VelocityCommand):
+    pass
+
+  with pytest.raises(TypeError, match=r"abstract method '?_next"):
+    Unfinished(MAX)  # pyright: ignore[reportAbstractUsage]
 
 
 # Gaits

@@ -236,7 +236,7 @@ def test_frames_are_newest_first_and_begin_with_zeros() -> None:
     ({"history": 0}, r"env\.observations\.state\.joint_pos\.history=0 must be a whole number from 1"),
     ({"delay": [2, 1]}, r"delay=\[2, 1\] must be 2 whole numbers"),
     ({"delay": 2}, r"delay=2 must be 2 whole numbers"),
-    ({"clip": [1]}, r"clip=\[1\.0\] must be 2 numbers"),
+    ({"clip": [1]}, r"clip=\[1\] must be 2 numbers"),
     ({"scale": "big"}, r"scale=big must be a number or a list of numbers"),
     ({"noise": 0.1}, r"noise=0\.1 must have one of the keys uniform, gaussian, same_as"),
     ({"noise": {"unifrm": 0.1}}, r"must have one of the keys uniform"),

@@ -14,7 +14,7 @@ import yaml
 import playground
 from playground import registry
 from playground.errors import ConfigError, UnknownNameError
-from playground.mdp.options import CommandOptions, EventOptions, RewardOptions, is_model_field
+from playground.mdp.options import EventOptions, NoOptions, RewardOptions, is_model_field
 from playground.mdp.rewards import action_rate_l2
 from playground.mdp.terms import MODULES, Term, bind, find, registered
 from playground.trust import trust
@@ -43,7 +43,7 @@ def test_a_terms_name_is_its_functions_name_unless_it_says_another() -> None:
 
 def test_classes_are_named_in_snake_case_and_their_fields_are_parameters() -> None:
   entry = {"func": "uniform_velocity", "params": {"max": [1, 1, 1], "min": None}}
-  (term,) = bind("commands", {"velocity": entry}, CommandOptions, skip=0)
+  (term,) = bind("commands", {"velocity": entry}, NoOptions, skip=0)
   assert term().max == (1, 1, 1)
 
 

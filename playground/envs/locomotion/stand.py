@@ -1,13 +1,14 @@
 """Stand on some of the feet, handstand and footstand: one task for all robots, composed by config."""
 
+import re
 from collections.abc import Iterable
 from typing import Any
 
 import mujoco
 
 from playground.envs.locomotion.legged import LeggedTask
+from playground.errors import lookup
 from playground.mdp.legged import LeggedRobot
-from playground.mdp.lookup import lookup
 from playground.robots.scene import add_floor_contacts
 
 
@@ -42,7 +43,7 @@ class Stand(LeggedTask):
 
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> LeggedRobot:
     robot = super().make_robot(mj_model, config)
-    robot.add_joint_group("lifted_legs", self.lifted_joints)
+    robot.joint_groups["lifted_legs"] = [re.escape(joint) for joint in self.lifted_joints]
     robot.add_contact_group("leg_contact", [f"{geom}_floor_found" for geom in self.leg_geoms])
     return robot
 

@@ -23,7 +23,7 @@ def roll_pitch(c: LeggedContext) -> jax.Array:
   return jnp.array([jnp.arctan2(y, z), jnp.arctan2(-x, jnp.sqrt(y**2 + z**2))])
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Wind:
   """Blows on the base with a horizontal force, drawn at every reset.
 
@@ -35,7 +35,7 @@ class Wind:
 
   def bind(self, env: Any) -> None:
     """Looks up the body, once."""
-    object.__setattr__(self, "_body", env.robot.root)
+    self.body: int = env.robot.root
 
   def reset(self, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     """Returns the entries of `info` that an episode starts with."""
@@ -45,5 +45,4 @@ class Wind:
 
   def step(self, data: PhysicsData, info: dict[str, Any]) -> tuple[PhysicsData, dict[str, Any]]:
     """Returns the physics that the control step begins with, and the entries of `info` that change."""
-    body: int = self._body  # pyright: ignore[reportAttributeAccessIssue]
-    return data.replace(xfrc_applied=data.xfrc_applied.at[body, :3].set(info["wind"])), {}
+    return data.replace(xfrc_applied=data.xfrc_applied.at[self.body, :3].set(info["wind"])), {}
