@@ -36,7 +36,7 @@ from mujoco.mjx._src.math import quat_mul, rotate
 from playground.config.text import format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.events import ModelField
-from playground.mdp.options import MODEL_FIELD, EventOptions, is_model_field
+from playground.mdp.options import MODEL_FIELD, is_model_field
 from playground.mdp.terms import bind_one
 
 # Whose rows a field has, by the prefix of its name: object type and number of objects.
@@ -172,7 +172,7 @@ def model_fields(events: Mapping[str, Any] | None, mode: str = "startup") -> dic
     if entry is None or not is_model_field(name, entry):
       continue
     key = f"env.events.{name}"
-    term = bind_one("events", key, name, entry, EventOptions)
+    term = bind_one("events", key, name, entry)
     if term.options.mode not in ("startup", "reset"):
       raise ConfigError(f"{key}.mode={term.options.mode} must be startup or reset: func {MODEL_FIELD} has these two.")
     field = term()

@@ -12,7 +12,7 @@ from rich.text import Text
 from playground import registry
 from playground.config import RunConfig, compose, format_value
 from playground.errors import ConfigError
-from playground.mdp.options import EventOptions, is_model_field
+from playground.mdp.options import is_model_field
 
 if TYPE_CHECKING:
   from playground.envs.base import Env
@@ -157,7 +157,7 @@ def _events(events: Mapping[str, Any] | None) -> Iterator[Row]:
   for name, entry in (events or {}).items():
     if entry is None:
       continue
-    term = bind_one("events", f"env.events.{name}", name, entry, EventOptions, skip=3)
+    term = bind_one("events", f"env.events.{name}", name, entry)
     enabled = {"mode": term.options.mode, "enabled": "" if term.options.enabled else "no"}
     if is_model_field(name, entry):
       drawn = term().describe()

@@ -64,9 +64,7 @@ class Env(abc.ABC):
     """Sets the time step and puts the model on the device.
 
     Args:
-      config: the task's ConfigDict: `ctrl_dt`, `sim_dt` in seconds, `episode_length` in control steps, `action_repeat`,
-        `impl` (auto, jax, warp), `cuda_impl` (what auto means on an NVIDIA GPU), `naconmax_per_env`,
-        `naccdmax_per_env` and `njmax` (Warp's buffer sizes, see `Physics`).
+      config: the task's ConfigDict: `ctrl_dt` and `sim_dt`, s, and `playground.envs.options.EnvConfig`.
       mj_model: the compiled model.
 
     Raises:
@@ -83,14 +81,8 @@ class Env(abc.ABC):
     mj_model.opt.timestep = self.sim_dt
     self.mj_model = mj_model
     self.impl = choose_impl(config.impl, config.cuda_impl, sees(config))
-    self.physics = Physics(
-      mj_model,
-      impl=self.impl,
-      derived=self.derived,
-      naconmax_per_env=config.naconmax_per_env,
-      naccdmax_per_env=config.naccdmax_per_env,
-      njmax=config.njmax,
-    )
+    buffers = {name: config[name] for name in ("naconmax_per_env", "naccdmax_per_env", "njmax")}
+    self.physics = Physics(mj_model, impl=self.impl, derived=self.derived, **buffers)
 
   @abc.abstractmethod
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
@@ -117,12 +109,10 @@ class Env(abc.ABC):
 
   def model_of(self, info: Mapping[str, Any], model: mjx.Model | None) -> mjx.Model:
     """Returns the model that a step simulates: `model` if given (a randomised one), else the task's own."""
-    del info
     return self.mjx_model if model is None else model
 
   def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
     """Returns `info` with what a new episode draws, for an auto-reset, which starts it from a stored state."""
-    del key
     return info
 
   @property
@@ -174,12 +164,7 @@ def newest_picture(env: Env, obs: Observation) -> jax.Array | None:
 
 
 def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
-  """Resolves `impl: auto` to the backend that was measured faster on this kind of device.
-
-  Args:
-    impl: auto, jax or warp.
-    cuda_impl: what auto means on an NVIDIA GPU.
-    renders: whether the task sees through a camera, which only Warp renders.
+  """Resolves `impl: auto`; `renders` is whether the task sees through a camera, which only Warp renders.
 
   Raises:
     ConfigError: unknown name, Warp asked for where it is not installed or cannot run, or another asked to render.

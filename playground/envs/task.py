@@ -60,8 +60,7 @@ class Task(Env):
     """Compiles the scene and binds the terms.
 
     Args:
-      config: the task's ConfigDict: that of `Env`, and `rewards`, `observations`, `terminations`, `commands`, `events`,
-        `reward_total` (sum or product), `reward_clip`, `noise_level`, `observation_frames` and `observation_order`.
+      config: the task's ConfigDict: that of `Env`, `observations` and `playground.envs.options.TermsConfig`.
       spec: the scene.
 
     Raises:
@@ -104,7 +103,6 @@ class Task(Env):
 
   def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
     """Returns the state that reset events change: by default that of the robot's keyframe at rest."""
-    del key, model
     return InitialState(self.robot.init_qpos, jnp.zeros(self.mj_model.nv))
 
   @abc.abstractmethod
@@ -113,25 +111,22 @@ class Task(Env):
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     """Returns what the task carries besides actions, commands and events at the start of an episode."""
-    del data, key, model
     return {}
 
   def next_info(self, c: StepContext, key: jax.Array) -> dict[str, Any]:
     """Returns the entries of `info` that the task itself changes in a step."""
-    del c, key
     return {}
 
   def measure(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns metrics of how well the task is done, in units that people use."""
-    del c
     return {}
 
   def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:
     """Returns the physics of a start state, after a forward pass."""
     ctrl = self.rest_ctrl(initial) if initial.ctrl is None else initial.ctrl
-    mocap = {name: getattr(initial, name) for name in ("mocap_pos", "mocap_quat")}
-    fields = {name: value for name, value in mocap.items() if value is not None}
-    return self.physics.forward(model, self.physics.make(qpos=initial.qpos, qvel=initial.qvel, ctrl=ctrl, **fields))
+    fields = {"qpos": initial.qpos, "qvel": initial.qvel, "ctrl": ctrl}
+    fields |= {"mocap_pos": initial.mocap_pos, "mocap_quat": initial.mocap_quat}
+    return self.physics.forward(model, self.physics.make(**{k: v for k, v in fields.items() if v is not None}))
 
   def model_of(self, info: Mapping[str, Any], model: mjx.Model | None) -> mjx.Model:
     model = super().model_of(info, model)
@@ -176,15 +171,15 @@ class Task(Env):
 
     `reward_total: product` multiplies the sum of the terms of positive weight by exp(0.2 * the sum of the others).
     """
+    add = lambda values: sum(values, jnp.zeros(()))
     if self._reward_total == "product":
       gains, costs = (
-        sum((rewards[t.name] for t in self.rewards.terms if (t.options.weight > 0) == positive), jnp.zeros(()))
+        add(rewards[t.name] for t in self.rewards.terms if (t.options.weight > 0) == positive)
         for positive in (True, False)
       )
-      reward = gains * jnp.exp(0.2 * costs)
+      reward = gains * jnp.exp(0.2 * costs) * self.dt
     else:
-      reward = sum(rewards.values(), jnp.zeros(()))
-    reward = reward * self.dt
+      reward = add(rewards.values()) * self.dt
     return jnp.clip(reward, *self._reward_clip) if self._reward_clip else reward
 
   def _metrics(self, c: StepContext, rewards: Mapping[str, jax.Array]) -> dict[str, jax.Array]:

@@ -92,7 +92,6 @@ class UniformVelocity(_VelocityCommand):
     return jnp.where(jnp.abs(command) < self.deadband, 0.0, command)
 
   def _next(self, key: jax.Array, command: jax.Array) -> jax.Array:
-    del command
     return self._first(key)
 
 
@@ -159,7 +158,6 @@ class Gait:
     return info
 
   def step(self, c: StepContext, key: jax.Array) -> Info:
-    del key
     phase = c.info["phase"]
     if self.rest_when_still:
       phase = jnp.where((phase == _AT_REST).all(), self._phases[c.info["gait"]], phase)

@@ -29,14 +29,12 @@ _MOMENTS = {"normal": ("mean", "std"), "bernoulli": ("mean",)}  # parameters of 
 
 def reset_root_xy(key: jax.Array, env: "Task", initial: "InitialState", distance: AtLeast0) -> "InitialState":
   """Moves the root by U[-distance, distance) along x and y, m."""
-  del env
   shift = jax.random.uniform(key, (2,), minval=-distance, maxval=distance)
   return initial.replace(qpos=initial.qpos.at[:2].add(shift))
 
 
 def reset_root_yaw(key: jax.Array, env: "Task", initial: "InitialState", angle: AtLeast0) -> "InitialState":
   """Turns the root about the vertical by U[-angle, angle), rad."""
-  del env
   yaw = jax.random.uniform(key, minval=-angle, maxval=angle)
   turn = axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), yaw)
   return initial.replace(qpos=initial.qpos.at[3:7].set(quat_mul(turn, initial.qpos[3:7])))
@@ -44,7 +42,6 @@ def reset_root_yaw(key: jax.Array, env: "Task", initial: "InitialState", angle: 
 
 def reset_root_velocity(key: jax.Array, env: "Task", initial: "InitialState", speed: AtLeast0) -> "InitialState":
   """Draws the root's velocity: six numbers U[-speed, speed), m/s and rad/s."""
-  del env
   velocity = jax.random.uniform(key, (6,), minval=-speed, maxval=speed)
   return initial.replace(qvel=initial.qvel.at[:6].set(velocity))
 
@@ -309,7 +306,6 @@ class PushBySettingVelocity:
     self.dt: float = env.dt
 
   def reset(self, key: jax.Array, model: mjx.Model) -> Info:
-    del model
     return {
       "push": jnp.zeros(2),
       "push_step": jnp.zeros((), jnp.int32),

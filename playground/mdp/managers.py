@@ -13,7 +13,7 @@ from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 from playground.limits import at_least_0
 from playground.mdp import delays
 from playground.mdp.context import StepContext
-from playground.mdp.options import EventOptions, NoOptions, ObservationOptions, RewardOptions, is_model_field
+from playground.mdp.options import ObservationOptions, is_model_field
 from playground.mdp.terms import Term, bind, bind_one
 
 ACTOR = "state"  # the observation group that the policy reads: noisy; the other groups are exact
@@ -31,7 +31,7 @@ class RewardManager:
     Raises:
       ConfigError, UnknownNameError: see `terms.bind`; also a condition or weight that is invalid.
     """
-    terms = bind("rewards", section, RewardOptions)
+    terms = bind("rewards", section)
     for term in terms:
       for name, value in (term.options.when or {}).items():
         key = f"{term.key}.when.{name}"
@@ -58,7 +58,7 @@ class TerminationManager:
 
   def __init__(self, section: Mapping[str, Any]):
     """Binds `env.terminations`; raises as `terms.bind`."""
-    self.terms = bind("terminations", section, NoOptions)
+    self.terms = bind("terminations", section)
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns whether each term ends the episode, by name, each a bool of shape []."""
@@ -200,7 +200,7 @@ def _bind_observation(group: str, name: str, entry: Any, noisy: list[str]) -> Te
   key = f"env.observations.{group}.{name}"
   if group != ACTOR and name == ACTOR and not dict(entry.items() if hasattr(entry, "items") else {"func": entry}):
     return Term(name, key, lambda c: None, {}, ObservationOptions())
-  term = bind_one("observations", key, name, entry, ObservationOptions)
+  term = bind_one("observations", key, name, entry)
   if term.options.noise is None:
     return term
   if (
@@ -249,7 +249,7 @@ class CommandManager:
 
   def __init__(self, section: Mapping[str, Any], env: Any):
     """Binds `env.commands` and builds each generator with its parameters; raises as `terms.bind`."""
-    self.terms = bind("commands", section, NoOptions, skip=0)
+    self.terms = bind("commands", section)
     self._generators = [term() for term in self.terms]
     for generator in self._generators:
       generator.bind(env)
@@ -283,7 +283,7 @@ class EventManager:
     for name, entry in (section or {}).items():
       if entry is None or is_model_field(name, entry):
         continue
-      term = bind_one("events", f"env.events.{name}", name, entry, EventOptions, skip=3)
+      term = bind_one("events", f"env.events.{name}", name, entry)
       if term.options.mode not in ("reset", "interval"):
         raise ConfigError(f"env.events.{name}.mode={term.options.mode}: only func model_field has the mode startup.")
       if isinstance(term.func, type) != (term.options.mode == "interval"):

@@ -33,7 +33,6 @@ def is_alive(c: StepContext) -> jax.Array:
 
 def constant(c: StepContext) -> jax.Array:
   """1 in every step."""
-  del c
   return jnp.ones(())
 
 

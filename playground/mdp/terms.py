@@ -21,12 +21,13 @@ import re
 import types
 import typing
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from playground.config.moved import renamed_function
 from playground.config.text import format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.limits import Limit
+from playground.mdp.options import OPTIONS, keys
 from playground.trust import trusted_object
 
 # Modules whose public functions and classes are the registered terms of a kind.
@@ -41,7 +42,8 @@ MODULES = {
   "commands": ("playground.mdp.commands",),
   "events": ("playground.mdp.events", "playground.mdp.arm_events"),
 }
-Options = TypeVar("Options", bound=tuple)
+# How many leading arguments of a function are no parameters: the context; key, task and state of reset events.
+_LEADING = {"rewards": 1, "observations": 1, "terminations": 1, "commands": 0, "events": 3}
 
 
 class Term(NamedTuple):
@@ -83,49 +85,43 @@ def registered(kind: str) -> dict[str, Callable[..., Any]]:
   return found
 
 
-def bind(kind: str, section: Mapping[str, Any] | None, options: type[Options], *, skip: int = 1) -> list[Term]:
+def bind(kind: str, section: Mapping[str, Any] | None) -> list[Term]:
   """Binds the terms of a section, in its order; null entries are left out.
 
   Args:
     kind: a key of `MODULES`, and of `env` in the config.
     section: entry by term name.
-    options: NamedTuple of the keys that an entry may have besides `func` and `params`.
-    skip: how many leading arguments of the function are not parameters (the context, say).
 
   Raises:
     UnknownNameError: a key, function or parameter that does not exist.
     ConfigError: an entry that is no mapping, a missing key or parameter, or a value of the wrong type.
   """
-  return [
-    bind_one(kind, f"env.{kind}.{name}", name, entry, options, skip)
-    for name, entry in (section or {}).items()
-    if entry is not None
-  ]
+  entries = {name: entry for name, entry in (section or {}).items() if entry is not None}
+  return [bind_one(kind, f"env.{kind}.{name}", name, entry) for name, entry in entries.items()]
 
 
-def bind_one(kind: str, key: str, name: str, entry: Any, options: type[Options], skip: int = 1) -> Term:
+def bind_one(kind: str, key: str, name: str, entry: Any) -> Term:
   """Binds one term; `key` is its place in the config. See `bind`."""
   if not hasattr(entry, "items"):
     raise ConfigError(f"{key}={entry!r} is no mapping such as {{func: {name}, params: {{}}}}.")
   entry = dict(entry.items())
-  fields: tuple[str, ...] = options._fields  # pyright: ignore[reportAttributeAccessIssue]
-  required = [field for field in fields if field not in options._field_defaults]  # pyright: ignore[reportAttributeAccessIssue]
-  known = ("func", "params", *fields)
+  options: Any = OPTIONS[kind]
+  known = keys(kind)
   for field in entry:
     if field not in known:
       raise UnknownNameError(f"{key}.{field} does not exist: a term has {', '.join(known)}.{nearest(field, known)}")
-  for field in required:
-    if entry.get(field) is None:
+  for field in options._fields:
+    if field not in options._field_defaults and entry.get(field) is None:
       raise ConfigError(f"{key}.{field} is missing: every term of env.{kind} has one.")
   given_func = entry.get("func")
   if given_func is not None and not isinstance(given_func, str):
     raise ConfigError(f"{key}.func={format_value(given_func)} must be text: a registered function or module:function.")
   func = find(kind, given_func or name, key)
-  params = check_params(func, entry.get("params") or {}, f"{key}.params", skip)
+  params = check_params(func, entry.get("params") or {}, f"{key}.params", _LEADING[kind])
   hints = typing.get_type_hints(options, include_extras=True)
   given = {
     field: _checked(f"{key}.{field}", plain(entry[field]), hints[field])
-    for field in fields
+    for field in options._fields
     if entry.get(field) is not None
   }
   return Term(name, key, func, params, options(**given))
@@ -154,7 +150,7 @@ def find(kind: str, name: str, key: str) -> Callable[..., Any]:
 
 
 def check_params(func: Callable[..., Any], given: Any, key: str, skip: int = 1) -> dict[str, Any]:
-  """Returns a function's keyword arguments as plain values; null is the argument's default.
+  """Returns keyword arguments of a function, after its first `skip`, as plain values; null is the argument's default.
 
   Raises:
     UnknownNameError: an argument that the function does not have.

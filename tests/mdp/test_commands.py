@@ -11,7 +11,6 @@ import pytest
 from playground.errors import ConfigError, UnknownNameError
 from playground.mdp.commands import Gait, UniformVelocity, VelocityWalk, _VelocityCommand, swing_height
 from playground.mdp.legged import LeggedRobot
-from playground.mdp.options import NoOptions
 from playground.mdp.terms import bind
 from tests.mdp.context import context
 
@@ -79,7 +78,7 @@ def test_refusals() -> None:
     bound(UniformVelocity(MAX, (2.0, 0, 0)))
   with pytest.raises(ConfigError, match=r"velocity\.params\.nonzero_probability=.* must be 3 numbers from 0 to 1"):
     walk = {"func": "velocity_walk", "params": {"max": MAX, "nonzero_probability": (1.0, 1.0)}}
-    bind("commands", {"velocity": walk}, NoOptions, skip=0)
+    bind("commands", {"velocity": walk})
 
 
 def test_a_velocity_command_says_what_follows_a_command() -> None:

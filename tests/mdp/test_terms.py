@@ -14,14 +14,14 @@ import yaml
 import playground
 from playground import registry
 from playground.errors import ConfigError, UnknownNameError
-from playground.mdp.options import EventOptions, NoOptions, RewardOptions, is_model_field
+from playground.mdp.options import RewardOptions, is_model_field
 from playground.mdp.rewards import action_rate_l2
 from playground.mdp.terms import MODULES, Term, bind, find, registered
 from playground.trust import trust
 
 
 def rewards(section: Any) -> list[Term]:
-  return bind("rewards", section, RewardOptions)
+  return bind("rewards", section)
 
 
 def test_a_terms_name_is_its_functions_name_unless_it_says_another() -> None:
@@ -43,7 +43,7 @@ def test_a_terms_name_is_its_functions_name_unless_it_says_another() -> None:
 
 def test_classes_are_named_in_snake_case_and_their_fields_are_parameters() -> None:
   entry = {"func": "uniform_velocity", "params": {"max": [1, 1, 1], "min": None}}
-  (term,) = bind("commands", {"velocity": entry}, NoOptions, skip=0)
+  (term,) = bind("commands", {"velocity": entry})
   assert term().max == (1, 1, 1)
 
 
@@ -89,7 +89,7 @@ def test_refusals(entry: Any, message: str) -> None:
 
 def test_events_need_a_mode() -> None:
   with pytest.raises(ConfigError, match=r"env\.events\.reset_root_xy\.mode is missing"):
-    bind("events", {"reset_root_xy": {"params": {"distance": 1.0}}}, EventOptions, skip=3)
+    bind("events", {"reset_root_xy": {"params": {"distance": 1.0}}})
 
 
 def test_functions_of_other_packages_are_trusted_by_name_only(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,3 +190,10 @@ def test_a_task_inherits_from_one_family_at_most_and_that_from_none() -> None:
 
 def test_no_term_weighs_nothing() -> None:
   assert [(t, name) for t in registry.names() for name, term in entries(t, "rewards") if not term["weight"]] == []
+
+
+@pytest.mark.parametrize("robot", ["Go1", "G1", "T1", "BerkeleyHumanoid"])
+def test_a_robot_walks_on_rough_ground_as_on_flat_ground_but_for_the_ground(robot: str) -> None:
+  flat, rough = (read(f"{robot}Joystick{terrain}Terrain")[1] for terrain in ("Flat", "Rough"))
+  differ = {key for key in flat | rough if flat.get(key) != rough.get(key)}
+  assert "scene" in differ <= {"scene", "cuda_impl", "naconmax_per_env", "njmax"}
