@@ -109,7 +109,7 @@ class _Rows(View):
     folder = self._sweep.folder(job)
     if folder.run.status.get("reason"):
       return state.reason
-    lines = folder.log.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = folder.log.read_text(encoding="utf-8", errors="replace").splitlines()[1:]  # the first is the worker's own
     return "\n".join([state.reason, *[line for line in lines if line.strip() and not line.startswith(ROW)][-TAIL:]])
 
 

@@ -172,39 +172,37 @@ class JobFolder:
       return None, None
 
 
+@dataclasses.dataclass
 class SweepDirectory:
-  """A sweep on disk. Get one from `create` or `open`."""
+  """A sweep on disk. Get one from `create` or `open`.
 
-  def __init__(self, path: str | Path, content: dict[str, Any]):
-    self.path = Path(path)
-    self._content = content
-    self.jobs = [Job(**job) for job in content["jobs"]]
+  Attributes:
+    path: its folder.
+    name: of the sweep.
+    command: the command line, for people.
+    settings: the overrides of the sweep itself.
+    lines: the overrides that its jobs are made of.
+    jobs: its jobs.
+    cwd: where it was started: relative paths in overrides are from there.
+    created: when (ISO 8601).
+  """
+
+  path: Path
+  name: str
+  command: list[str]
+  settings: list[str]
+  lines: list[str]
+  jobs: list[Job]
+  cwd: Path
+  created: str = ""
 
   @classmethod
   def create(
     cls, path: str | Path, name: str, command: Sequence[str], settings: Sequence[str], lines: Sequence[str],
     jobs: Sequence[Job],
   ) -> "SweepDirectory":  # fmt: skip
-    """Makes the folder and writes sweep.yaml.
-
-    Args:
-      path: the folder.
-      name: the sweep's.
-      command: the command line, to be read by people.
-      settings: the overrides that say how it is run.
-      lines: the overrides that its jobs are made of.
-      jobs: those.
-    """
-    content = {
-      "name": name,
-      "created": now(),
-      "cwd": str(Path.cwd()),
-      "command": list(command),
-      "settings": list(settings),
-      "lines": list(lines),
-      "jobs": [dataclasses.asdict(job) for job in jobs],
-    }
-    sweep = cls(path, content)
+    """Makes the folder and writes sweep.yaml; see the attributes. Raises CheckpointError where it cannot be written."""
+    sweep = cls(Path(path), name, list(command), list(settings), list(lines), list(jobs), Path.cwd(), now())
     try:
       sweep.path.mkdir(parents=True, exist_ok=True)
       sweep._write()
@@ -224,30 +222,9 @@ class SweepDirectory:
     try:
       content = yaml.safe_load(file.read_text(encoding="utf-8"))
       _check(content)
+      return cls(path, **content | {"jobs": [Job(**job) for job in content["jobs"]], "cwd": Path(content["cwd"])})
     except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
       raise CheckpointError(f"{file} is damaged: {first_line(error)}.") from None
-    return cls(path, content)
-
-  @property
-  def name(self) -> str:
-    return self._content["name"]
-
-  @property
-  def cwd(self) -> Path:
-    """Where it was started: relative paths in overrides are from there."""
-    return Path(self._content["cwd"])
-
-  @property
-  def command(self) -> list[str]:
-    return self._content["command"]
-
-  @property
-  def settings(self) -> list[str]:
-    return self._content["settings"]
-
-  @property
-  def lines(self) -> list[str]:
-    return self._content["lines"]
 
   @property
   def group(self) -> str:
@@ -269,7 +246,6 @@ class SweepDirectory:
   def add(self, job: Job) -> None:
     """Another job, of a search."""
     self.jobs.append(job)
-    self._content["jobs"].append(dataclasses.asdict(job))
     self._write()
 
   @contextlib.contextmanager
@@ -284,7 +260,9 @@ class SweepDirectory:
       yield
 
   def _write(self) -> None:
-    write_text(self.path / "sweep.yaml", yaml.safe_dump(self._content, sort_keys=False, allow_unicode=True))
+    content = dataclasses.asdict(self) | {"cwd": str(self.cwd)}
+    del content["path"]
+    write_text(self.path / "sweep.yaml", yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
 def _check(content: Any) -> None:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from playground.benchmark.gate import Limit, Options, Pair, judge, measure, run
+from playground.benchmark.gate import Limit, Options, judge, measure, run
+from playground.benchmark.gate.checks import Pair
 from playground.config.files import shipped
 from playground.errors import ConfigError, UnknownNameError
 

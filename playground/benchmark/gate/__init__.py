@@ -12,15 +12,15 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from playground.benchmark.arguments import check_amounts, option
 from playground.config.files import shipped
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.runs.files import need_folder, write_text
 
-Timed = Callable[[], Any]  # does its work and waits for it
-Pair = tuple[Timed, Timed]  # ours and the reference, both compiled
+if TYPE_CHECKING:
+  from playground.benchmark.gate.checks import Pair, Timed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +75,7 @@ def run(options: Options) -> int:
   return 0
 
 
-def judge(checks: Mapping[str, Callable[[], Pair]], limits: Mapping[str, Limit], repeats: int) -> int:
+def judge(checks: "Mapping[str, Callable[[], Pair]]", limits: Mapping[str, Limit], repeats: int) -> int:
   """Compares checks with their limits; a ratio above its limit must show a second time. Returns the exit code."""
   slow = []
   if new := next((name for name in checks if name not in limits), None):
@@ -93,14 +93,14 @@ def judge(checks: Mapping[str, Callable[[], Pair]], limits: Mapping[str, Limit],
   return 1 if slow else 0
 
 
-def measure(pair: Pair, repeats: int) -> float:
+def measure(pair: "Pair", repeats: int) -> float:
   """Median over turns of the time that ours takes as a multiple of the reference's, one right after the other."""
   for timed in pair:
     timed()
   return statistics.median(_seconds(pair[0]) / _seconds(pair[1]) for _ in range(repeats))
 
 
-def _seconds(timed: Timed) -> float:
+def _seconds(timed: "Timed") -> float:
   """Processor time of all threads of this process: what others do on the machine is hardly in it."""
   begin = time.process_time()
   timed()

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from playground import registry
-from playground.benchmark.gate import Pair
 from playground.config import compose
 from playground.envs.physics import mjx
 from playground.envs.wrappers import wrap_for_training
@@ -18,6 +17,8 @@ from playground.learning.algorithms import make_learner
 
 jax.config.update("jax_platforms", "cpu")
 
+Timed = Callable[[], Any]  # does its work and waits for it
+Pair = tuple[Timed, Timed]  # ours and the reference, both compiled
 LENGTH = 20  # control steps of one call
 
 
