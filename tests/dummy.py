@@ -11,12 +11,11 @@ from playground.envs.base import Env, State
 from playground.envs.physics import STATE_FIELDS, PhysicsData, mjx
 from playground.envs.wrappers import MAX_VELOCITY
 from playground.hardware.mesh import make_mesh
-from playground.learning.learner import Learner
+from playground.learning.hyperparameters import PPOConfig, SACConfig
 from playground.learning.loop import Metrics
 from playground.learning.networks import NetworkConfig, SoftNetworkConfig
-from playground.learning.ppo import PPO, PPOConfig
 from playground.learning.rollout import Step
-from playground.learning.sac import SAC, SACConfig
+from playground.learning.trainer import Trainer
 
 
 class NoPhysics:
@@ -107,17 +106,15 @@ SMALL_SAC = SACConfig(
 )  # fmt: skip
 
 Config = PPOConfig | SACConfig
-ALGORITHMS: dict[type[Any], type[Any]] = {PPOConfig: PPO, SACConfig: SAC}
 
 
-def point_learner(config: Config, num_devices: int = 1, **events: Any) -> Learner:
-  """The algorithm that a config is of, for the point."""
-  algorithm = ALGORITHMS[type(config)]
-  return algorithm(PointTask(**events), config, make_mesh(num_devices))
+def point_trainer(config: Config, num_devices: int = 1, **events: Any) -> Trainer:
+  """A trainer of the algorithm that a config is of, for the point."""
+  return Trainer(PointTask(**events), config, make_mesh(num_devices))
 
 
 class Recorder:
-  """Hooks that remember, and stop after a number of rows."""
+  """Callbacks that remember, and stop after a number of rows."""
 
   def __init__(self, stop_after: int | None = None):
     self.rows: list[tuple[int, Metrics]] = []

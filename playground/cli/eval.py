@@ -57,7 +57,7 @@ def evaluate_run(
   drawn = drawn_model(env, run.video.visuals)
   need_camera(drawn, camera, "--camera")
   _, model = model_sampler(env, run, 1, count)(run.seed)
-  act = lambda policy, obs, key: trained.learner.act(policy, obs, key, deterministic or None)
+  act = lambda policy, obs, key: trained.trainer.act(policy, obs, key, deterministic or None)
   evaluate = make_evaluator(env, act, count, hardware.mesh, 1 if film else 0)
   scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model)
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}

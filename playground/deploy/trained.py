@@ -40,7 +40,7 @@ def record(trained: Trained, num_envs: int, decisions: int) -> tuple[dict[str, n
     What the actor saw, by entry [num_envs * decisions, ...], what it did, [..., action_size], and a state of one
     environment.
   """
-  batch, networks = wrap_for_training(trained.env), trained.learner.networks
+  batch, networks = wrap_for_training(trained.env), trained.trainer.networks
 
   def decide(state: State, _: None) -> tuple[State, tuple[dict[str, jax.Array], jax.Array]]:
     action, seen = trained.act(state.obs, jax.random.PRNGKey(0), deterministic=True), networks.select(state.obs)
@@ -58,10 +58,10 @@ def record(trained: Trained, num_envs: int, decisions: int) -> tuple[dict[str, n
 def export_policy(trained: Trained, state: State | None = None) -> ExportedPolicy:
   """The policy as a controller has it; `state` is any of one environment (a fresh one if None)."""
   need("deploy", "onnx", "onnxruntime")
-  policy, agent, networks = jax.device_get(trained.policy), trained.config.agent, trained.learner.networks
+  policy, agent, networks = jax.device_get(trained.policy), trained.config.agent, trained.trainer.networks
   params, seen = networks.mlp(policy.params.policy, policy.normalizer if agent.normalize_observations else None)
   inputs = networks.policy_inputs
-  model = policy_graph(params, inputs, agent.network.activation, seen, networks.cnn)
+  model = policy_graph(params, inputs, networks.activation_name, seen, networks.cnn)
   content = model.SerializeToString()
   origin = {
     "run": trained.run_dir.path.absolute().name,

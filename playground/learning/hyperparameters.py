@@ -254,6 +254,11 @@ def config_class(name: str) -> type[AgentConfig]:
   return found
 
 
+def read_config(agent: Any) -> AgentConfig:
+  """Builds the dataclass that an `agent` section (a mapping with `name`) is of; raises as `config_class`."""
+  return config_class(agent["name"]).from_config(agent)
+
+
 def agent_names() -> list[str]:
   """Every `agent.name`: ours, then those of other packages."""
   return [*_BUILT_IN, *(name for name in _entry_points() if name not in _BUILT_IN)]

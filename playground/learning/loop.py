@@ -20,8 +20,9 @@ from playground.collector import uncollected
 from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import agree, several
 from playground.hardware.mesh import divide, put
-from playground.learning.learner import Learner
+from playground.learning.algorithm import Policy
 from playground.learning.rollout import Step
+from playground.learning.trainer import Trainer, TrainState
 
 Metrics = dict[str, float]
 Draw = Callable[[], tuple[ModelFields, ModelFields]]  # randomised models, of the training and of the evaluation
@@ -29,7 +30,7 @@ COMPILER = "compiler"  # name of the threads that compile
 
 
 @dataclasses.dataclass(frozen=True)
-class Mark:
+class ScheduleEvent:
   """A point of the schedule: what happens once `update` training steps are done."""
 
   update: int
@@ -37,7 +38,7 @@ class Mark:
   reset: bool = False
 
 
-def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_updates: int) -> list[Mark]:
+def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_updates: int) -> list[ScheduleEvent]:
   """Divides a run of `num_updates` training steps into calls of at most `max_updates`.
 
   Evaluations lie evenly, the first before training and the last at its end (a single one at the end). Resets of all
@@ -48,21 +49,21 @@ def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_upd
   evals -= set() if num_evals > 1 else {0}
   points = stretches * num_resets_per_eval
   resets = {round(i * num_updates / points) for i in range(1, points)} - {0, num_updates} if points else set()
-  marks, at = [], 0
+  events, at = [], 0
   for stop in sorted(evals | resets | {num_updates}):
-    marks += [Mark(update) for update in range(at + max_updates, stop, max_updates)]
-    marks.append(Mark(stop, stop in evals and num_evals > 0, stop in resets))
+    events += [ScheduleEvent(update) for update in range(at + max_updates, stop, max_updates)]
+    events.append(ScheduleEvent(stop, stop in evals and num_evals > 0, stop in resets))
     at = stop
-  return marks
+  return events
 
 
-def longest_stretch(marks: Sequence[Mark]) -> int:
-  """The most training steps from one fresh start of all environments to the next, or to the end of the run."""
-  starts = [0, *(mark.update for mark in marks if mark.reset), marks[-1].update]
+def longest_stretch(events: Sequence[ScheduleEvent]) -> int:
+  """The most training steps from one reset of all environments to the next, or to the end of the run."""
+  starts = [0, *(event.update for event in events if event.reset), events[-1].update]
   return max(after - before for before, after in itertools.pairwise(starts))
 
 
-class Hooks(Protocol):
+class Callbacks(Protocol):
   """What a run does with what happens; called on a thread of its own while the device works on."""
 
   def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
@@ -81,16 +82,16 @@ class Hooks(Protocol):
     ...
 
   def should_stop(self) -> bool:
-    """Whether to save and leave at the next mark."""
+    """Whether to save and leave at the next event."""
     ...
 
 
 @dataclasses.dataclass
-class Program:
+class CompiledFunctions:
   """What one run executes, and on which models.
 
   Attributes:
-    train, init, reset, copy: see `Learner`.
+    train, init, reset, copy: see `Trainer`.
     evaluate: see `evaluation.make_evaluator`.
     model: randomised model fields of the training environments, each [num_envs, ...].
     eval_model: of the evaluation environments.
@@ -111,33 +112,34 @@ class Program:
   notice: str | None
 
 
-def compile_program(learner: Learner, evaluate: Any, draw: Draw) -> Program:
+def compile_program(trainer: Trainer, evaluate: Any, draw: Draw, policy: Policy | None = None) -> CompiledFunctions:
   """Traces each function once and compiles them side by side, Warp's kernels too, ahead of the first step.
 
   Args:
-    learner: the algorithm.
+    trainer: of the run.
     evaluate: (policy, key, model fields) -> scores, jitted.
     draw: randomised model fields of the training and of the evaluation environments.
+    policy: what a new run starts from, if it has any weights to start from.
   """
   key, count = jax.ShapeDtypeStruct((2,), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
   start = time.perf_counter()
   pool = ThreadPoolExecutor(thread_name_prefix=COMPILER)
-  kernels = learner.env.unwrapped.physics.compile_ahead()
+  kernels = trainer.env.unwrapped.physics.compile_ahead()
   submit = lambda traced: pool.submit(traced.lower().compile)
   try:
     with uncollected():  # tracing makes millions of objects
       model, eval_model = jax.eval_shape(draw)
-      init = learner.init.trace(key, model)
+      init = trainer.init.trace(key, model, policy)
       state = init.out_info
-      train = submit(learner.train.trace(state, model, count))  # first, for it takes XLA longest
+      train = submit(trainer.train.trace(state, model, count))  # first, for it takes XLA longest
       others = [
         submit(init),
-        submit(learner.reset.trace(state, key, model)),
-        submit(evaluate.trace(learner.policy(state), key, eval_model)),
-        submit(learner.copy.trace(state)),
+        submit(trainer.reset.trace(state, key, model)),
+        submit(evaluate.trace(trainer.policy(state), key, eval_model)),
+        submit(trainer.copy.trace(state)),
       ]
       trace_s = time.perf_counter() - start
-      models = divide(draw(), learner.mesh)  # takes seconds, which XLA needs anyway
+      models = divide(draw(), trainer.mesh)  # takes seconds, which XLA needs anyway
       compiled = [future.result() for future in (train, *others)]
     notice = None if kernels is None else kernels.wait()
   finally:
@@ -145,14 +147,14 @@ def compile_program(learner: Learner, evaluate: Any, draw: Draw) -> Program:
       kernels.stop()
     pool.shutdown(wait=False, cancel_futures=True)  # an interrupted run does not wait for its compiler
   compile_s = time.perf_counter() - start - trace_s
-  return Program(*compiled, *models, trace_s=trace_s, compile_s=compile_s, notice=notice)
+  return CompiledFunctions(*compiled, *models, trace_s=trace_s, compile_s=compile_s, notice=notice)
 
 
 @dataclasses.dataclass
-class Done:
-  """What was done up to one mark, on the device."""
+class SegmentResult:
+  """What was done up to one event, on the device."""
 
-  mark: Mark
+  event: ScheduleEvent
   steps: int
   trained: Any = None
   train_s: float = 0.0
@@ -163,104 +165,105 @@ class Done:
 
 
 class Loop:
-  """One run: from a state at some mark of the schedule to its end."""
+  """One run: from a state at some event of the schedule to its end."""
 
   def __init__(
     self,
-    learner: Learner,
-    program: Program,
-    marks: list[Mark],
+    trainer: Trainer,
+    functions: CompiledFunctions,
+    events: list[ScheduleEvent],
     seed: int,
-    hooks: Hooks,
+    callbacks: Callbacks,
     save_every_s: float = 300.0,
   ):
     """Takes what there is to run.
 
     Args:
-      learner: the algorithm.
-      program: its compiled functions, and the models.
-      marks: the schedule.
-      seed: of the run; evaluations and resets draw from it and the mark they belong to, so they do not depend on
+      trainer: of the run.
+      functions: the trainer's, compiled, and the models.
+      events: the schedule.
+      seed: of the run; evaluations and resets draw from it and the event they belong to, so they do not depend on
         where the run was interrupted.
-      hooks: called with rows, states to keep and for whether to stop.
-      save_every_s: a state is kept at every evaluation, and at marks when this long has passed since the last.
+      callbacks: called with rows, states to keep and for whether to stop.
+      save_every_s: a state is kept at every evaluation, and at events when this long has passed since the last.
     """
-    self._learner = learner
-    self._program = program
-    self._marks = marks
-    self._hooks = hooks
+    self._trainer = trainer
+    self._functions = functions
+    self._events = events
+    self._callbacks = callbacks
     self._save_every_s = save_every_s
     self._init_key, self._eval_key, self._reset_key = jax.random.split(jax.random.PRNGKey(seed), 3)
     self.train_s = 0.0  # device time of training alone
     self.first_update_s: float | None = None
 
-  def init(self) -> Any:
-    """The state of a new run."""
-    return self._program.init(self._place(self._init_key), self._program.model)
+  def init(self, policy: Policy | None = None) -> TrainState:
+    """Returns the state of a new run, which starts from a policy (host arrays) if there is one."""
+    placed = None if policy is None else self._trainer.place_policy(policy)
+    return self._functions.init(self._place(self._init_key), self._functions.model, placed)
 
   def run(self, state: Any, update: int | None = None) -> tuple[Any, bool]:
-    """Runs to the end of the schedule, or until the hooks say stop.
+    """Runs to the end of the schedule, or until the callbacks say stop.
 
     Args:
       state: the state to go on from; its buffers are taken over.
-      update: the mark it was saved at, None for a new run.
+      update: the number of training steps after which it was saved, None for a new run.
 
     Returns:
       The last state, and whether the schedule was completed.
     """
-    marks = [mark for mark in self._marks if update is None or mark.update > update]
+    events = [event for event in self._events if update is None or event.update > update]
     at, reported = update or 0, None
     self._last_save = time.perf_counter()
     with ThreadPoolExecutor(1, thread_name_prefix="report") as reports:
-      for mark in marks:
-        state, done = self._work(state, mark, mark.update - at)
-        at = mark.update
+      for event in events:
+        state, done = self._work(state, event, event.update - at)
+        at = event.update
         if reported:
           reported.result()  # one row is in flight; what went wrong with it stops the run here
-        stop = agree(self._hooks.should_stop()) and mark is not marks[-1]
+        stop = agree(self._callbacks.should_stop()) and event is not events[-1]
         if stop:
-          done.snapshot = self._program.copy(state) if several() else state
+          done.snapshot = self._functions.copy(state) if several() else state
         reported = reports.submit(self._report, done)
         if stop:
           break
       if reported:
         reported.result()
-    return state, at == self._marks[-1].update
+    return state, at == self._events[-1].update
 
-  def _work(self, state: Any, mark: Mark, num_updates: int) -> tuple[Any, Done]:
-    """Trains up to a mark and does what it asks for; waits for the numbers, not for resets and copies."""
-    done = Done(mark, num_updates * self._learner.steps_per_update)
+  def _work(self, state: Any, event: ScheduleEvent, num_updates: int) -> tuple[Any, SegmentResult]:
+    """Trains up to an event and does what it asks for; waits for the numbers, not for resets and copies."""
+    done = SegmentResult(event, num_updates * self._trainer.steps_per_update)
     if num_updates:
       start = time.perf_counter()
-      state, done.trained = self._program.train(state, self._program.model, np.int32(num_updates))
+      state, done.trained = self._functions.train(state, self._functions.model, np.int32(num_updates))
       jax.block_until_ready(done.trained)
       done.train_s = time.perf_counter() - start
       self.train_s += done.train_s
       self.first_update_s = self.first_update_s or done.train_s / num_updates
       if done.trained["nonfinite"] > 0:
-        capture = self._program.copy(state).capture if several() else state.capture
-        action_size = self._learner.env.action_size
-        done.captured = jax.device_get(capture).first(state.env_state, action_size, self._program.model)
-    if mark.evaluate:
+        capture = self._functions.copy(state).capture if several() else state.capture
+        action_size = self._trainer.env.action_size
+        done.captured = jax.device_get(capture).first(state.env_state, action_size, self._functions.model)
+    if event.evaluate:
       start = time.perf_counter()
-      policy = self._learner.policy(state)
-      done.evaluated = self._program.evaluate(policy, self._key(self._eval_key, mark), self._program.eval_model)
+      policy = self._trainer.policy(state)
+      done.evaluated = self._functions.evaluate(policy, self._key(self._eval_key, event), self._functions.eval_model)
       jax.block_until_ready(done.evaluated)
       done.eval_s = time.perf_counter() - start
-    if mark.reset:
-      state = self._program.reset(state, self._key(self._reset_key, mark), self._program.model)
+    if event.reset:
+      state = self._functions.reset(state, self._key(self._reset_key, event), self._functions.model)
     late = agree(time.perf_counter() - self._last_save > self._save_every_s)
-    due = late or mark.evaluate or mark is self._marks[-1]
-    if due and mark.update:
+    due = late or event.evaluate or event is self._events[-1]
+    if due and event.update:
       # A copy, because the next training call takes the state's buffers over while this one is written to disk.
-      done.snapshot = self._program.copy(state)
+      done.snapshot = self._functions.copy(state)
       self._last_save = time.perf_counter()
     return state, done
 
-  def _report(self, done: Done) -> None:
-    """Hands finished work to the hooks."""
+  def _report(self, done: SegmentResult) -> None:
+    """Hands finished work to the callbacks."""
     row: Metrics = {}
-    step = done.mark.update * self._learner.steps_per_update
+    step = done.event.update * self._trainer.steps_per_update
     recording = None
     if done.trained is not None:
       report = {k: float(v) for k, v in jax.device_get(done.trained).items()}
@@ -270,12 +273,12 @@ class Loop:
       scores, recording = done.evaluated
       row |= {f"eval/{k}": float(v) for k, v in jax.device_get(scores).items()}
       row["time/eval_s"] = done.eval_s
-    self._hooks.on_metrics(step, row, done.captured, recording)
+    self._callbacks.on_metrics(step, row, done.captured, recording)
     if done.snapshot is not None:
-      self._hooks.on_save(done.mark.update, step, done.snapshot, done.mark is self._marks[-1])
+      self._callbacks.on_save(done.event.update, step, done.snapshot, done.event is self._events[-1])
 
-  def _key(self, key: jax.Array, mark: Mark) -> jax.Array:
-    return self._place(jax.random.fold_in(key, mark.update))
+  def _key(self, key: jax.Array, event: ScheduleEvent) -> jax.Array:
+    return self._place(jax.random.fold_in(key, event.update))
 
   def _place(self, key: jax.Array) -> jax.Array:
-    return put(key, self._learner.mesh, P())
+    return put(key, self._trainer.mesh, P())

@@ -81,7 +81,7 @@ class Actor:
       )
     self.precision = precision
     self.action_size = action_size
-    self.activation = ACTIVATIONS[config.activation]
+    self.activation, self.activation_name = ACTIVATIONS[config.activation], config.activation
     self.policy_obs_key, self.value_obs_key = config.policy_obs_key, config.value_obs_key
     self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key, self.estimated_obs_key} - {""}))
     self.obs_sizes = {key: sizes[key] for key in self.obs_keys}
@@ -236,7 +236,7 @@ class ActorCritic(Actor):
 
 
 class SoftActorCriticParams(struct.PyTreeNode):
-  """What SAC's optimiser changes. The order counts: the critics come first, see `SAC._sgd_step`.
+  """What SAC's optimiser changes. The order counts: the critics come first, see `SAC._learn`.
 
   Attributes:
     q: parameters of the twin critics, each array [2, ...].

@@ -31,14 +31,16 @@ REPLAY_SPEC: Any = Replay(data=P(None, AXIS), inserted=P())  # pyright: ignore[r
 class ReplayBuffer:
   """Puts transitions in and draws them; pure functions on `Replay`, each device on its share of the environments."""
 
-  def __init__(self, max_size: int, num_envs: int, example: Any):
+  def __init__(self, max_size: int, num_envs: int, example: Any, saved: bool = True):
     """Sizes an empty buffer.
 
     Args:
       max_size: transitions at most, rounded down to whole steps of all environments.
       num_envs: environments, over all devices.
       example: one transition, a tree of float32 arrays or their shapes.
+      saved: whether the newest checkpoint holds the transitions; else a resumed run collects them anew.
     """
+    self.max_size, self.saved = max_size, saved
     row, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, jnp.float32), example))
     self.slots, self.num_envs, self.width = max_size // num_envs, num_envs, row.size
     self._ravel = jax.vmap(lambda tree: ravel_pytree(tree)[0])

@@ -14,9 +14,17 @@ from playground.learning.networks import ActorCritic, Normalizer, normalize
 
 
 class Transitions(struct.PyTreeNode):
-  """Steps of N environments, each array [T, N, ...]; see `losses.Batch` for the fields. Observations are raw.
+  """Steps of N environments.
 
-  `final_value` is the critic's value of an episode's last observation where time cut it, else 0; None if not asked for.
+  Attributes:
+    obs: observations the actions were taken on, as the task gives them, each [T, N, ...].
+    raw_action: actions before squashing, [T, N, action_size].
+    log_prob: their log-probability under the policy that took them, [T, N].
+    reward: [T, N], unscaled.
+    termination: 1 where the task ended the episode, [T, N].
+    truncation: 1 where the time limit cut it, [T, N].
+    final_value: the critic's value of an episode's last observation where time cut it, else 0, [T, N]; None if not
+      asked for.
   """
 
   obs: dict[str, jax.Array]
@@ -122,43 +130,74 @@ def episode_sums(state: State) -> EpisodeSums:
   return sums if buffers is None else sums | {"overflows": (buffers.overflow != 0).sum().astype(ended.dtype)}
 
 
-def step_and_see(env: AutoReset, state: State, action: jax.Array, model: ModelFields) -> tuple[State, Observation]:
-  """A step of a batch, and the observation that it made itself: where an episode ended the last one of that episode."""
-  after = AutoReset(env.env, env.full_reset, keep_final_obs=True).step(state, action, model)
-  info = dict(after.info)
-  final_obs = info.pop(FINAL_OBS)  # not carried to the next step
-  return after.replace(info=info), final_obs
+class Environments(struct.PyTreeNode):
+  """A device's share of the environments during one training step.
+
+  Attributes:
+    state: the present state, a batch.
+    capture: the first step that went NaN, infinite or absurd.
+    model: randomised model fields.
+    sums: what ended in this training step so far, see `episode_sums`; {} before its first step.
+    env: what is stepped.
+  """
+
+  state: State
+  capture: NonfiniteCapture
+  model: ModelFields
+  sums: EpisodeSums
+  env: AutoReset = struct.field(pytree_node=False)
+
+  def step(self, action: jax.Array) -> tuple["Environments", Observation]:
+    """Steps each environment once.
+
+    Returns:
+      The environments after it, and the observation that the step itself made: where an episode ended, its last.
+    """
+    after = AutoReset(self.env.env, self.env.full_reset, keep_final_obs=True).step(self.state, action, self.model)
+    info = dict(after.info)
+    final_obs = info.pop(FINAL_OBS)  # not carried to the next step
+    after = after.replace(info=info)
+    capture = self.capture.look(self.state, action, self.model, after)
+    return self._after(after, capture, episode_sums(after)), final_obs
+
+  def scan(
+    self, step: Callable[["Environments", jax.Array], tuple["Environments", Any]], keys: jax.Array
+  ) -> tuple["Environments", Any]:
+    """Does `step(envs, key)` for one key after the other; returns the environments and what it returned, stacked."""
+
+    def body(carry: tuple[State, NonfiniteCapture], key: jax.Array) -> tuple[Any, Any]:
+      envs, out = step(self.replace(state=carry[0], capture=carry[1], sums={}), key)
+      return (envs.state, envs.capture), (out, envs.sums)
+
+    (state, capture), (out, sums) = jax.lax.scan(body, (self.state, self.capture), keys)
+    return self._after(state, capture, jax.tree.map(lambda x: x.sum(axis=0), sums)), out
+
+  def _after(self, state: State, capture: NonfiniteCapture, sums: EpisodeSums) -> "Environments":
+    sums = jax.tree.map(jnp.add, self.sums, sums) if self.sums else sums
+    return self.replace(state=state, capture=capture, sums=sums)
 
 
 def unroll(
-  env: AutoReset,
-  state: State,
-  capture: NonfiniteCapture,
-  model: ModelFields,
+  envs: Environments,
   networks: ActorCritic,
   policy_params: Any,
   normalizer: Normalizer | None,
   key: jax.Array,
   length: int,
   value_params: Any = None,
-) -> tuple[State, NonfiniteCapture, Transitions, EpisodeSums]:
+) -> tuple[Environments, Transitions]:
   """Steps the environments `length` times with sampled actions.
 
   With the critic's parameters it values the last observation of every episode that time cuts, in the steps in which it
   cuts any.
-
-  Returns:
-    The last state, the capture, the transitions and the sums over all steps of what ended.
   """
 
-  def step(carry: tuple[State, NonfiniteCapture], key: jax.Array) -> tuple[Any, tuple[Transitions, EpisodeSums]]:
-    state, capture = carry
-    obs = networks.select(state.obs)
+  def step(envs: Environments, key: jax.Array) -> tuple[Environments, Transitions]:
+    obs = networks.select(envs.state.obs)
     logits = networks.logits(policy_params, normalize(obs, normalizer))
     raw_action = networks.distribution.sample_no_postprocessing(logits, key)
-    action = networks.distribution.postprocess(raw_action)
-    after, final_obs = step_and_see(env, state, action, model)
-    truncation = after.info["truncation"]
+    envs, final_obs = envs.step(networks.distribution.postprocess(raw_action))
+    after, truncation = envs.state, envs.state.info["truncation"]
     final_value = None
     if value_params is not None:
       value = lambda obs: networks.value(value_params, normalize(networks.select(obs), normalizer)) * truncation
@@ -172,27 +211,11 @@ def unroll(
       truncation=truncation,
       final_value=final_value,
     )
-    capture = capture.look(state, action, model, after)
-    return (after, capture), (transitions, episode_sums(after))
+    return envs, transitions
 
-  (state, capture), (transitions, sums) = jax.lax.scan(step, (state, capture), jax.random.split(key, length))
-  return state, capture, transitions, jax.tree.map(lambda x: x.sum(axis=0), sums)
+  return envs.scan(step, jax.random.split(key, length))
 
 
-def repeat_unroll(one: Callable[..., Any], state: State, capture: NonfiniteCapture, keys: jax.Array) -> Any:
-  """Runs `one(state, capture, key)`, an `unroll`, once for each key and lays the trajectories side by side.
-
-  Returns:
-    The last state, the capture, transitions [T, len(keys) * N, ...] with the observations after each trajectory's last
-    step [len(keys) * N, ...], and the sums.
-  """
-
-  def body(carry: tuple[State, NonfiniteCapture], key: jax.Array) -> Any:
-    state, capture, transitions, sums = one(*carry, key)
-    return (state, capture), (transitions, state.obs, sums)
-
-  (state, capture), (transitions, last_obs, sums) = jax.lax.scan(body, (state, capture), keys)
-  side_by_side = lambda x: x.swapaxes(0, 1).reshape(x.shape[1], -1, *x.shape[3:])
-  flat = lambda x: x.reshape(-1, *x.shape[2:])
-  sums = jax.tree.map(lambda x: x.sum(axis=0), sums)
-  return state, capture, jax.tree.map(side_by_side, transitions), jax.tree.map(flat, last_obs), sums
+def side_by_side(x: jax.Array) -> jax.Array:
+  """Stacked trajectories [K, T, N, ...] as [T, K * N, ...]."""
+  return x.swapaxes(0, 1).reshape(x.shape[1], -1, *x.shape[3:])

@@ -19,8 +19,9 @@ from playground.config import in_stage, stage_folders
 from playground.errors import ConfigError
 from playground.hardware.distributed import agree, is_main, noting_loss, share
 from playground.hardware.setup import setup
-from playground.learning.algorithms import make_learner
 from playground.learning.checkpoints import describe
+from playground.learning.hyperparameters import read_config
+from playground.learning.trainer import Trainer
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
 from playground.runs.chain_result import write_result
@@ -101,15 +102,15 @@ def _check(config: "RunConfig") -> None:
       env = registry.load(stage.choices["env"], config=stage.env)
       need_camera(env.mj_model, stage.video.camera, "video.camera")
       Randomizer(env.mj_model, stage.env.events)
-      learner = make_learner(env, stage.agent, hardware.mesh, hardware.network_precision)
-      learner.notices()  # raises for a replay buffer that the device cannot hold
+      trainer = Trainer(env, read_config(stage.agent), hardware.mesh, hardware.network_precision)
+      trainer.notices()  # raises for a replay buffer that the device cannot hold
       size = env.observation_size
       facts: dict[str, Any] = {"agent.name": stage.agent.name, "size of the action": env.action_size}
       facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
-      facts |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(learner.policy_shape())}
+      facts |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(trainer.policy_shape())}
       if before is None and config.init_from is not None:
         start = Start(weights=weights_of(config.init_from))
-        start.restore(learner, stage.agent.name, lambda: ({}, {}))
+        start.restore(trainer, stage.agent.name, lambda: ({}, {}))
       if before is not None:
         _compare(f"env={stage.choices['env']}", facts, *before)
       before = name, facts

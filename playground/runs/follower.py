@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Follower:
-  """The loop's hooks of a process that writes nothing (`learning.loop.Hooks`)."""
+  """The loop's callbacks of a process that writes nothing (`learning.loop.Callbacks`)."""
 
   def __init__(self, config: "RunConfig", env: Env, interrupts: Interrupts, step: int | None):
     self._allowed = config.on_nonfinite.max_fraction

@@ -14,9 +14,9 @@ from playground.envs.base import Env
 from playground.errors import PlaygroundError
 from playground.hardware.mesh import own_share
 from playground.learning.checkpoints import CheckpointStore, checksum
-from playground.learning.learner import Learner
 from playground.learning.loop import Loop, Metrics
 from playground.learning.rollout import Step
+from playground.learning.trainer import Trainer
 from playground.rendering.video import render_video
 from playground.runs.csv_tracker import read_metrics
 from playground.runs.interrupts import Interrupts
@@ -38,14 +38,14 @@ class NonfiniteError(PlaygroundError):
 
 
 class Job:
-  """The loop's hooks for one run directory (`learning.loop.Hooks`)."""
+  """The loop's callbacks for one run directory (`learning.loop.Callbacks`)."""
 
   def __init__(
     self,
     config: "RunConfig",
     run_dir: RunDirectory,
     env: Env,
-    learner: Learner,
+    trainer: Trainer,
     progress: Progress,
     interrupts: Interrupts,
     start: Start,
@@ -55,7 +55,7 @@ class Job:
     self._run_dir = run_dir
     self._env = env
     self._drawn = drawn
-    self._learner = learner
+    self._trainer = trainer
     self._progress = progress
     self._interrupts = interrupts
     # A run that is resumed from the beginning logs all its rows again: step 0 is after "step -1".
@@ -103,7 +103,7 @@ class Job:
     self._rejected += check_updates(metrics, self._config.on_nonfinite.max_fraction, step)
 
   def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
-    policy, rest = self._learner.split(state)
+    policy, rest = self._trainer.split(state)
     meta = {
       "update": update,
       "env": self._config.choices["env"],
@@ -111,7 +111,7 @@ class Job:
       "config": self._config.resolved,
       "columns": self._trackers.columns,
     }
-    experience = None if final else partial(self._learner.experience, state)
+    experience = None if final else partial(self._trainer.experience, state)
     self._store.save(step, policy, rest, meta, experience, self._return)
 
   def should_stop(self) -> bool:
@@ -125,7 +125,7 @@ class Job:
     if wanted and self._recording is not None:
       self._progress.phase("rendering the video")
       self._start_video(self._step, self._recording)
-    policy = self._learner.policy(state)
+    policy = self._trainer.policy(state)
     wall_clock_s = self.wall_clock_s
     if self._video:
       self._video.result()
@@ -189,7 +189,7 @@ class Job:
     if rate is None:
       return
     if not self._rates:
-      after_first = (taken - self._learner.steps_per_update) / rate
+      after_first = (taken - self._trainer.steps_per_update) / rate
       self._start_to_first_update_s = process_age_s() - self._process_began_s - after_first
     self._rates.append(rate)
 

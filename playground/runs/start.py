@@ -12,8 +12,8 @@ from playground import registry
 from playground.errors import CheckpointError
 from playground.hardware.distributed import is_main
 from playground.learning.checkpoints import Checkpoint, DamagedCheckpointError, NoCheckpointError, find_checkpoints
-from playground.learning.learner import Learner
 from playground.learning.loop import Draw
+from playground.learning.trainer import Trainer
 from playground.pretrained import check_task, is_pretrained, locate
 from playground.runs.run_dir import RunDirectory
 
@@ -107,7 +107,7 @@ class Start:
     """Whether the resumed run has nothing left to do."""
     return self.run_dir is not None and self.run_dir.status.get("status") == "finished"
 
-  def restore(self, learner: Learner, name: str, draw: Draw) -> None:
+  def restore(self, trainer: Trainer, name: str, draw: Draw) -> None:
     """Reads what there is to restore, checked against the algorithm and its shapes, before anything is compiled.
 
     Raises:
@@ -119,16 +119,16 @@ class Start:
       theirs = self.weights.meta["config"].get("agent", {}).get("name")
       if theirs != name:
         raise CheckpointError(f"{self.weights.path} was trained by {theirs}: agent={name} cannot start from it.")
-      self.policy = self.weights.restore("policy", learner.policy_shape())
+      self.policy = self.weights.restore("policy", trainer.policy_shape())
       source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
       self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is fresh.")
       return
     model, _ = jax.eval_shape(draw)
-    template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), model)
+    template = jax.eval_shape(trainer.init, jax.random.PRNGKey(0), model, None)
     for path in self.checkpoints:
       try:
         checkpoint = Checkpoint(path)
-        self.state, notice = learner.restore(checkpoint, template)
+        self.state, notice = trainer.restore(checkpoint, template)
       except DamagedCheckpointError as error:
         if path == self.checkpoints[-1]:
           raise

@@ -14,12 +14,11 @@ from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import ending_together, is_main, leave, noting_loss, preflight, share, wait_for_all
 from playground.hardware.scaling import describe_division, scale_envs
 from playground.hardware.setup import Hardware, setup
-from playground.learning.algorithms import algorithm
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
-from playground.learning.hyperparameters import config_class
-from playground.learning.learner import Learner
-from playground.learning.loop import Loop, Mark, compile_program, longest_stretch, schedule
+from playground.learning.hyperparameters import read_config
+from playground.learning.loop import Loop, ScheduleEvent, compile_program, longest_stretch, schedule
+from playground.learning.trainer import Trainer, TrainState
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
 from playground.rendering.visuals import drawn_model
@@ -75,57 +74,57 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
 def _train_locked(config: "RunConfig", interrupts: Interrupts, began_s: float, start: Start, hardware: Hardware) -> int:
   """One run, new or to resume, that no other process writes."""
   preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
-  agent = config_class(config.agent.name).from_config(config.agent)
+  agent = read_config(config.agent)
   agent.check(hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
   need_camera(drawn, config.video.camera, "video.camera")
   draw = partial(model_sampler(env, config, agent.num_envs, agent.num_eval_envs), config.seed)
-  learner = algorithm(config.agent.name)(env, agent, hardware.mesh, hardware.network_precision)
-  start.notices += learner.notices()
+  trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision)
+  start.notices += trainer.notices()
   if hardware.mesh.size > 1:
     start.notices.append(describe_division(config.agent, hardware.mesh.size))
-  start.restore(learner, config.agent.name, draw)
+  start.restore(trainer, config.agent.name, draw)
   preflight(config.hardware, [start.step, start.weights and start.weights.step], "checkpoint")  # one may see it damaged
 
-  num_updates = math.ceil(agent.num_timesteps / learner.steps_per_update)
-  marks = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
-  start.notices += cut_short(agent, env.episode_length, marks, learner.steps_per_update)
+  num_updates = math.ceil(agent.num_timesteps / trainer.steps_per_update)
+  events = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
+  start.notices += cut_short(agent, env.episode_length, events, trainer.steps_per_update)
   num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
-  evaluate = make_evaluator(env, learner.act, agent.num_eval_envs, hardware.mesh, num_recorded)
+  evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, hardware.mesh, num_recorded)
   if not is_main():
     with noting_loss(RunDirectory(share()).note_loss):
-      program = compile_program(learner, evaluate, draw)
+      program = compile_program(trainer, evaluate, draw, start.policy)
       follower = Follower(config, env, interrupts, start.step)
-      loop = Loop(learner, program, marks, config.seed, follower)
-      _, completed = _run(loop, learner, start, interrupts)
+      loop = Loop(trainer, program, events, config.seed, follower)
+      _, completed = _run(loop, start, interrupts)
     return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
   run_dir = start.run_dir or RunDirectory.create(
     str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
   )
   share(str(run_dir.path.absolute()))
-  with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(num_updates * learner.steps_per_update) as progress:
+  with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(num_updates * trainer.steps_per_update) as progress:
     run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=env.impl, **hardware.facts)
     for notice in start.notices:
       progress.print(notice)
     progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
-    program = compile_program(learner, evaluate, draw)
+    program = compile_program(trainer, evaluate, draw, start.policy)
     if program.notice:
       progress.print(program.notice)
     to_compiled_s = process_age_s() - began_s
     timings = {"start_to_compiled_s": to_compiled_s, "trace_s": program.trace_s, "compile_s": program.compile_s}
     run_dir.update_manifest(timings=timings)
 
-    job = Job(config, run_dir, env, learner, progress, interrupts, start, drawn)
+    job = Job(config, run_dir, env, trainer, progress, interrupts, start, drawn)
     with contextlib.closing(job):
-      loop = Loop(learner, program, marks, config.seed, job)
-      state, completed = _run(loop, learner, start, interrupts)
+      loop = Loop(trainer, program, events, config.seed, job)
+      state, completed = _run(loop, start, interrupts)
       job.finish(loop, state, completed)
   _say_where(run_dir)
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
 
 
-def cut_short(agent: Any, episode_length: int, marks: Sequence[Mark], steps_per_update: int) -> list[str]:
+def cut_short(agent: Any, episode_length: int, events: Sequence[ScheduleEvent], steps_per_update: int) -> list[str]:
   """A sentence for the user where fresh starts of all environments leave no time for a whole episode.
 
   They come closer with fewer steps to train: a trial of a tenth of the steps sees a tenth as much of an episode, and
@@ -134,11 +133,11 @@ def cut_short(agent: Any, episode_length: int, marks: Sequence[Mark], steps_per_
   Args:
     agent: the algorithm's settings.
     episode_length: of the task, control steps.
-    marks: of the run.
+    events: of the run.
     steps_per_update: control steps of one training step, over all environments.
   """
-  seen = longest_stretch(marks) * steps_per_update // agent.num_envs
-  if seen >= episode_length or not any(mark.reset for mark in marks):
+  seen = longest_stretch(events) * steps_per_update // agent.num_envs
+  if seen >= episode_length or not any(event.reset for event in events):
     return []
   return [
     f"Training sees the first {seen} of an episode's {episode_length} control steps: then all environments start "
@@ -146,13 +145,11 @@ def cut_short(agent: Any, episode_length: int, marks: Sequence[Mark], steps_per_
   ]
 
 
-def _run(loop: Loop, learner: Learner, start: Start, interrupts: Interrupts) -> tuple[Any, bool]:
+def _run(loop: Loop, start: Start, interrupts: Interrupts) -> tuple[TrainState, bool]:
   """Trains from where the run begins; returns the last state, and whether the schedule was completed."""
   wait_for_all()  # a first exchange waits for half a minute on CPUs: not all compile equally fast
   interrupts.start_saving()
-  state = loop.init() if start.state is None else start.state
-  if start.policy is not None:
-    state = learner.with_policy(state, start.policy)
+  state = loop.init(start.policy) if start.state is None else start.state
   return loop.run(state, start.update)
 
 

@@ -12,9 +12,10 @@ from playground import config as configs
 from playground import registry
 from playground.envs.base import Env
 from playground.hardware.setup import Hardware, setup, this_machine
-from playground.learning.algorithms import make_learner
+from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import Checkpoint
-from playground.learning.learner import Learner, Policy
+from playground.learning.hyperparameters import read_config
+from playground.learning.trainer import Trainer
 from playground.runs.run_dir import RunDirectory
 from playground.runs.start import weights_of
 
@@ -32,7 +33,7 @@ class Trained:
     checkpoint: where the policy is from.
     env: the task, as the run trained it, unless it was asked for otherwise.
     hardware: this machine's devices.
-    learner: the algorithm, whose `act(policy, obs, key, deterministic)` gives actions.
+    trainer: of the algorithm, whose `act(policy, obs, key, deterministic)` gives actions.
     policy: networks and normaliser, on the devices.
   """
 
@@ -41,7 +42,7 @@ class Trained:
   checkpoint: Checkpoint
   env: Env
   hardware: Hardware
-  learner: Learner
+  trainer: Trainer
   policy: Policy
 
   @property
@@ -50,7 +51,7 @@ class Trained:
 
   def act(self, obs: Any, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
     """Actions in [-1, 1], [..., action_size]."""
-    return self.learner.act(self.policy, obs, key, deterministic)
+    return self.trainer.act(self.policy, obs, key, deterministic)
 
   def at(self, path: Path) -> "Trained":
     """The policy of another checkpoint of the run, or of a stage of its chain, with this one's task and configuration.
@@ -59,7 +60,7 @@ class Trained:
       CheckpointError: it is gone or damaged, or its arrays have other shapes.
     """
     checkpoint = Checkpoint(path)
-    policy = self.learner.place_policy(checkpoint.restore("policy", self.learner.policy_shape()))
+    policy = self.trainer.place_policy(checkpoint.restore("policy", self.trainer.policy_shape()))
     return dataclasses.replace(self, run_dir=RunDirectory(path.parents[1]), checkpoint=checkpoint, policy=policy)
 
 
@@ -88,6 +89,6 @@ def load_trained(
   hardware_config.platform = platform or hardware_config.platform
   hardware = setup(hardware_config)
   env = (load_task or registry.load)(config.choices["env"], config.env)
-  learner = make_learner(env, config.agent, hardware.mesh, precision or hardware.network_precision)
-  policy = learner.place_policy(checkpoint.restore("policy", learner.policy_shape()))
-  return Trained(run_dir, config, checkpoint, env, hardware, learner, policy)
+  trainer = Trainer(env, read_config(config.agent), hardware.mesh, precision or hardware.network_precision)
+  policy = trainer.place_policy(checkpoint.restore("policy", trainer.policy_shape()))
+  return Trained(run_dir, config, checkpoint, env, hardware, trainer, policy)

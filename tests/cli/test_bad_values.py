@@ -54,8 +54,8 @@ def cases() -> list[tuple[str, ...]]:
 def built() -> Iterator[None]:
   """Stops each run where it would compile, with its task traced; composes each choice of files once."""
 
-  def stop(learner: Any, evaluate: Any, draw: Any) -> None:
-    env = learner.env.unwrapped
+  def stop(trainer: Any, evaluate: Any, draw: Any) -> None:
+    env = trainer.env.unwrapped
     jax.eval_shape(draw)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jnp.float32))

@@ -17,27 +17,27 @@ from playground.hardware.setup import setup
 TWO_DEVICES = """
 import jax, numpy as np
 from playground.learning.evaluation import make_evaluator
-from tests.dummy import SMALL_PPO, SMALL_SAC, PointTask, point_learner
+from tests.dummy import SMALL_PPO, SMALL_SAC, PointTask, point_trainer
 
 assert jax.device_count() == 2
 for config in (SMALL_PPO, SMALL_SAC):
-  learner = point_learner(config, num_devices=2)
-  state = learner.init(jax.random.PRNGKey(0), {})
-  state, metrics = learner.train(state, {}, np.int32(30))
-  alone = point_learner(config)
-  _, its = alone.train(alone.init(jax.random.PRNGKey(0), {}), {}, np.int32(30))
+  trainer = point_trainer(config, num_devices=2)
+  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  state, metrics = trainer.train(state, {}, np.int32(30))
+  alone = point_trainer(config)
+  _, its = alone.train(alone.init(jax.random.PRNGKey(0), {}, None), {}, np.int32(30))
   ratio = float(metrics["grad_norm"]) / float(its["grad_norm"])
   assert 0.7 < ratio < 1.4, f"gradients are averaged, not added: {ratio}"
-  for leaf in jax.tree.leaves((state.params, state.opt_state, state.normalizer)):
+  for leaf in jax.tree.leaves((state.algorithm)):
     ours, theirs = (np.asarray(shard.data) for shard in leaf.addressable_shards)
     np.testing.assert_array_equal(ours, theirs)
   first, second = (np.asarray(shard.data) for shard in state.env_state.data.qpos.addressable_shards)
   assert first.shape == second.shape == (8, 2)
   assert not np.isin(first, second).any(), "devices must not live the same lives"
-  count = state.normalizer.count
-  assert int(count.hi) == 0 and int(count.lo) == 30 * learner.steps_per_update
-  evaluate = make_evaluator(PointTask(), learner.act, 16, learner.mesh, 1)
-  scores, recording = evaluate(learner.policy(state), jax.random.PRNGKey(1), {})
+  count = state.algorithm.normalizer.count
+  assert int(count.hi) == 0 and int(count.lo) == 30 * trainer.steps_per_update
+  evaluate = make_evaluator(PointTask(), trainer.act, 16, trainer.mesh, 1)
+  scores, recording = evaluate(trainer.policy(state), jax.random.PRNGKey(1), {})
   assert float(scores["episode_length"]) == 20 and recording["qpos"].shape == (20, 2, 2)
   assert float(scores["episode_reward"]) > -12 or config is SMALL_SAC, scores["episode_reward"]
 

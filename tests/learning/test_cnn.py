@@ -15,9 +15,10 @@ from playground.errors import ConfigError
 from playground.hardware.mesh import make_mesh
 from playground.learning import ppo
 from playground.learning.cnn import CNN, CNNConfig, random_shift
-from playground.learning.losses import Batch
+from playground.learning.hyperparameters import PPOConfig
 from playground.learning.networks import ACTIVATIONS, ActorCritic, NetworkConfig, SoftActorCritic, SoftNetworkConfig
-from playground.learning.ppo import PPO, PPOConfig
+from playground.learning.ppo import Batch, ppo_loss
+from playground.learning.trainer import Trainer
 from tests.dummy import SMALL_PPO, PointTask, numbers
 
 SIZES = {"state": (5,), "privileged_state": (7,), "pixels/eye": (16, 12, 3), "pixels/hand": (8, 8, 1)}
@@ -163,33 +164,33 @@ def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: py
   monkeypatch.setattr(ppo, "random_shift", note)
   network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", cnn=TINY)
   config = dataclasses.replace(SMALL_PPO, network=network, augment_pixels=1)
-  learner = PPO(Seen(), config, make_mesh(1))
-  state = learner.init(jax.random.PRNGKey(0), {})
+  trainer = Trainer(Seen(), config, make_mesh(1))
+  state = trainer.init(jax.random.PRNGKey(0), {}, None)
   assert state.env_state.obs["pixels/eye"].dtype == jnp.uint8
-  before = numbers(state.params)
-  traced = learner.train.trace(state, {}, jnp.int32(1))
+  before = numbers(state.algorithm.params)
+  traced = trainer.train.trace(state, {}, jnp.int32(1))
   floats = [v.aval for v in _variables(traced.jaxpr.jaxpr) if v.aval.shape == (5, 32, 6, 6, 2)]
   assert floats and {aval.dtype.name for aval in floats} == {"uint8"}  # all that is collected: [T, B, H, W, C]
   (collected, shifts, pad), (last, same, _) = shifted[:2]  # of a minibatch, [T, B, ...], and of what came after it
   assert pad == 1 and shifts is same and collected[1:] == last and shifts.shape == (last[0], 2)
-  state, metrics = learner.train(state, {}, jnp.int32(1))
+  state, metrics = trainer.train(state, {}, jnp.int32(1))
   assert metrics["nonfinite_updates"] == 0 and "obs_farthest" not in metrics
-  assert all((a != b).any() for a, b in zip(before, numbers(state.params), strict=True) if a.any())
+  assert all((a != b).any() for a, b in zip(before, numbers(state.algorithm.params), strict=True) if a.any())
 
 
 def test_only_pictures_can_be_shifted() -> None:
   with pytest.raises(
     ConfigError, match=r"^agent\.augment_pixels=4 shifts pictures, and the task has none: set it to 0\.$"
   ):
-    PPO(PointTask(), dataclasses.replace(SMALL_PPO, augment_pixels=4), make_mesh(1))
+    Trainer(PointTask(), dataclasses.replace(SMALL_PPO, augment_pixels=4), make_mesh(1))
 
 
 def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
   network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", estimated_obs_key="state", cnn=TINY)
   config = dataclasses.replace(SMALL_PPO, network=network)
-  learner = PPO(Seen(), config, make_mesh(1))
-  state = learner.init(jax.random.PRNGKey(0), {})
-  nets, policy = learner.networks, jax.device_get(state.params.policy)
+  trainer = Trainer(Seen(), config, make_mesh(1))
+  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  nets, policy = trainer.networks, jax.device_get(state.algorithm.params.policy)
   assert policy["params"]["estimator"]["kernel"].shape == (16, 2)
   obs = nets.select(state.env_state.obs)
   logits, estimate = nets.logits_and_estimate(policy, obs)
@@ -199,19 +200,21 @@ def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
 
   log = []
   for _ in range(10):
-    state, metrics = learner.train(state, {}, jnp.int32(2))
+    state, metrics = trainer.train(state, {}, jnp.int32(2))
     log.append(float(metrics["estimation_loss"]))
     assert metrics["total_loss"] > 0.5 * metrics["estimation_loss"]
   assert log[-1] < 0.3 * log[0], log
   far = jax.tree.map(lambda x: jnp.zeros((1, 2, *x.shape[1:]), x.dtype), obs)
   far |= {"state": jnp.full_like(far["state"], 1000.0)}  # what hardly ever changes, normalised
   row = jnp.zeros((1, 2))
-  batch = Batch(far, jax.tree.map(lambda x: x[0], far), jnp.zeros((1, 2, learner.env.action_size)), row, row, row, row)
-  _, parts = learner.loss(state.params, batch, jax.random.PRNGKey(0))
+  batch = Batch(far, jax.tree.map(lambda x: x[0], far), jnp.zeros((1, 2, trainer.env.action_size)), row, row, row, row)
+  _, parts = ppo_loss(state.algorithm.params, batch, jax.random.PRNGKey(0), nets, config)
   assert 900 < parts["estimation_loss"] < 1100  # not a million, which would drown what the policy learns
   still = dataclasses.replace(config, estimation_coefficient=0.0)
-  learner = PPO(Seen(), still, make_mesh(1))
-  after = learner.train(learner.init(jax.random.PRNGKey(0), {}), {}, jnp.int32(2))[0].params.policy["params"]
+  trainer = Trainer(Seen(), still, make_mesh(1))
+  after = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None), {}, jnp.int32(2))[0].algorithm.params.policy[
+    "params"
+  ]
   np.testing.assert_array_equal(after["estimator"]["kernel"], policy["params"]["estimator"]["kernel"])
 
 

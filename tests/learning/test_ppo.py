@@ -1,4 +1,4 @@
-"""What is PPO's own; what it shares with the other algorithms is in test_learner.py."""
+"""What is PPO's own; what it shares with the other algorithms is in test_trainer.py."""
 
 import dataclasses
 from typing import Any
@@ -6,37 +6,32 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec as P
 
 from playground.envs.wrappers import FINAL_OBS
 from playground.errors import ConfigError
-from playground.hardware.mesh import jit_on_mesh
-from playground.learning.losses import Batch, gae, pay_time_outs
+from playground.hardware.mesh import jit_on_mesh, make_mesh
+from playground.learning.algorithm import gradient_step
 from playground.learning.networks import NetworkConfig, normalize
-from playground.learning.ppo import PPO
-from playground.learning.rollout import unroll
-from tests.dummy import SMALL_PPO, numbers, point_learner
+from playground.learning.ppo import Batch, gae, pay_time_outs
+from playground.learning.rollout import Environments, unroll
+from tests.dummy import SMALL_PPO, numbers, point_trainer
 
 
 def test_a_bad_gradient_is_left_out() -> None:
-  learner = point_learner(SMALL_PPO)
-  assert isinstance(learner, PPO)
-  flat, unravel = ravel_pytree(learner.networks.init(jax.random.PRNGKey(0)))
-  start = (flat, learner.optimizer.init(flat))
-  rng = np.random.default_rng(0)
-  obs = {"state": rng.normal(size=(5, 8, 2)), "privileged_state": rng.normal(size=(5, 8, 4))}
-  zeros = np.zeros((5, 8), np.float32)
-  last_obs = jax.tree.map(lambda x: x[0], obs)
-  batch: Any = Batch(obs, last_obs, rng.normal(size=(5, 8, 2)), zeros, zeros * np.nan, zeros, zeros)  # pyright: ignore
-  step = lambda batch, carry, x: learner._sgd_step(batch, unravel, carry, x)
-  mapped = jit_on_mesh(step, learner.mesh, (P(), P(), P()), P())
-  columns = np.arange(8)
-  after, log = mapped(batch, start, (columns, jax.random.PRNGKey(0)))
-  np.testing.assert_array_equal(log, [*np.zeros(len(log) - 1), 1.0])
-  for a, b in zip(numbers(start), numbers(after), strict=True):
+  params, optimizer = jnp.arange(3.0), optax.adam(1e-3)
+  start = (params, optimizer.init(params))
+  step = lambda grads: gradient_step(optimizer, grads, *start)
+  mapped = jit_on_mesh(step, make_mesh(1), (P(),), P())
+  *after, norm, finite = mapped({"bad": jnp.array([1.0, jnp.nan]), "good": jnp.ones(1)})
+  assert not finite and np.isnan(norm)
+  for a, b in zip(numbers(start), numbers(tuple(after)), strict=True):
     np.testing.assert_array_equal(a, b)
+  moved, _, norm, finite = mapped({"bad": jnp.ones(2), "good": jnp.ones(1)})
+  assert finite and norm == pytest.approx(3**0.5) and (moved < params).all()
 
 
 @pytest.mark.parametrize(
@@ -55,13 +50,13 @@ def test_sizes_that_do_not_divide_are_refused(change: dict[str, Any], words: lis
 def test_an_observation_entry_that_is_not_there_is_named() -> None:
   config = dataclasses.replace(SMALL_PPO, network=NetworkConfig(value_obs_key="priviledged_state"))
   with pytest.raises(ConfigError, match=r"agent.network.value_obs_key='priviledged_state'.*Did you mean 'privileged"):
-    point_learner(config)
+    point_trainer(config)
 
 
 def test_environments_can_start_at_all_ages() -> None:
-  state = lambda learner: learner.init(jax.random.PRNGKey(0), {}).env_state
+  state = lambda trainer: trainer.init(jax.random.PRNGKey(0), {}, None).env_state
   same_age, mixed = (
-    state(point_learner(dataclasses.replace(SMALL_PPO, init_at_random_ep_len=mix), num_devices=2))
+    state(point_trainer(dataclasses.replace(SMALL_PPO, init_at_random_ep_len=mix), num_devices=2))
     for mix in (False, True)
   )
   np.testing.assert_array_equal(same_age.info["steps"], 0)
@@ -74,15 +69,16 @@ def test_environments_can_start_at_all_ages() -> None:
 
 def test_a_time_out_is_worth_what_its_true_last_observation_promises() -> None:
   config = dataclasses.replace(SMALL_PPO, init_at_random_ep_len=True, bootstrap_on_timeout=True)
-  learner: Any = point_learner(config, episode_length=4)
-  state = learner.init(jax.random.PRNGKey(0), {})
-  normalizer = jax.tree.map(lambda x: x + 0.25 if x.dtype == jnp.float32 else x, state.normalizer)
-  actor = (learner.networks, state.params.policy, normalizer)
-  roll = lambda env_state, *args: unroll(learner.env, env_state, state.capture, {}, *actor, *args)[2]
-  data = jax.jit(roll, static_argnums=2)(state.env_state, jax.random.PRNGKey(1), 6, state.params.value)
-  place, action = data.obs["state"], learner.networks.distribution.postprocess(data.raw_action)
+  trainer: Any = point_trainer(config, episode_length=4)
+  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  normalizer = jax.tree.map(lambda x: x + 0.25 if x.dtype == jnp.float32 else x, state.algorithm.normalizer)
+  actor = (trainer.networks, state.algorithm.params.policy, normalizer)
+  envs = lambda env_state: Environments(env_state, state.capture, {}, {}, trainer.env)
+  roll = lambda env_state, *args: unroll(envs(env_state), *actor, *args)[1]
+  data = jax.jit(roll, static_argnums=2)(state.env_state, jax.random.PRNGKey(1), 6, state.algorithm.params.value)
+  place, action = data.obs["state"], trainer.networks.distribution.postprocess(data.raw_action)
   last = {"state": place + 0.1 * action, "privileged_state": jnp.concatenate([place + 0.1 * action, action], -1)}
-  value = learner.networks.value(state.params.value, normalize(last, normalizer))
+  value = trainer.networks.value(state.algorithm.params.value, normalize(last, normalizer))
   assert 0 < data.truncation[0].sum() < 16, "some of the environments"
   np.testing.assert_allclose(data.final_value, value * data.truncation, atol=1e-6)
   assert np.abs(data.final_value).max() > 1e-3
@@ -99,7 +95,8 @@ def test_paid_time_outs_are_ends_with_a_value() -> None:
   values, reward = jnp.asarray(draw(steps + 1, count)), draw(steps, count)
   final_value = jnp.asarray(draw(steps, count) * truncation)
   batch = Batch({}, {}, draw(0), draw(0), reward, termination, truncation)  # pyright: ignore
-  _, advantages = gae(pay_time_outs(batch, final_value, discount, scale), values, scale, discount, decay)
+  config = dataclasses.replace(SMALL_PPO, reward_scaling=scale, discounting=discount, gae_lambda=decay)
+  _, advantages = gae(pay_time_outs(batch, final_value, config), values, config)
   expected = np.zeros((steps, count))
   for b in range(count):
     # Brax's advantages are r + discount * (next value, with all that follows) - V, the sum of which is the target.
@@ -115,10 +112,10 @@ def test_paid_time_outs_are_ends_with_a_value() -> None:
 def test_a_run_that_pays_time_outs_stores_no_more_and_learns() -> None:
   shapes, learned = [], []
   for pays in (False, True):
-    learner = point_learner(dataclasses.replace(SMALL_PPO, bootstrap_on_timeout=pays), num_devices=2)
-    state, metrics = learner.train(learner.init(jax.random.PRNGKey(0), {}), {}, np.int32(4))
+    trainer = point_trainer(dataclasses.replace(SMALL_PPO, bootstrap_on_timeout=pays), num_devices=2)
+    state, metrics = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None), {}, np.int32(4))
     assert metrics["episodes"] > 0 and FINAL_OBS not in state.env_state.info
     shapes.append(jax.eval_shape(lambda state=state: state))
-    learned.append(ravel_pytree(state.params)[0])
+    learned.append(ravel_pytree(state.algorithm.params)[0])
   assert jax.tree.structure(shapes[0]) == jax.tree.structure(shapes[1])
   assert np.isfinite(learned[1]).all() and (learned[0] != learned[1]).any()

@@ -1,4 +1,4 @@
-"""What is SAC's own; what it shares with the other algorithms is in test_learner.py."""
+"""What is SAC's own; what it shares with the other algorithms is in test_trainer.py."""
 
 import dataclasses
 from functools import cache
@@ -15,39 +15,44 @@ from jax.sharding import PartitionSpec as P
 from playground.envs.base import State
 from playground.errors import CheckpointError, ConfigError
 from playground.hardware.mesh import jit_on_mesh, make_mesh
-from playground.learning import sac
+from playground.learning import trainer as trainer_module
 from playground.learning.checkpoints import Checkpoint, CheckpointStore, find_checkpoints
-from playground.learning.learner import Learner
+from playground.learning.rollout import Environments
 from playground.learning.sac import SAC
-from tests.dummy import SMALL_SAC, PointTask, numbers, point_learner
+from playground.learning.trainer import Trainer
+from tests.dummy import SMALL_SAC, PointTask, numbers, point_trainer
 
 PREFILL = 4  # steps of 16 environments that make up min_replay_size
 MODEL: dict[str, Any] = {}
 
 
 @cache
-def built() -> SAC:
-  learner = point_learner(SMALL_SAC)
-  assert isinstance(learner, SAC)
-  return learner
+def built() -> Trainer:
+  return point_trainer(SMALL_SAC)
+
+
+def algorithm(trainer: Trainer) -> SAC:
+  assert isinstance(trainer.algorithm, SAC)
+  return trainer.algorithm
 
 
 @cache
-def other() -> Learner:
+def other() -> Trainer:
   """A second set of hyperparameters, shared because compiling it takes seconds."""
-  return point_learner(
+  return point_trainer(
     dataclasses.replace(SMALL_SAC, alpha_learning_rate=1e-5, grad_updates_per_step=1, checkpoint_replay=False)
   )
 
 
-def trained(updates: int, learner: Learner | None = None) -> Any:
-  learner = learner or built()
-  state, _ = learner.train(learner.init(jax.random.PRNGKey(0), MODEL), MODEL, np.int32(updates))
+def trained(updates: int, trainer: Trainer | None = None) -> Any:
+  trainer = trainer or built()
+  state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), MODEL, None), MODEL, np.int32(updates))
   return state
 
 
 def test_nothing_is_learned_before_there_is_enough_to_learn_from() -> None:
-  start, filled, later = trained(0), trained(PREFILL), trained(PREFILL + 1)
+  states = trained(0), trained(PREFILL), trained(PREFILL + 1)
+  start, filled, later = (state.algorithm for state in states)
   for a, b in zip(numbers(start.params), numbers(filled.params), strict=True):
     np.testing.assert_array_equal(a, b)
   assert all((a != b).any() for a, b in zip(numbers(filled.params), numbers(later.params), strict=True))
@@ -60,7 +65,7 @@ def test_nothing_is_learned_before_there_is_enough_to_learn_from() -> None:
 def test_transitions_are_what_the_environments_did() -> None:
   state = trained(25)  # the 20th step of the point is cut by the time limit
   rows = jax.device_get(state.replay.data)[:25]
-  example = built().buffer.sample(state.replay, jax.random.PRNGKey(0), (1,))
+  example = algorithm(built()).buffer.sample(state.replay, jax.random.PRNGKey(0), (1,))
   _, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], example))
   steps = jax.vmap(jax.vmap(unravel))(rows)
   position, after = steps.obs["state"], steps.next_obs["state"]
@@ -84,11 +89,17 @@ class Dying(PointTask):
 
 @pytest.mark.parametrize("length", [2, 3, 20])
 def test_what_comes_after_a_termination_is_worth_nothing_whatever_the_time(length: int) -> None:
-  learner = SAC(Dying(episode_length=length), SMALL_SAC, make_mesh(1))
-  transition = jax.jit(learner._collect)
-  state, discounts = learner.init(jax.random.PRNGKey(0), MODEL), []
+  trainer = Trainer(Dying(episode_length=length), SMALL_SAC, make_mesh(1))
+
+  @jax.jit
+  def transition(state: Any, key: jax.Array) -> Any:
+    envs = Environments(state.env_state, state.capture, MODEL, {}, trainer.env)
+    envs, step = algorithm(trainer)._collect(state.algorithm, envs, key)
+    return envs.state, step
+
+  state, discounts = trainer.init(jax.random.PRNGKey(0), MODEL, None), []
   for i in range(6):
-    env_state, _, step = transition(state, jax.random.PRNGKey(i), MODEL)
+    env_state, step = transition(state, jax.random.PRNGKey(i))
     np.testing.assert_allclose(step.next_obs["state"], step.obs["state"] + 0.1 * step.action, atol=1e-6)
     np.testing.assert_array_equal(step.nonfinite, 0)
     discounts.append(step.discount)
@@ -97,7 +108,7 @@ def test_what_comes_after_a_termination_is_worth_nothing_whatever_the_time(lengt
 
 
 def test_a_step_that_went_nan_teaches_the_critics_nothing() -> None:
-  state = trained(3, point_learner(SMALL_SAC, nan_at=3))
+  state = trained(3, point_trainer(SMALL_SAC, nan_at=3))
   assert np.isfinite(state.replay.data).all()
   reward, discount, nonfinite = np.moveaxis(np.asarray(state.replay.data)[2, :, -3:], -1, 0)
   assert (reward == 0).all()
@@ -106,23 +117,20 @@ def test_a_step_that_went_nan_teaches_the_critics_nothing() -> None:
 
 
 def test_a_bad_gradient_is_left_out() -> None:
-  learner, state = built(), trained(PREFILL + 1)
-  batch = learner.buffer.sample(state.replay, jax.random.PRNGKey(0), (32,))
-  batch = batch.replace(reward=batch.reward * np.nan)
-  flat, unravel = ravel_pytree(state.params)
-  target, unravel_target = ravel_pytree(state.target_q)
-  step = lambda carry, x: learner._sgd_step(unravel, unravel_target, jnp.ones_like(flat), carry, x)
-  carry = (flat, target, state.opt_state)
-  new, parts = jit_on_mesh(step, learner.mesh, (P(), P()), P())(carry, (batch, jnp.zeros((2, 32, 2))))
+  sac, state = algorithm(built()), trained(PREFILL + 1)
+  batches = sac.buffer.sample(state.replay, jax.random.PRNGKey(0), (1, 32))
+  batches = batches.replace(reward=batches.reward * np.nan)
+  start = (state.algorithm.params, state.algorithm.target_q, state.algorithm.opt_state)
+  new, parts = jit_on_mesh(sac._learn, built().mesh, (P(), P(), P()), P())(start, batches, jnp.zeros((1, 2, 32, 2)))
   assert parts[-1] == 1
   assert np.isfinite(parts).all()
-  for a, b in zip(numbers(carry), numbers(new), strict=True):
+  for a, b in zip(numbers(start), numbers(new), strict=True):
     np.testing.assert_array_equal(a, b)
 
 
 def test_each_learns_at_its_own_rate() -> None:
   before, after = trained(PREFILL, other()), trained(PREFILL + 1, other())
-  step = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), after.params, before.params)
+  step = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), after.algorithm.params, before.algorithm.params)
   np.testing.assert_allclose(step.log_alpha, 1e-5, rtol=1e-3)  # Adam's first step is the rate
   for change in jax.tree.leaves((step.q, step.policy)):
     np.testing.assert_allclose(change, SMALL_SAC.learning_rate, rtol=0.05)
@@ -131,25 +139,25 @@ def test_each_learns_at_its_own_rate() -> None:
 # Checkpoints
 
 
-def save(folder: Path, learner: Learner, *states: Any) -> list[Path]:
+def save(folder: Path, trainer: Trainer, *states: Any) -> list[Path]:
   """Saves states as a run does, at steps 10, 20, ...; returns the checkpoints, newest first."""
   store = CheckpointStore(folder / "checkpoints")
   for i, state in enumerate(states):
-    policy, rest = learner.split(state)
+    policy, rest = trainer.split(state)
     meta = {"update": i, "wall_clock_s": 0.0, "env": "Point", "config": {}}
-    store.save(10 * (i + 1), policy, rest, meta, lambda state=state: learner.experience(state))
+    store.save(10 * (i + 1), policy, rest, meta, lambda state=state: trainer.experience(state))
   store.close()
   return find_checkpoints(folder)
 
 
 @pytest.mark.parametrize("updates", [7, 40], ids=["half full", "full"])
 def test_the_newest_checkpoint_restores_everything(tmp_path: Path, updates: int) -> None:
-  learner, state = built(), trained(updates)
-  newest, older = save(tmp_path, learner, trained(3), state)
+  trainer, state = built(), trained(updates)
+  newest, older = save(tmp_path, trainer, trained(3), state)
   assert Checkpoint(newest).has("replay")
   assert not Checkpoint(older).has("replay")
-  template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), MODEL)
-  restored, said = learner.restore(Checkpoint(newest), template)
+  template = jax.eval_shape(trainer.init, jax.random.PRNGKey(0), MODEL, None)
+  restored, said = trainer.restore(Checkpoint(newest), template)
   assert said == f"Resuming the whole training state of {newest} (20 steps)."
   assert jax.tree.structure(restored) == jax.tree.structure(state)
   for a, b in zip(numbers(state), numbers(restored), strict=True):
@@ -157,65 +165,65 @@ def test_the_newest_checkpoint_restores_everything(tmp_path: Path, updates: int)
 
 
 def test_without_the_buffer_it_is_filled_again(tmp_path: Path) -> None:
-  learner = built()
-  _, older = save(tmp_path, learner, trained(30), trained(31))
-  template = jax.eval_shape(learner.init, jax.random.PRNGKey(0), MODEL)
-  state, said = learner.restore(Checkpoint(older), template)
+  trainer = built()
+  _, older = save(tmp_path, trainer, trained(30), trained(31))
+  template = jax.eval_shape(trainer.init, jax.random.PRNGKey(0), MODEL, None)
+  state, said = trainer.restore(Checkpoint(older), template)
   assert "without its replay buffer (64 transitions are collected before it learns on)" in said
-  before = numbers(state.params)
-  state, _ = learner.train(state, MODEL, np.int32(PREFILL))
-  for a, b in zip(before, numbers(state.params), strict=True):
+  before = numbers(state.algorithm.params)
+  state, _ = trainer.train(state, MODEL, np.int32(PREFILL))
+  for a, b in zip(before, numbers(state.algorithm.params), strict=True):
     np.testing.assert_array_equal(a, b)
-  state, metrics = learner.train(state, MODEL, np.int32(1))
+  state, metrics = trainer.train(state, MODEL, np.int32(1))
   assert int(state.replay.inserted) == PREFILL + 1
-  assert all((a != b).any() for a, b in zip(before, numbers(state.params), strict=True))
+  assert all((a != b).any() for a, b in zip(before, numbers(state.algorithm.params), strict=True))
   assert np.isfinite(metrics["critic_loss"])
 
 
 def test_a_buffer_that_is_not_to_be_saved_is_not_even_copied(tmp_path: Path) -> None:
-  learner = other()
-  state = trained(6, learner)
-  copy = learner.copy(state)
+  trainer = other()
+  state = trained(6, trainer)
+  copy = trainer.copy(state)
   assert copy.replay.data is None
   for kept in (copy, state):
-    assert learner.experience(kept) is None
-  (path,) = save(tmp_path, learner, copy)
-  restored, _ = learner.restore(Checkpoint(path), jax.eval_shape(lambda: state))
+    assert trainer.experience(kept) is None
+  (path,) = save(tmp_path, trainer, copy)
+  restored: Any = trainer.restore(Checkpoint(path), jax.eval_shape(lambda: state))[0]
   assert not restored.replay.inserted
-  for a, b in zip(numbers(state.opt_state), numbers(restored.opt_state), strict=True):
+  for a, b in zip(numbers(state.algorithm.opt_state), numbers(restored.algorithm.opt_state), strict=True):
     np.testing.assert_array_equal(a, b)
 
 
 def test_new_weights_come_with_their_target() -> None:
-  learner = built()
-  policy = jax.device_get(learner.policy(trained(20)))
-  state = learner.with_policy(trained(0), policy)
-  for ours, theirs in ((state.params, policy.params), (state.target_q, policy.params.q)):
+  trainer = built()
+  policy = jax.device_get(trainer.policy(trained(20)))
+  state = trainer.init(jax.random.PRNGKey(0), MODEL, policy)
+  for ours, theirs in ((state.algorithm.params, policy.params), (state.algorithm.target_q, policy.params.q)):
     for a, b in zip(numbers(ours), numbers(theirs), strict=True):
       np.testing.assert_array_equal(a, b)
 
 
 def test_another_buffer_is_refused(tmp_path: Path) -> None:
-  learner = built()
-  (path,) = save(tmp_path, learner, trained(7))
+  trainer = built()
+  (path,) = save(tmp_path, trainer, trained(7))
   (path / "replay").rename(path / "elsewhere")
   (path / "replay").mkdir()
   with pytest.raises(CheckpointError, match="damaged: its 'replay' cannot be read"):
-    learner.restore(Checkpoint(path), jax.eval_shape(learner.init, jax.random.PRNGKey(0), MODEL))
+    trainer.restore(Checkpoint(path), jax.eval_shape(trainer.init, jax.random.PRNGKey(0), MODEL, None))
 
 
 # What is refused
 
 
 def test_memory_is_stated_and_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
-  monkeypatch.setattr(sac, "device_memory", lambda mesh: None)
-  (said,) = point_learner(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
+  monkeypatch.setattr(trainer_module, "device_memory", lambda mesh: None)
+  (said,) = point_trainer(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
   assert said.startswith("Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device, and as much ")
-  monkeypatch.setattr(sac, "device_memory", lambda mesh: 10 * 10**9)
+  monkeypatch.setattr(trainer_module, "device_memory", lambda mesh: 10 * 10**9)
   with pytest.raises(ConfigError, match=r"agent.max_replay_size=100000000 is .* but a device has 10.00 GB: lower it"):
-    point_learner(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
+    point_trainer(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
   config = dataclasses.replace(SMALL_SAC, max_replay_size=10**8, checkpoint_replay=False)
-  assert point_learner(config).notices() == [
+  assert point_trainer(config).notices() == [
     "Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device."
   ]
 
@@ -238,4 +246,4 @@ def test_sizes_that_do_not_go_together_are_refused(change: dict[str, Any], words
 
 def test_a_budget_that_only_fills_the_buffer_is_refused() -> None:
   with pytest.raises(ConfigError, match=r"agent.num_timesteps=64 is over before agent.min_replay_size=64"):
-    point_learner(dataclasses.replace(SMALL_SAC, num_timesteps=64))
+    point_trainer(dataclasses.replace(SMALL_SAC, num_timesteps=64))

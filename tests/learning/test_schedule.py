@@ -4,18 +4,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from playground.learning.loop import Mark, longest_stretch, schedule
+from playground.learning.loop import ScheduleEvent, longest_stretch, schedule
 
 
 def test_a_short_run_written_out() -> None:
   assert schedule(6, num_evals=3, num_resets_per_eval=3, max_updates=10) == [
-    Mark(0, evaluate=True),
-    Mark(1, reset=True),
-    Mark(2, reset=True),
-    Mark(3, evaluate=True, reset=True),
-    Mark(4, reset=True),
-    Mark(5, reset=True),
-    Mark(6, evaluate=True),
+    ScheduleEvent(0, evaluate=True),
+    ScheduleEvent(1, reset=True),
+    ScheduleEvent(2, reset=True),
+    ScheduleEvent(3, evaluate=True, reset=True),
+    ScheduleEvent(4, reset=True),
+    ScheduleEvent(5, reset=True),
+    ScheduleEvent(6, evaluate=True),
   ]
 
 
@@ -49,4 +49,4 @@ def test_the_longest_stretch_is_from_one_fresh_start_to_the_next_or_to_the_end()
   assert longest_stretch(schedule(12, num_evals=3, num_resets_per_eval=2, max_updates=2)) == 3
   assert longest_stretch(schedule(7, num_evals=2, num_resets_per_eval=3, max_updates=50)) == 3  # 2, 3, 2
   assert longest_stretch(schedule(12, num_evals=3, num_resets_per_eval=0, max_updates=2)) == 12
-  assert longest_stretch([Mark(4), Mark(5, reset=True), Mark(8)]) == 5
+  assert longest_stretch([ScheduleEvent(4), ScheduleEvent(5, reset=True), ScheduleEvent(8)]) == 5

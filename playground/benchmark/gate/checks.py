@@ -13,7 +13,8 @@ from playground.config import compose
 from playground.envs.physics import mjx
 from playground.envs.wrappers import wrap_for_training
 from playground.hardware.mesh import make_mesh
-from playground.learning.algorithms import make_learner
+from playground.learning.hyperparameters import read_config
+from playground.learning.trainer import Trainer
 
 jax.config.update("jax_platforms", "cpu")
 
@@ -52,13 +53,13 @@ def training_step(agent: str, overrides: tuple[str, ...], layers: tuple[int, int
     layers: rows, width and number of the products.
   """
   config = compose(["env=CartpoleBalance", f"agent={agent}", "env.impl=jax", *overrides])
-  learner: Any = make_learner(registry.load("CartpoleBalance", config=config.env), config.agent, make_mesh(1), None)
-  state = learner.init(jax.random.PRNGKey(0), {})
-  state, _ = learner.train(state, {}, np.int32(learner.config.prefill_updates))
+  trainer = Trainer(registry.load("CartpoleBalance", config=config.env), read_config(config.agent), make_mesh(1))
+  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  state, _ = trainer.train(state, {}, np.int32(trainer.config.prefill_updates))
 
   def ours() -> Any:
     nonlocal state
-    state, metrics = learner.train(state, {}, np.int32(1))
+    state, metrics = trainer.train(state, {}, np.int32(1))
     return jax.block_until_ready(metrics)
 
   rows, width, count = layers

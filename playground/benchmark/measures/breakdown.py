@@ -13,7 +13,7 @@ from playground.benchmark.worker import Facts
 from playground.envs.base import PIXELS
 from playground.envs.physics import WORLDS
 from playground.envs.wrappers import Vectorize, wrap_for_training
-from playground.learning.rollout import unroll
+from playground.learning.rollout import Environments, unroll
 
 PARTS = {  # in the order they are added
   "physics": "MJX alone under a constant ctrl",
@@ -47,15 +47,15 @@ def measure(
   """
   with used_memory(facts) if watch_memory else nullcontext():
     subject = Subject.build(facts, task, agent, overrides)
-    learner, state = subject.learner, subject.learner.init(subject.key(0), subject.model)
-    length = getattr(learner.config, "unroll_length", LENGTH)
+    trainer, state = subject.trainer, subject.trainer.init(subject.key(0), subject.model, None)
+    length = getattr(trainer.config, "unroll_length", LENGTH)
     calls: dict[str, tuple[Callable[[int], Any], int]] = {}
     wanted = list(PARTS)[: list(PARTS).index(until) + 1]
     for part, (run, carry, repeat) in _rolls(subject, state, length).items():
       if part in wanted:
-        calls[part] = (_repeat(subject, run, carry), learner.config.num_envs * length * repeat)
+        calls[part] = (_repeat(subject, run, carry), trainer.config.num_envs * length * repeat)
     if "update" in wanted:
-      calls["update"] = (_train(subject, state), learner.steps_per_update)
+      calls["update"] = (_train(subject, state), trainer.steps_per_update)
     for call, _ in calls.values():
       jax.block_until_ready(call(1))
     best = dict.fromkeys(calls, 0.0)
@@ -86,29 +86,29 @@ def _repeat(subject: Subject, run: Run, carry: Any) -> Callable[[int], Any]:
 
 def _train(subject: Subject, state: Any) -> Callable[[int], Any]:
   """A function that does a number of training steps that learn."""
-  learner = subject.learner
+  trainer = subject.trainer
 
   def call(count: int) -> Any:
     nonlocal state
-    state, metrics = learner.train(state, subject.model, num_updates(count))
+    state, metrics = trainer.train(state, subject.model, num_updates(count))
     return metrics
 
-  call(1 + learner.config.prefill_updates)
+  call(1 + trainer.config.prefill_updates)
   return call
 
 
 def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, Any, int]]:
   """The parts up to the update: what runs `length` steps, what it carries, control steps that each counts for."""
-  learner, env = subject.learner, subject.learner.env
-  task, repeat, num_envs = env.unwrapped, env.action_repeat, learner.config.num_envs
-  bare, policy = Vectorize(task), learner.policy(state)
+  trainer, env = subject.trainer, subject.trainer.env
+  task, repeat, num_envs = env.unwrapped, env.action_repeat, trainer.config.num_envs
+  bare, policy = Vectorize(task), trainer.policy(state)
 
   def random_actions(key: jax.Array) -> jax.Array:
     return jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
 
   def act(carry: Any, model: Any, key: jax.Array) -> Any:
     state, policy = carry  # carried along, for what a function merely refers to is compiled into it
-    return env.step(state, learner.act(policy, state.obs, key, False), model), policy
+    return env.step(state, trainer.act(policy, state.obs, key, False), model), policy
 
   def advance(data: Any, fields: Any) -> Any:
     model = task.mjx_model.tree_replace(fields) if fields else task.mjx_model
@@ -128,7 +128,7 @@ def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, An
   )
   by_chance: Callable[[Any], Any] = lambda env: lambda s, model, key: env.step(s, random_actions(key), model)
   seeing: dict[str, tuple[Run, Any, int]] = {"episodes": (scan(by_chance(env)), state.env_state, repeat)}
-  if any(key.startswith(PIXELS) for key in learner.networks.select(state.env_state.obs)):
+  if any(key.startswith(PIXELS) for key in trainer.networks.select(state.env_state.obs)):
     blind = wrap_for_training(task)
     first = jax.jit(blind.reset)(jax.random.split(subject.key(0), num_envs), subject.model)
     seeing = {"episodes": (scan(by_chance(blind)), first, repeat), "pixels": seeing["episodes"]}
@@ -138,15 +138,14 @@ def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, An
     **seeing,
     "inference": (scan(act), (state.env_state, policy), repeat),
   }
-  if hasattr(learner.config, "unroll_length"):  # the algorithm learns from whole rollouts
+  if hasattr(trainer.config, "unroll_length"):  # the algorithm learns from whole rollouts
 
     def store(carry: Any, model: Any, key: jax.Array) -> tuple[Any, Any]:
       before, capture, policy = carry
-      normalizer = policy.normalizer if learner.config.normalize_observations else None
-      after, capture, *stored = unroll(
-        env, before, capture, model, learner.networks, policy.params.policy, normalizer, key, length
-      )
-      return (after, capture, policy), stored
+      normalizer = policy.normalizer if trainer.config.normalize_observations else None
+      envs = Environments(before, capture, model, {}, env)
+      envs, stored = unroll(envs, trainer.networks, policy.params.policy, normalizer, key, length)
+      return (envs.state, envs.capture, policy), (stored, envs.sums)
 
     rolls["storing"] = (store, (state.env_state, state.capture, policy), repeat)
   return rolls

@@ -14,7 +14,7 @@ def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: 
   The environments are those that a trainer steps: guarded, limited, reset when done, on randomised models.
   """
   subject = Subject.build(facts, task, agent, overrides)
-  env, model, num_envs = subject.learner.env, subject.model, subject.learner.config.num_envs
+  env, model, num_envs = subject.trainer.env, subject.model, subject.trainer.config.num_envs
 
   def roll(state, key, calls):
     def step(state, key):

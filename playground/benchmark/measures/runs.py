@@ -18,7 +18,7 @@ from playground.benchmark.worker import Facts
 from playground.config import RunConfig, compose
 from playground.errors import PlaygroundError
 from playground.interpreter import PYTHON
-from playground.learning.hyperparameters import config_class
+from playground.learning.hyperparameters import read_config
 from playground.runs.run_dir import RunDirectory
 
 RESULT = ("steps", "wall_clock_s", "training_steps_per_s", "best_return", "final_return")
@@ -128,7 +128,7 @@ def emit_result(facts: Facts, result: Mapping[str, Any], quantities: Sequence[st
 
 def _one_update(config: RunConfig) -> int:
   """The budget (control steps) with which something is learned once."""
-  settings = config_class(config.agent.name).from_config(config.agent)
+  settings = read_config(config.agent)
   return (settings.prefill_updates + 1) * settings.steps_per_update * config.env.action_repeat
 
 

@@ -1,4 +1,4 @@
-"""What the measurements share: a task with its learner, clocks, and the facts of this process."""
+"""What the measurements share: a task with its trainer, clocks, and the facts of this process."""
 
 import contextlib
 import dataclasses
@@ -23,9 +23,8 @@ from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
 from playground.hardware.scaling import scale_envs
 from playground.hardware.setup import Hardware, setup
-from playground.learning.algorithms import algorithm
-from playground.learning.hyperparameters import config_class
-from playground.learning.learner import Learner
+from playground.learning.hyperparameters import read_config
+from playground.learning.trainer import Trainer
 from playground.runs.train import model_sampler
 
 ONE_DEVICE = "hardware.devices=1"
@@ -38,7 +37,7 @@ class Subject:
   config: RunConfig
   hardware: Hardware
   env: Env
-  learner: Learner
+  trainer: Trainer
   draw: Callable[[int], tuple[ModelFields, ModelFields]]
 
   @classmethod
@@ -48,19 +47,19 @@ class Subject:
     hardware = setup(config.hardware)
     if config.hardware.scale_envs:
       config, _ = scale_envs(config, hardware.mesh.size)
-    settings = config_class(config.agent.name).from_config(config.agent)
+    settings = read_config(config.agent)
     env = registry.load(task, config=config.env)
     draw = model_sampler(env, config, settings.num_envs, settings.num_eval_envs)
-    learner = algorithm(config.agent.name)(env, settings, hardware.mesh, hardware.network_precision)
+    trainer = Trainer(env, settings, hardware.mesh, hardware.network_precision)
     facts.update(
       backend=env.impl,
       devices=hardware.mesh.size,
       device=device_name(),
-      precision=_precision(hardware, learner),
+      precision=_precision(hardware, trainer),
       versions=versions(),
       conditions=f"hyperparameters {config.choices.get('tuned') or 'not tuned for this task'}",
     )
-    return cls(config, hardware, env, learner, draw)
+    return cls(config, hardware, env, trainer, draw)
 
   @functools.cached_property
   def model(self) -> ModelFields:
@@ -77,8 +76,8 @@ def told(overrides: Sequence[str]) -> list[str]:
   return [text for text in overrides if text != ONE_DEVICE]
 
 
-def _precision(hardware: Hardware, learner: Learner) -> str:
-  facts, value_dtype = hardware.facts, getattr(learner.networks, "value_dtype", None)
+def _precision(hardware: Hardware, trainer: Trainer) -> str:
+  facts, value_dtype = hardware.facts, getattr(trainer.networks, "value_dtype", None)
   critic = f", critic activations {value_dtype}" if value_dtype else ""
   return f"physics {facts['matmul_precision']}, networks {facts['network_precision']}{critic}"
 
@@ -133,5 +132,5 @@ def emit_peak(facts: Facts, **columns: Any) -> None:
 
 
 def num_updates(count: int) -> np.int32:
-  """The argument of `Learner.train`."""
+  """The argument of `Trainer.train`."""
   return np.int32(count)

@@ -37,17 +37,17 @@ def measure(
   """
   with used_memory(facts, seeds[0]) if watch_memory else nullcontext():
     subject = Subject.build(facts, task, agent, overrides)
-    learner, conditions = subject.learner, facts["conditions"]
+    trainer, conditions = subject.trainer, facts["conditions"]
     no_evaluation = jax.jit(lambda policy, key, model: ())
-    program = compile_program(learner, no_evaluation, partial(subject.draw, seeds[0]))
+    program = compile_program(trainer, no_evaluation, partial(subject.draw, seeds[0]))
     facts.emit("trace_s", program.trace_s, "s", seed=seeds[0])
     facts.emit("compile_s", program.compile_s, "s", seed=seeds[0])
-    warm_up = 1 + learner.config.prefill_updates
+    warm_up = 1 + trainer.config.prefill_updates
     for seed in seeds:
       model = program.model if seed == seeds[0] else subject.draw(seed)[0]
       with alone(facts.lock):
         state = None  # the last seed's goes before the next one's comes: a replay buffer is large
-        state = program.init(subject.key(seed), model)
+        state = program.init(subject.key(seed), model, None)
 
         def train(count: int) -> jax.Array:
           nonlocal state
@@ -57,7 +57,7 @@ def measure(
         jax.block_until_ready(train(warm_up))
         if seed == seeds[0] and facts.lock is None:  # with a lock, waiting for it would be in the time
           facts.emit("start_to_first_update_s", process_age_s(), "s", seed=seed)
-        speed, timed = rate(train, learner.steps_per_update, seconds)
+        speed, timed = rate(train, trainer.steps_per_update, seconds)
       how = f"{timed:.1f} s timed after the first update, no evaluation, no outer resets"
       facts.emit("training_steps_per_s", speed, "steps/s", seed=seed, conditions=f"{conditions}; {how}")
     emit_peak(facts, seed=seeds[0])

@@ -18,8 +18,8 @@ class Steps(NamedTuple):
 def test_every_environment_and_every_repeat_of_an_action_counts(monkeypatch: pytest.MonkeyPatch):
   env = SimpleNamespace(action_size=1, action_repeat=3, reset=lambda keys, model: Steps(jnp.zeros(len(keys))))
   env.step = lambda state, action, model: Steps(state.done + 1)
-  learner = SimpleNamespace(env=env, config=SimpleNamespace(num_envs=4))
-  found = SimpleNamespace(learner=learner, model={}, key=jax.random.PRNGKey)
+  trainer = SimpleNamespace(env=env, config=SimpleNamespace(num_envs=4))
+  found = SimpleNamespace(trainer=trainer, model={}, key=jax.random.PRNGKey)
   counted: dict[str, Any] = {}
 
   def rate(call: Any, steps: int, seconds: float) -> tuple[float, float]:

@@ -11,8 +11,9 @@ from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses as brax_losses
 from brax.training.agents.ppo import networks as brax_networks
 
-from playground.learning.losses import Batch, ppo_loss
+from playground.learning.hyperparameters import PPOConfig
 from playground.learning.networks import ActorCritic, ActorCriticParams, NetworkConfig, normalize
+from playground.learning.ppo import Batch, ppo_loss
 
 T, B, OBS, PRIVILEGED, ACTIONS = 6, 5, 4, 7, 3
 
@@ -77,7 +78,9 @@ def test_loss_and_gradient_equal_brax(clip_value: float | None) -> None:
     brax_params = brax_losses.PPONetworkParams(policy=params.policy, value=params.value)  # pyright: ignore[reportCallIssue]
     return brax_losses.compute_ppo_loss(brax_params, normalizer, data, key, theirs, **options)[0]
 
-  our_loss, our_grad = jax.value_and_grad(lambda p: ppo_loss(p, batch, key, ours, **options)[0])(params)
+  our_loss, our_grad = jax.value_and_grad(
+    lambda p: ppo_loss(p, batch, key, ours, PPOConfig(num_timesteps=1, **options))[0]
+  )(params)
   their_loss, their_grad = jax.value_and_grad(brax_loss)(params)
   np.testing.assert_allclose(our_loss, their_loss, rtol=1e-5)
   for a, b in zip(jax.tree.leaves(our_grad), jax.tree.leaves(their_grad), strict=True):

@@ -10,8 +10,9 @@ from brax.training import types
 from brax.training.agents.sac import losses as brax_losses
 from brax.training.agents.sac import networks as brax_networks
 
+from playground.learning.hyperparameters import SACConfig
 from playground.learning.networks import SoftActorCritic, SoftActorCriticParams, SoftNetworkConfig
-from playground.learning.sac_losses import PARTS, Transition, sac_loss
+from playground.learning.sac import PARTS, Transition, sac_loss
 
 B, OBS, ACTIONS = 12, 5, 3
 
@@ -41,10 +42,12 @@ def test_losses_and_gradients_equal_brax(batched: bool) -> None:
   keys = jax.random.split(jax.random.PRNGKey(2))
   noise = jnp.stack([jax.random.normal(key, (B, ACTIONS)) for key in keys])
 
+  settings = SACConfig(num_timesteps=1, discounting=0.97, reward_scaling=0.5)
+
   @jax.jit
   def found() -> tuple[jax.Array, SoftActorCriticParams]:
     loss = jax.value_and_grad(sac_loss, has_aux=True)
-    (_, parts), grads = loss(params, target_q, batch, noise, ours, discounting=0.97, reward_scaling=0.5)
+    (_, parts), grads = loss(params, target_q, batch, noise, ours, settings)
     return parts, grads
 
   @jax.jit

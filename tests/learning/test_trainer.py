@@ -14,39 +14,38 @@ from playground.envs.base import State
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.hardware.mesh import make_mesh
 from playground.learning.evaluation import make_evaluator
-from playground.learning.learner import Learner
-from playground.learning.loop import Loop, Program, compile_program, schedule
+from playground.learning.loop import CompiledFunctions, Loop, compile_program, schedule
+from playground.learning.trainer import Trainer
 from tests.dummy import (
-  ALGORITHMS,
   SMALL_PPO,
   SMALL_SAC,
   Config,
   PointTask,
   Recorder,
   numbers,
-  point_learner,
+  point_trainer,
 )
 
 every_algorithm = pytest.mark.parametrize("config", [SMALL_PPO, SMALL_SAC], ids=["ppo", "sac"])
 
 
 @cache
-def built(config: Config, **events: Any) -> tuple[Learner, Program]:
-  learner = point_learner(config, **events)
-  evaluate = make_evaluator(learner.env.unwrapped, learner.act, config.num_eval_envs, learner.mesh, 1)
-  return learner, compile_program(learner, evaluate, lambda: ({}, {}))
+def built(config: Config, **events: Any) -> tuple[Trainer, CompiledFunctions]:
+  trainer = point_trainer(config, **events)
+  evaluate = make_evaluator(trainer.env.unwrapped, trainer.act, config.num_eval_envs, trainer.mesh, 1)
+  return trainer, compile_program(trainer, evaluate, lambda: ({}, {}))
 
 
 def run(
   config: Config,
-  hooks: Recorder,
+  callbacks: Recorder,
   updates: int = 12,
   resumed: tuple[Any, int] | None = None,
   **events: Any,
 ) -> tuple[Any, bool]:
-  learner, program = built(config, **events)
+  trainer, program = built(config, **events)
   marks = schedule(updates, 3, 1, max(5, updates // 20))
-  loop = Loop(learner, program, marks, seed=3, hooks=hooks)
+  loop = Loop(trainer, program, marks, seed=3, callbacks=callbacks)
   return loop.run(*(resumed or (loop.init(), None)))
 
 
@@ -59,13 +58,13 @@ def run(
   ids=["ppo", "sac"],
 )
 def test_it_learns_and_reports(config: Config, updates: int, names: tuple[str, ...]) -> None:
-  hooks = Recorder()
-  _, completed = run(config, hooks, updates=updates)
+  callbacks = Recorder()
+  _, completed = run(config, callbacks, updates=updates)
   assert completed
-  scores = [row["eval/episode_reward"] for _, row in hooks.rows if "eval/episode_reward" in row]
+  scores = [row["eval/episode_reward"] for _, row in callbacks.rows if "eval/episode_reward" in row]
   assert len(scores) == 3
   assert scores[-1] > 0.5 * scores[0], "the return is negative: half the distance is a clear gain"
-  steps, last = hooks.rows[-1]
+  steps, last = callbacks.rows[-1]
   assert steps == updates * built(config)[0].steps_per_update
   for name in (*names, "training/episode_reward", "eval/episode_distance"):
     assert np.isfinite(last[name]), name
@@ -80,45 +79,45 @@ def test_an_interrupted_run_goes_on_bit_for_bit(config: Config) -> None:
   _, completed = run(config, first)
   assert not completed
   update, saved = first.saved[-1]
-  learner, _ = built(config)
-  got, completed = run(config, second, resumed=(learner.place(saved), update))
+  trainer, _ = built(config)
+  got, completed = run(config, second, resumed=(trainer.place(saved), update))
   assert completed
   for a, b in zip(expected, numbers(got), strict=True):
     np.testing.assert_array_equal(a, b)
-  kept = [row for row in first.rows if row[0] <= update * learner.steps_per_update]
+  kept = [row for row in first.rows if row[0] <= update * trainer.steps_per_update]
   np.testing.assert_equal([*kept, *second.rows], whole.rows)
 
 
 @every_algorithm
 def test_a_training_call_of_any_length_is_one_program(config: Config) -> None:
-  learner, _ = built(config)
+  trainer, _ = built(config)
   model: dict[str, Any] = {}
-  state = learner.init(jax.random.PRNGKey(0), model)
+  state = trainer.init(jax.random.PRNGKey(0), model, None)
   for updates in (1, 3, 2):
-    state, _ = learner.train(state, model, np.int32(updates))
-  assert learner.train._cache_size() == 1
+    state, _ = trainer.train(state, model, np.int32(updates))
+  assert trainer.train._cache_size() == 1
 
 
 @every_algorithm
 def test_nan_in_first_observations_is_counted_and_kept_from_what_is_learned(config: Config) -> None:
-  learner, program = built(config, nan_reset=True)
-  state = program.init(jax.random.PRNGKey(0), {})
+  trainer, program = built(config, nan_reset=True)
+  state = program.init(jax.random.PRNGKey(0), {}, None)
   broken = np.asarray(state.env_state.info["nonfinite_reset"])
   assert 0 < broken.sum() < len(broken)
   state, metrics = program.train(state, {}, np.int32(8))
-  assert metrics["nonfinite"] == broken.mean() * 8 * learner.steps_per_update, "every step of these counts"
+  assert metrics["nonfinite"] == broken.mean() * 8 * trainer.steps_per_update, "every step of these counts"
   for leaf in numbers(state.replace(capture=None, env_state=None)):
     assert np.isfinite(leaf).all()
 
 
 @every_algorithm
 def test_nan_is_counted_captured_and_kept_from_the_parameters(config: Config) -> None:
-  hooks = Recorder()
-  state, _ = run(config, hooks, updates=8, nan_at=3)
-  assert sum(row.get("training/nonfinite", 0) for _, row in hooks.rows) > 0
+  callbacks = Recorder()
+  state, _ = run(config, callbacks, updates=8, nan_at=3)
+  assert sum(row.get("training/nonfinite", 0) for _, row in callbacks.rows) > 0
   for leaf in numbers(state.replace(capture=None, env_state=None)):
     assert np.isfinite(leaf).all()
-  captured = [captured for captured in hooks.captured if captured]
+  captured = [captured for captured in callbacks.captured if captured]
   assert np.isfinite(captured[0].state.data.qpos).all()
   assert np.isnan(captured[0].after["qpos"]).any()
 
@@ -137,11 +136,11 @@ class Rising(PointTask):
 
 @every_algorithm
 def test_a_fresh_start_of_all_environments_keeps_what_outlasts_a_reset(config: Config) -> None:
-  learner = ALGORITHMS[type(config)](Rising(), config, make_mesh(1), {})
+  trainer = Trainer(Rising(), config, make_mesh(1))
   model: dict[str, Any] = {}
-  state, _ = learner.train(learner.init(jax.random.PRNGKey(0), model), model, np.int32(1))
+  state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), model, None), model, np.int32(1))
   before = jax.device_get(state.env_state)
-  after = jax.device_get(learner.reset(state, jax.random.PRNGKey(1), model).env_state)
+  after = jax.device_get(trainer.reset(state, jax.random.PRNGKey(1), model).env_state)
   assert (before.info[PRESERVE_INFO]["level"] > 0).all()
   np.testing.assert_array_equal(after.info[PRESERVE_INFO]["level"], before.info[PRESERVE_INFO]["level"])
   assert not after.info["age"].any() and not np.array_equal(after.data.qpos, before.data.qpos)
@@ -149,9 +148,9 @@ def test_a_fresh_start_of_all_environments_keeps_what_outlasts_a_reset(config: C
 
 @every_algorithm
 def test_a_mean_over_nothing_is_left_out(config: Config) -> None:
-  hooks = Recorder()
-  run(config, hooks, updates=1)
-  _, row = hooks.rows[-1]
+  callbacks = Recorder()
+  run(config, callbacks, updates=1)
+  _, row = callbacks.rows[-1]
   assert row["training/episodes"] == 0
   assert not [name for name in row if name.startswith("training/episode_")]
   assert not any(np.isnan(value) for value in row.values())

@@ -1,0 +1,134 @@
+"""The interface of an algorithm. The trainer does what is the same for all (`playground.learning.trainer`)."""
+
+import abc
+import importlib
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax.flatten_util import ravel_pytree
+
+from playground.envs.base import Env, Observation
+from playground.hardware.mesh import AXIS
+from playground.learning.hyperparameters import AgentConfig
+from playground.learning.networks import Actor, Normalizer
+from playground.learning.replay import Replay, ReplayBuffer
+from playground.learning.rollout import Environments
+
+Metrics = dict[str, jax.Array]
+
+
+class Policy(struct.PyTreeNode):
+  """Parameters and observation statistics: all that acting needs, and what another run can start from.
+
+  Attributes:
+    params: of all networks; the actor's are `params.policy`.
+    normalizer: running mean and standard deviation of observations.
+  """
+
+  params: Any
+  normalizer: Normalizer
+
+
+class AlgorithmState(struct.PyTreeNode):
+  """What an algorithm learns, the same on every device. A subclass may add fields.
+
+  Attributes:
+    params, normalizer: see `Policy`.
+    opt_state: of the optimiser.
+    replay: experience of an algorithm that has a replay buffer, divided over the devices by environments.
+  """
+
+  params: Any
+  opt_state: Any
+  normalizer: Normalizer
+  replay: Replay | None = None
+
+
+ConfigT = TypeVar("ConfigT", bound=AgentConfig)
+NetworksT = TypeVar("NetworksT", bound=Actor)
+StateT = TypeVar("StateT", bound=AlgorithmState)
+
+
+class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
+  """An algorithm for one task: pure functions that run on every device, each with its share of the environments.
+
+  Collectives between the devices name the axis `AXIS`; its size is `jax.lax.axis_size(AXIS)`. A subclass takes
+  `(env, config, network_precision)` and fills `init` and `train_step`.
+
+  Attributes:
+    config: hyperparameters, checked.
+    networks: the actor, with the networks that only training needs.
+    replay: the buffer of an algorithm that trains on past experience, else None.
+  """
+
+  def __init__(self, config: ConfigT, networks: NetworksT, replay: ReplayBuffer | None = None):
+    self.config, self.networks, self.replay = config, networks, replay
+
+  @abc.abstractmethod
+  def init(self, key: jax.Array, policy: Policy | None) -> StateT:
+    """Returns the state of a new run, with the parameters and statistics of `policy` if there is one."""
+
+  @abc.abstractmethod
+  def train_step(self, state: StateT, envs: Environments, key: jax.Array) -> tuple[StateT, Environments, Metrics]:
+    """Collects experience and learns from it, once.
+
+    Args:
+      state: what was learned so far.
+      envs: this device's share of the environments.
+      key: of this device.
+
+    Returns:
+      The state and the environments after it, and float32 scalars, the same on all devices: means of what is logged,
+      `gradient_steps`, and `nonfinite_updates`, those of them that were left out. Where `learned` is 0, the means are
+      left out: there was nothing to learn from yet.
+    """
+
+  def policy(self, state: StateT) -> Policy:
+    """Returns what acting needs."""
+    return Policy(state.params, state.normalizer)
+
+  def act(self, policy: Policy, obs: Observation, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
+    """Returns actions in [-1, 1], [..., action_size]; deterministic as `deterministic_eval` says if not given."""
+    normalizer = policy.normalizer if self.config.normalize_observations else None
+    deterministic = self.config.deterministic_eval if deterministic is None else deterministic
+    return self.networks.act(policy.params.policy, normalizer, obs, key, deterministic)
+
+
+def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None) -> Algorithm[Any, Any, Any]:
+  """Imports and builds the algorithm that a config is of.
+
+  Raises:
+    ConfigError: sizes that do not go together, or networks that do not fit the task.
+  """
+  module, _, name = config.algorithm.partition(":")
+  make: Callable[..., Algorithm[Any, Any, Any]] = getattr(importlib.import_module(module), name)
+  return make(env, config, network_precision)
+
+
+def gradient_step(
+  optimizer: optax.GradientTransformation, grads: Any, params: jax.Array, opt_state: Any
+) -> tuple[jax.Array, Any, jax.Array, jax.Array]:
+  """Applies gradients, averaged over the devices; one that is not finite is left out.
+
+  Parameters travel as one vector: an array each would cost a GPU a kernel or two each.
+
+  Args:
+    optimizer: of `params`.
+    grads: a tree.
+    params: the raveled tree of parameters.
+    opt_state: of the optimiser.
+
+  Returns:
+    Parameters and optimiser after it, the gradient's norm, and whether it was finite.
+  """
+  flat = jax.lax.pmean(ravel_pytree(grads)[0], AXIS)
+  norm = jnp.linalg.norm(flat)
+  updates, new_opt_state = optimizer.update(flat, opt_state, params)
+  finite = jnp.isfinite(norm)
+  new = (optax.apply_updates(params, updates), new_opt_state)
+  params, opt_state = jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, (params, opt_state))
+  return params, opt_state, norm, finite

@@ -1,0 +1,257 @@
+"""What is the same for all algorithms: the training state, its division over devices, training steps, checkpoints."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+
+from playground.envs.base import Env, State
+from playground.envs.wrappers import PRESERVE_INFO, ModelFields, wrap_for_training
+from playground.errors import ConfigError
+from playground.hardware.distributed import several
+from playground.hardware.mesh import AXIS, device_memory, gather_on_mesh, jit_on_mesh, put
+from playground.learning.algorithm import AlgorithmState, Metrics, Policy, build_algorithm
+from playground.learning.checkpoints import Checkpoint
+from playground.learning.hyperparameters import AgentConfig
+from playground.learning.replay import REPLAY_SPEC, Replay
+from playground.learning.rollout import Environments, NonfiniteCapture
+
+
+class TrainState(struct.PyTreeNode):
+  """All that training goes on from: a run restored from it ends with the same parameters, bit for bit.
+
+  `env_state`, `capture` and `replay` are divided over the devices; the rest is the same on all of them.
+
+  Attributes:
+    algorithm: what is learned, its `replay` left out.
+    replay: experience, None without a replay buffer.
+    key: of the next training step.
+    env_state: a batch.
+    capture: the first step with a number that is not finite.
+  """
+
+  algorithm: Any
+  replay: Replay | None
+  key: jax.Array
+  env_state: State
+  capture: NonfiniteCapture
+
+
+class Trainer:
+  """Trains one algorithm on one task over a mesh of devices.
+
+  Attributes:
+    algorithm: what is trained.
+    env: the task as a batch that resets itself.
+    steps_per_update: environment steps of one training step, over all devices.
+    init: (key, model fields, policy or None) -> state of a new run.
+    train: (state, model fields, number of training steps) -> (state, metrics); takes the state's buffers over.
+    reset: (state, key, model fields) -> state with all environments reset, but for what outlasts a full reset; takes
+      the state's buffers over.
+    copy: (state) -> state in buffers of its own, as a checkpoint needs it.
+  """
+
+  def __init__(self, env: Env, config: AgentConfig, mesh: Mesh, network_precision: str | None = None):
+    """Builds the algorithm.
+
+    Args:
+      env: the task.
+      config: hyperparameters.
+      mesh: devices, one axis named "data".
+      network_precision: matrix-product precision of the networks.
+
+    Raises:
+      ConfigError: sizes that do not go together or do not divide over the devices, or networks that do not fit the
+        task.
+    """
+    config.check(mesh.size)
+    self.algorithm = build_algorithm(env, config, network_precision)
+    self.config, self.mesh, self.env = config, mesh, wrap_for_training(env)
+    self.act, self.networks = self.algorithm.act, self.algorithm.networks
+    self.steps_per_update = config.steps_per_update * env.action_repeat
+    self._buffer = self.algorithm.replay
+    if several() and self._buffer and self._buffer.saved:
+      raise ConfigError("agent.checkpoint_replay=true needs one process for all devices: set it to false.")
+    specs: dict[str, Any] = {"algorithm": P(), "key": P(), "env_state": P(AXIS), "capture": P(AXIS)}
+    spec = self._spec = TrainState(**specs, replay=REPLAY_SPEC if self._buffer else None)
+    self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS), P()), spec)
+    self.reset = jit_on_mesh(self._reset, mesh, (spec, P(), P(AXIS)), spec, donate_argnums=0)
+    self.train = jit_on_mesh(self._train, mesh, (spec, P(AXIS), P()), (spec, P()), donate_argnums=0)
+    copy = lambda state: jax.tree.map(jnp.copy, self._saved(state))
+    # Whole on every device where no process sees all of them.
+    self.copy = gather_on_mesh(copy, mesh, spec) if several() else jit_on_mesh(copy, mesh, (spec,), self._saved(spec))
+
+  def policy(self, state: TrainState) -> Policy:
+    """Returns what acting needs, and what a new run can start from."""
+    return self.algorithm.policy(state.algorithm)
+
+  def policy_shape(self) -> Policy:
+    """Returns a policy's structure, shapes and dtypes, to read one from a checkpoint; no environment is traced."""
+    make = lambda: Policy(self.networks.init(jax.random.PRNGKey(0)), self.networks.init_normalizer())
+    return jax.eval_shape(make)
+
+  def place_policy(self, policy: Policy) -> Policy:
+    """Puts a policy's host arrays on every device."""
+    return put(policy, self.mesh, P())
+
+  def notices(self) -> list[str]:
+    """Returns what a user should know before the state is allocated.
+
+    Raises:
+      ConfigError: it does not fit the devices.
+    """
+    buffer = self._buffer
+    if buffer is None:
+      return []
+    each, limit = buffer.nbytes / self.mesh.size, device_memory(self.mesh)
+    size = f"{buffer.size:,} transitions of {buffer.width} numbers, {each / 1e9:.2f} GB on each device"
+    size += ", and as much again while a checkpoint is saved" * buffer.saved
+    if limit is not None and each * (1 + buffer.saved) > limit:
+      raise ConfigError(
+        f"agent.max_replay_size={buffer.max_size} is {size}, but a device has {limit / 1e9:.2f} GB: "
+        "lower it, or set agent.checkpoint_replay=false."
+      )
+    return [f"Replay buffer: {size}."]
+
+  # Checkpoints
+
+  def split(self, state: TrainState) -> tuple[Policy, TrainState]:
+    """Returns the items `policy` and `state` of a checkpoint, which together are all but the replay buffer's data."""
+    rest = state.replace(algorithm=state.algorithm.replace(params=None, normalizer=None))
+    return self.policy(state), self._without_data(rest)
+
+  def experience(self, state: TrainState) -> np.ndarray | None:
+    """Returns the replay buffer's data on the host; it is large, so only the newest checkpoint has it."""
+    if self._buffer is None or not self._buffer.saved:
+      return None
+    replay: Any = state.replay
+    return np.asarray(replay.data)[: int(self._buffer.held(replay))]
+
+  def restore(self, checkpoint: Checkpoint, template: TrainState) -> tuple[TrainState, str]:
+    """Reads a training state.
+
+    Args:
+      checkpoint: where from.
+      template: the state's structure, shapes and dtypes.
+
+    Returns:
+      The state, on the devices, and a sentence for the user on what it is.
+
+    Raises:
+      CheckpointError: damaged, or made for other shapes.
+    """
+    policy, rest = self.split(template)
+    leaves = {name: shape for name, shape, _ in checkpoint.meta["leaves"]["state"]}
+    there, here = leaves.get(".capture.found", [self.mesh.size])[0], self.mesh.size
+    theirs = jax.tree.map(lambda x: jax.ShapeDtypeStruct((there, *x.shape[1:]), x.dtype), rest.capture)
+    rest = checkpoint.restore("state", rest.replace(capture=theirs))
+    policy = checkpoint.restore("policy", policy)
+    replay, what = self._restore_replay(checkpoint, template, rest.replay)
+    algorithm = rest.algorithm.replace(params=policy.params, normalizer=policy.normalizer)
+    state = rest.replace(algorithm=algorithm, replay=replay, capture=rest.capture.on_devices(here))
+    elsewhere = (
+      f" It was written on {there} device{'s' * (there > 1)}: on {here}, all of it goes on, but random numbers and "
+      "rounding differ from here on."
+    )
+    said = f"Resuming {what} of {checkpoint.path} ({checkpoint.step:,} steps).{elsewhere * (there != here)}"
+    return self.place(state), said
+
+  def place(self, state: TrainState) -> TrainState:
+    """Puts a state's host arrays on the devices, each its share."""
+    return put(state, self.mesh, self._spec)
+
+  def _restore_replay(self, checkpoint: Checkpoint, template: TrainState, replay: Any) -> tuple[Replay | None, str]:
+    """Returns the replay buffer, empty if the checkpoint has none, and what the user is told of the state."""
+    whole = "the whole training state"
+    if self._buffer is None or template.replay is None:
+      return None, whole
+    shape = template.replay.data.shape
+    data = np.zeros(shape, np.float32)
+    if checkpoint.has("replay"):
+      held = min(int(replay.inserted), self._buffer.slots)
+      data[:held] = checkpoint.restore("replay", jax.ShapeDtypeStruct((held, *shape[1:]), jnp.float32))
+      return Replay(data, replay.inserted), whole
+    refill = f"{self.config.prefill_updates * self.config.num_envs:,} transitions are collected before it learns on"
+    return Replay(data, np.zeros_like(replay.inserted)), f"the training state without its replay buffer ({refill})"
+
+  def _saved(self, state: Any) -> Any:
+    """Returns what a checkpoint needs of a state, or of its specs."""
+    return self._without_data(state) if self._buffer and not self._buffer.saved else state
+
+  def _without_data(self, state: Any) -> Any:
+    return state if state.replay is None else state.replace(replay=state.replay.replace(data=None))
+
+  # On each device
+
+  def _init(self, key: jax.Array, model: ModelFields, policy: Policy | None) -> TrainState:
+    key, algorithm_key, env_key = jax.random.split(key, 3)
+    algorithm = self.algorithm.init(algorithm_key, policy)
+    env_state = self._reset_environments(env_key, model)
+    capture = NonfiniteCapture.empty(env_state, self.env.action_size, model)
+    return _train_state(algorithm, key, env_state, capture)
+
+  def _reset(self, state: TrainState, key: jax.Array, model: ModelFields) -> TrainState:
+    fresh = self._reset_environments(key, model)
+    kept = {k: v for k, v in state.env_state.info.items() if k == PRESERVE_INFO}
+    return state.replace(env_state=fresh.replace(info=fresh.info | kept))
+
+  def _reset_environments(self, key: jax.Array, model: ModelFields) -> State:
+    """Resets this device's share of the environments, with keys that no other device has."""
+    device = jax.lax.axis_index(AXIS)
+    reset_keys = jax.random.split(jax.random.fold_in(key, device), self.config.num_envs // self.mesh.size)
+    state = self.env.reset(reset_keys, model)
+    if not self.config.random_episode_ages:
+      return state
+    age_key, steps = jax.random.fold_in(jax.random.split(key)[0], device), state.info["steps"]
+    age = jax.random.randint(age_key, steps.shape, 0, self.env.episode_length).astype(steps.dtype)
+    return state.replace(info=state.info | {"steps": age})
+
+  def _train(self, state: TrainState, model: ModelFields, num_updates: jax.Array) -> tuple[TrainState, Metrics]:
+    """`num_updates` training steps; the number is an argument, so any number of them is one compiled program."""
+    train_step = jax.jit(self._train_step)  # so that asking for its shapes and calling it is one trace
+    shapes = jax.eval_shape(train_step, state, model)[1]
+    total, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+
+    def body(_: int, carry: tuple[TrainState, jax.Array]) -> tuple[TrainState, jax.Array]:
+      state, total = carry
+      state, metrics = train_step(state, model)
+      return state, total + ravel_pytree(metrics)[0]  # one vector: an addition each costs a kernel each
+
+    state, total = jax.lax.fori_loop(0, num_updates, body, (state, total))
+    return state, _means(unravel(total))
+
+  def _train_step(self, state: TrainState, model: ModelFields) -> tuple[TrainState, Metrics]:
+    key, shared = jax.random.split(state.key)
+    envs = Environments(state.env_state, state.capture, model, {}, self.env)
+    algorithm, envs, metrics = self.algorithm.train_step(
+      state.algorithm.replace(replay=state.replay), envs, jax.random.fold_in(shared, jax.lax.axis_index(AXIS))
+    )
+    metrics = {"learned": jnp.ones(())} | metrics | jax.lax.psum(envs.sums, AXIS)
+    return _train_state(algorithm, key, envs.state, envs.capture), metrics
+
+
+def _train_state(algorithm: AlgorithmState, key: jax.Array, env_state: State, capture: NonfiniteCapture) -> TrainState:
+  without: Any = algorithm.replace(replay=None)
+  return TrainState(algorithm=without, replay=algorithm.replay, key=key, env_state=env_state, capture=capture)
+
+
+_COUNTS = ("episodes", "nonfinite", "gradient_steps", "nonfinite_updates", "overflows")
+
+
+def _means(total: Metrics) -> Metrics:
+  """Means over training steps that learned and, for what ended, over episodes; counts stay counts.
+
+  A mean over nothing is NaN, which the log leaves out.
+  """
+  learned, means = total.pop("learned"), {}
+  for name, value in total.items():
+    if name.startswith("episode_"):
+      means[{"episode_sum_reward": "episode_reward"}.get(name, name)] = value / total["episodes"]
+    else:
+      means[name] = value if name in _COUNTS else value / learned
+  return means
