@@ -29,9 +29,9 @@ PAGES = (*DOCS.glob("*.md"), REPOSITORY / "README.md")
 NOTEBOOK = DOCS / "first_policy.ipynb"
 MISTAKE = "joint_powr_l1"  # which a page misspells
 # Names that a page introduces itself.
-OWN = ("SlideToTarget", "go1_worn", "=pup", "PupJoystick", "go1_in_wind", MISTAKE)
+OWN = ("SlideToTarget", "go1_worn", "=pup", "PupJoystick", "go1_in_wind", "reinforce", MISTAKE)
 # Pages that write out the files of a package of tests/packages, and the files that only the page has.
-PACKAGE_PAGES = {"add-a-robot.md": "robot_only", "add-a-reward.md": "terms_only"}
+PACKAGE_PAGES = {"add-a-robot.md": "robot_only", "add-a-reward.md": "terms_only", "add-an-algorithm.md": "reinforce"}
 ONLY_ON_A_PAGE = ("robot_only/robot_only/configs/env/PupJoystick.yaml",)
 
 
@@ -131,13 +131,15 @@ def test_the_commands_and_the_code_of_the_pages_on_packages(tmp_path: Path):
   written = write({name: text for page in PACKAGE_PAGES for name, text in files(page).items()}, tmp_path / "written")
   for package in PACKAGE_PAGES.values():
     install(written / package, tmp_path / "site")
-  commands = [words for words in run_commands() if names(words, "=pup", "PupJoystick", "go1_in_wind")]
+  commands = [words for words in run_commands() if names(words, "=pup", "PupJoystick", "go1_in_wind", "reinforce")]
   assert len(commands) >= 4
   (code,) = blocks("add-a-robot.md", "python")[1:]
   composed = f"""
 from playground.config import compose
+from playground.sweep.plan import compose_jobs
 for words in {commands!r}:
-  compose([word for word in words if "=" in word])
+  overrides = [word for word in words if "=" in word]
+  compose_jobs(overrides) if "-m" in words else compose(overrides)
 config = compose(["env=PupJoystick"]).env
 assert config.robot.name == "pup" and config.rewards.feet_clearance.weight == -2.0
 assert config.commands.velocity.params.max == [0.8, 0.4, 1.0]

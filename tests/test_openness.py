@@ -1,4 +1,4 @@
-"""Packages of somebody else add robots, rewards, observations and events: see tests/packages."""
+"""Packages of somebody else add robots, rewards, observations, events and algorithms: see tests/packages."""
 
 import json
 from pathlib import Path
@@ -30,6 +30,11 @@ def robot_only(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def terms_only(tmp_path_factory: pytest.TempPathFactory) -> Path:
   return install(PACKAGES / "terms_only", tmp_path_factory.mktemp("terms_only"))
+
+
+@pytest.fixture(scope="module")
+def reinforce(tmp_path_factory: pytest.TempPathFactory) -> Path:
+  return install(PACKAGES / "reinforce", tmp_path_factory.mktemp("reinforce"))
 
 
 def test_a_package_with_a_robot_alone(robot_only: Path):
@@ -116,6 +121,63 @@ def test_terms_of_a_module_that_the_user_trusts():
     assert "height" in [term.name for term in registry.build(config).rewards.terms]
     """
   run(PACKAGES / "terms_only", "-c", code)
+
+
+def test_settings_of_an_algorithm_are_checked_before_jax_is_imported(reinforce: Path):
+  code = """
+    import sys
+    from playground.config import compose
+    from playground.errors import PlaygroundError
+
+    assert compose(["agent=reinforce", "agent.unroll_length=20"]).agent.learning_rate == 1e-3
+    for override, sentence in {
+      "agent=reinforc": "agent=reinforc does not exist: choose from",
+      "agent.unrol_length=2": "Did you mean 'agent.unroll_length'?",
+      "agent.discounting=2": "agent.discounting=2.0 must be a number from 0 to 1",
+    }.items():
+      try:
+        compose(["agent=reinforce", override] if "." in override else [override])
+      except PlaygroundError as error:
+        assert sentence in str(error), error
+      else:
+        raise AssertionError(override)
+    assert "jax" not in sys.modules
+    """
+  run(reinforce, "-c", code)
+
+
+def test_an_algorithm_of_a_package_trains_resumes_and_is_exported(reinforce: Path, tmp_path: Path):
+  """A resumed run ends bit for bit as one that never stopped."""
+  code = f"""
+    from playground.config import compose
+    from playground.deploy.export import export_run
+    from playground.runs.job import Job
+    from playground.runs.run_dir import RunDirectory
+    from playground.runs.train import train
+
+    fast = ["env=CartpoleBalance", "agent=reinforce", "debug=fast", "hardware=cpu", "tracking=csv"]
+    whole, parts = ({str(tmp_path)!r} + name for name in ("/whole", "/parts"))
+    assert train(compose([*fast, f"run_dir={{whole}}"])) == 0
+    should_stop = Job.should_stop
+    Job.should_stop = lambda job: job._step >= 160
+    train(compose([*fast, f"run_dir={{parts}}"]))
+    assert RunDirectory(parts).status["status"] == "preempted"
+    Job.should_stop = should_stop
+    assert train(compose([f"resume={{parts}}"])) == 0
+    for key in ("params_sha256", "final_return", "steps"):
+      assert RunDirectory(parts).summary[key] == RunDirectory(whole).summary[key], key
+    assert export_run(whole) == 0
+    """
+  run(reinforce, "-c", code)
+  assert (tmp_path / "whole" / "export" / "policy.onnx").is_file()
+
+
+@pytest.mark.slow
+def test_a_sweep_over_an_algorithm_of_a_package(reinforce: Path, tmp_path: Path):
+  options = ("debug=fast", "hardware=cpu", "tracking=csv", f"sweep_dir={tmp_path / 'sweep'}")
+  run(reinforce, "-m", "playground.cli.run", "-m", "env=CartpoleBalance", "agent=ppo,reinforce", *options)
+  summaries = [json.loads(path.read_text()) for path in (tmp_path / "sweep").glob("**/summary.json")]
+  assert [summary["status"] for summary in summaries] == ["finished"] * 2
 
 
 @pytest.mark.slow

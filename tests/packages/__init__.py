@@ -1,4 +1,4 @@
-"""Packages of somebody else that tests install: a robot alone, and terms alone. docs/ shows their files."""
+"""Packages of somebody else that tests install: a robot alone, terms alone, an algorithm. docs/ shows their files."""
 
 import os
 import shutil

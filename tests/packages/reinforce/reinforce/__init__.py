@@ -1,0 +1,5 @@
+"""REINFORCE for playground-run."""
+
+from pathlib import Path
+
+CONFIGS = Path(__file__).parent / "configs"
