@@ -8,11 +8,11 @@ import mujoco
 from mujoco.mjx._src.math import axis_angle_to_quat, quat_to_mat
 
 from playground.envs.manipulation import arm, handover, peg, pick_cartesian, push
-from playground.envs.manipulation.tabletop import TabletopTask
+from playground.envs.manipulation.arm import TabletopTask
 from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.envs.wrappers import PRESERVE_INFO
-from playground.mdp.arms import ArmContext, ArmRobot
+from playground.mdp.manipulators import ArmContext, ArmRobot
 from playground.robots.panda.kinematics import JOINT_RANGE
 
 
@@ -71,7 +71,7 @@ class OpenCabinet(ArmTask):
 class PickCubeCartesian(_NoForward, pick_cartesian.PickCubeCartesian):
   """The cube starts 3 cm inside the floor, the hand is called back from a start with the cube, no limits are known."""
 
-  episode_info = ("reached_box", "first_step", "best_reward", "current_pos", "last_act")
+  episode_info = ("reached_box", "first_step", "best_potential", "current_pos", "last_act")
 
   def __init__(self, config: Any):
     super().__init__(config)

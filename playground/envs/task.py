@@ -186,7 +186,8 @@ class Task(Env):
     ended = {name: value.astype(jnp.float32) for name, value in self.terminations.compute(c).items()}
     metrics = {f"reward/{name}": value for name, value in rewards.items()}
     metrics |= {f"termination/{name}": value for name, value in ended.items()}
-    return metrics | {"fall": c.terminated.astype(jnp.float32)} | self.measure(c)
+    failures = [ended[term.name] for term in self.terminations.terms if not term.options.success]
+    return metrics | {"fall": jnp.array(failures, jnp.float32).max(initial=0.0)} | self.measure(c)
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:

@@ -23,8 +23,18 @@ class RewardOptions(NamedTuple):
   when: Mapping[str, float] | None = None
 
 
-class NoOptions(NamedTuple):
-  """Terminations and commands have no keys besides `func` and `params`."""
+class TerminationOptions(NamedTuple):
+  """Keys of a termination term.
+
+  Attributes:
+    success: the term ends the episode because the task is done: the metric `fall` does not count it.
+  """
+
+  success: bool = False
+
+
+class CommandOptions(NamedTuple):
+  """A command term has no keys besides `func` and `params`."""
 
 
 class ObservationOptions(NamedTuple):
@@ -69,8 +79,8 @@ def is_model_field(name: str, entry: Any) -> bool:
 OPTIONS: dict[str, type] = {
   "rewards": RewardOptions,
   "observations": ObservationOptions,
-  "terminations": NoOptions,
-  "commands": NoOptions,
+  "terminations": TerminationOptions,
+  "commands": CommandOptions,
   "events": EventOptions,
 }
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 
 from playground.limits import AtLeast0
 from playground.mdp.context import StepContext
-from playground.mdp.hands import HandContext
 from playground.mdp.legged import LeggedContext
+from playground.mdp.manipulators import HandContext
 
 
 def nonfinite_state(c: StepContext) -> jax.Array:

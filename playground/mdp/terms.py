@@ -32,15 +32,11 @@ from playground.trust import trusted_object
 
 # Modules whose public functions and classes are the registered terms of a kind.
 MODULES = {
-  "rewards": ("playground.mdp.rewards", "playground.mdp.hand_rewards", "playground.mdp.arm_rewards"),
-  "observations": (
-    "playground.mdp.observations",
-    "playground.mdp.hand_observations",
-    "playground.mdp.arm_observations",
-  ),
-  "terminations": ("playground.mdp.terminations", "playground.mdp.arm_terminations"),
+  "rewards": ("playground.mdp.rewards", "playground.mdp.manipulation_rewards"),
+  "observations": ("playground.mdp.observations", "playground.mdp.manipulation_observations"),
+  "terminations": ("playground.mdp.terminations", "playground.mdp.manipulation_terminations"),
   "commands": ("playground.mdp.commands",),
-  "events": ("playground.mdp.events", "playground.mdp.arm_events"),
+  "events": ("playground.mdp.events", "playground.mdp.manipulation_events"),
 }
 # How many leading arguments of a function are no parameters: the context; key, task and state of reset events.
 _LEADING = {"rewards": 1, "observations": 1, "terminations": 1, "commands": 0, "events": 3}

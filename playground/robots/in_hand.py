@@ -4,8 +4,7 @@ from typing import Any
 
 import mujoco
 
-from playground.errors import ConfigError
-from playground.mdp.lookup import lookup
+from playground.errors import ConfigError, lookup
 from playground.robots.scene import add_studio_floor, attach, read_mjcf
 
 # How the cube lies in the keyframe `home` (w x y z), and where the goal is then (m).

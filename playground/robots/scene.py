@@ -18,8 +18,7 @@ from typing import Any
 import mujoco
 
 from playground.config.text import first_line
-from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.mdp.lookup import lookup
+from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 from playground.robots.terrain import add_terrain
 
 ROBOTS = Path(__file__).parent

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from playground.mdp.lookup import lookup
+from playground.errors import lookup
 from playground.robots.scene import add_contact_sensor, add_studio_floor, attach, load
 
 # Pose from which the Panda picks things up: joints (rad), fingers (m).

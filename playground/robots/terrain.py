@@ -11,8 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.mdp.lookup import lookup
+from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 
 HALF_EXTENT = 10.0  # m, of the square
 POINTS = 256  # a side: 0.078 m apart

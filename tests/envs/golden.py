@@ -20,8 +20,7 @@ from playground.config.files import options
 from playground.envs.base import Env, State
 from playground.envs.dm_control.suite import SuiteTask
 from playground.envs.locomotion.legged import LeggedTask
-from playground.envs.manipulation.arm import ArmTask
-from playground.envs.manipulation.bimanual import Bimanual
+from playground.envs.manipulation.arm import ArmTask, Bimanual
 from playground.envs.manipulation.in_hand import HandTask
 from playground.envs.manipulation.pick_cartesian import PickCubeCartesian
 from playground.envs.manipulation.push import PushCube
@@ -157,7 +156,7 @@ _REWARDS: dict[str, tuple[str, ...]] = {
 _RENAMED = {  # upstream's names for what others of its tasks call otherwise
   "info/goal_quat_dquat": "info/goal_spin",
   "info/prev_potential": "info/best_potential",
-  "info/prev_reward": "info/best_reward",
+  "info/prev_reward": "info/best_potential",
   "info/prev_action": "info/last_act",
   "info/last_action": "info/last_act",
   "info/curriculum_id": "info/AutoResetWrapper_preserve_info/curriculum_id",

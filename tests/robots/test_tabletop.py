@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from playground.errors import UnknownNameError
-from playground.mdp.arms import contact_addresses
+from playground.mdp.manipulators import contact_addresses
 from playground.robots.tabletop import TABLETOPS, build_tabletop
 from tests.robots.figures import figures
 

@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.base import State
-from playground.envs.manipulation.bimanual import Bimanual
+from playground.envs.manipulation.arm import Bimanual, ProgressTask
 from playground.envs.physics import PhysicsData, mjx
-from playground.mdp.arms import ArmContext
-from playground.mdp.progress import progress
+from playground.mdp.manipulators import ArmContext
 
 _MEETING = (0.0, 0.0, 0.24)  # m, where the box changes hands
 _PICK_X, _PASS_X = -0.1, 0.0  # m: the box's x up to which it is the left hand's, and from which the right one's
@@ -19,7 +18,7 @@ _DROP_COST = 0.1
 _HOLDING_RATE = 0.02  # of the potential, paid in every step once the right hand has the box
 
 
-class HandOver(Bimanual):
+class HandOver(ProgressTask, Bimanual):
   """The left arm picks the box up and passes it to the right one, which brings it to the goal. (Not in the paper.)
 
   The reward is what the terms' weighted mean gains over its best so far in the episode; a dropped box costs and ends
@@ -29,29 +28,24 @@ class HandOver(Bimanual):
   its own side, when the episode ends; `position_error_cm` how far the box is then.
   """
 
-  # `first_step`: no step was made since the reset.
-  episode_info = (*Bimanual.episode_info, "first_step", "best_potential", "picked")
+  episode_info = (*ProgressTask.episode_info, "picked")
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
-    return {"first_step": jnp.ones((), bool), "best_potential": jnp.zeros(()), "picked": jnp.zeros((), bool)}
+    return super().first_info(data, key, model) | {"picked": jnp.zeros((), bool)}
 
   def next_info(self, c: ArmContext, key: jax.Array) -> dict[str, Any]:
-    return {"first_step": jnp.zeros((), bool), "picked": c.info["picked"] | (c.object_pos[2] > _LIFTED)}
+    return super().next_info(c, key) | {"picked": c.info["picked"] | (c.object_pos[2] > _LIFTED)}
+
+  def bonus(self, c: ArmContext, potential: jax.Array) -> jax.Array:
+    left_x = c.site_pos("left/gripper")[0]
+    return _HOLDING_RATE * potential * _beyond(-left_x, 0.0) * _beyond(c.object_pos[0], 0.1)
 
   def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     state = super().post_step(data, info, action)
-    c = ArmContext(self, data, info, action)
-    potential, left_x = state.reward, c.site_pos("left/gripper")[0]
-    gain, best = progress(potential, info["best_potential"])
-    reward = gain + _HOLDING_RATE * potential * _beyond(-left_x, 0.0) * _beyond(c.object_pos[0], 0.1)
-    reward = jnp.where(info["first_step"], 0.0, reward)  # what the start itself is worth is no progress
-    return state.replace(reward=reward - _DROP_COST * dropped(c), info=state.info | {"best_potential": best})
+    return state.replace(reward=state.reward - _DROP_COST * dropped(ArmContext(self, data, info, action)))
 
   def at_goal(self, c: ArmContext) -> jax.Array:
-    return (jnp.linalg.norm(c.to_goal) < self.config.success_distance) & (c.site_pos("left/gripper")[0] < 0)
-
-  def measure(self, c: ArmContext) -> dict[str, jax.Array]:
-    return {"success": c.at_goal.astype(jnp.float32), "position_error_cm": 100 * jnp.linalg.norm(c.to_goal)}
+    return super().at_goal(c) & (c.site_pos("left/gripper")[0] < 0)
 
 
 def dropped(c: ArmContext) -> jax.Array:

@@ -11,8 +11,8 @@ import numpy as np
 from playground.envs.base import State
 from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState, Task
-from playground.mdp.hands import Hand, HandContext
-from playground.mdp.lookup import lookup
+from playground.errors import lookup
+from playground.mdp.manipulators import Hand, HandContext
 from playground.mdp.pose_noise import Pose, sensed_pose
 from playground.robots.in_hand import build_in_hand_scene
 
@@ -20,7 +20,7 @@ _AWAY = (-100.0, -100.0, -100.0)  # m, where a goal is that the task does not ha
 
 # What an action is added to: the targets that hold the keyframe `home`, or those of the step before.
 _ACTION_BASES: dict[str, Callable[[Hand, PhysicsData], jax.Array]] = {
-  "home": lambda hand, data: hand.default_ctrl,
+  "home": lambda hand, data: hand.init_ctrl,
   "last_target": lambda hand, data: data.ctrl,
 }
 
@@ -73,7 +73,7 @@ class HandTask(Task):
     return super().initial_state(key, model).replace(mocap_pos=jnp.array([_AWAY]))
 
   def rest_ctrl(self, initial: InitialState) -> jax.Array:
-    return initial.qpos[self.robot.qpos] if self.robot.has_servos else self.robot.default_ctrl
+    return initial.qpos[self.robot.qpos] if self.robot.has_servos else self.robot.init_ctrl
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     return {"pose_key": key} if self.pose_noise else {}
@@ -87,7 +87,7 @@ class HandTask(Task):
 
   def action_to_ctrl(self, state: State, action: jax.Array) -> jax.Array:
     target = self._action_base(self.robot, state.data) + self._action_scale * action
-    target = jnp.clip(target, *self.robot.target_range)
+    target = jnp.clip(target, *self.robot.ctrl_range)
     return self._smoothing * target + (1 - self._smoothing) * state.data.ctrl
 
   def sense_cube(self, info: Mapping[str, Any], pose: Pose) -> Pose:

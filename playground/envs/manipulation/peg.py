@@ -6,10 +6,10 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from playground.envs.manipulation.bimanual import Bimanual
+from playground.envs.manipulation.arm import Bimanual
 from playground.limits import AtLeast0
-from playground.mdp.arm_rewards import joint_deviation_tolerance, site_body_distance_tolerance
-from playground.mdp.arms import ArmContext
+from playground.mdp.manipulation_rewards import joint_deviation_tolerance, site_body_distance_tolerance
+from playground.mdp.manipulators import ArmContext
 from playground.mdp.tolerance import tolerance
 
 _IN_LINE = 0.005  # m off the socket's axis, within which the peg slides in

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.base import State
-from playground.envs.manipulation.arm import ArmTask
+from playground.envs.manipulation.arm import ArmTask, ProgressTask
 from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.mdp import delays
-from playground.mdp.arms import ArmContext
-from playground.mdp.progress import progress
+from playground.mdp.manipulators import ArmContext
 from playground.robots.panda.kinematics import forward_kinematics, inverse_kinematics, within_limits
 
 _WORKSPACE = jnp.array([[0.25, -0.32, 0.02], [0.77, 0.32, 0.5]])  # m, where the tip may be sent
@@ -21,7 +20,7 @@ _GOAL_HEIGHT = 0.2  # m
 _GRIP_STEP = 0.02  # m: two steps close the open fingers
 
 
-class PickCubeCartesian(ArmTask):
+class PickCubeCartesian(ProgressTask, ArmTask):
   """Lifts a cube to a goal above the middle of where it may lie (paper, appendix "Manipulation").
 
   Actions: where the hand's tip goes along y and z, in parts of `action_scale`, and whether the fingers close (below 0)
@@ -30,8 +29,7 @@ class PickCubeCartesian(ArmTask):
   cube in the hand.
   """
 
-  # `first_step`: no step was made since the reset.
-  episode_info = (*ArmTask.episode_info, "first_step", "best_reward", "current_pos", "no_solution", "action_history")
+  episode_info = (*ProgressTask.episode_info, "reached_box", "current_pos", "no_solution", "action_history")
 
   def __init__(self, config: Any):
     """Builds the scene. `config`: see `configs/env/PandaPickCubeCartesian.yaml`."""
@@ -58,8 +56,6 @@ class PickCubeCartesian(ArmTask):
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     return super().first_info(data, key, model) | {
-      "first_step": jnp.ones((), bool),
-      "best_reward": jnp.zeros(()),
       "current_pos": self._tip,
       "no_solution": jnp.zeros(()),
       "action_history": jnp.zeros(self.config.gripper_delay + 1),
@@ -91,20 +87,9 @@ class PickCubeCartesian(ArmTask):
     action, history = self._delayed(info, action)
     # From the servos' new targets this is the plan that they came from: joint 7 is the same, and so is the branch.
     tip, _, solved = self._plan(data.ctrl, info, action)
-    info = {**info, "no_solution": 1 - solved.astype(jnp.float32)}
-    state = super().post_step(data, info, action)
-    gain, best = progress(state.reward, info["best_reward"])
-    reward = jnp.where(info["first_step"], 0.0, gain)  # what the start itself is worth is no progress
-    return state.replace(
-      reward=reward,
-      info=state.info
-      | {
-        "first_step": jnp.zeros((), bool),
-        "best_reward": best,
-        "current_pos": self._tip_after(info["current_pos"], tip, solved),
-        "action_history": history,
-      },
-    )
+    state = super().post_step(data, {**info, "no_solution": 1 - solved.astype(jnp.float32)}, action)
+    tip = self._tip_after(info["current_pos"], tip, solved)
+    return state.replace(info=state.info | {"current_pos": tip, "action_history": history})
 
   def next_info(self, c: ArmContext, key: jax.Array) -> dict[str, Any]:
     return super().next_info(c, key) | {"action_delay": delays.draw_delay(key, (0, self.config.gripper_delay))}

@@ -14,8 +14,8 @@ from playground.envs.task import InitialState
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.errors import ConfigError
 from playground.mdp import delays
-from playground.mdp.arms import ArmContext
 from playground.mdp.managers import ACTOR, ObservationManager
+from playground.mdp.manipulators import ArmContext
 
 _ARM, _BOX = slice(0, 7), slice(13, 16)  # joints, and the block's position, in qpos
 # Where the block and its goal may be drawn (m).

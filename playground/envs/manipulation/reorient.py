@@ -11,7 +11,7 @@ from playground.envs.base import State
 from playground.envs.manipulation.in_hand import HandTask
 from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
-from playground.mdp.hands import HandContext
+from playground.mdp.manipulators import HandContext
 from playground.mdp.rotations import uniform_quat
 
 _BONUS = "success"  # the reward term that is not times dt

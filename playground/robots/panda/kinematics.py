@@ -22,13 +22,9 @@ FLANGE = 0.107  # m from joint 6's axis, along joint 7's
 TIP = FLANGE + 0.1034  # the manufacturer's tip of the hand, between the ends of its fingers
 HAND_TURN = -jnp.pi / 4  # rad, of the hand on the flange
 
-JOINT_RANGE = jnp.array(
-  [
-    [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973],
-    [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973],
-  ]
-)  # rad, lower and upper
-MAX_VELOCITY = jnp.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])  # rad/s
+_LOWER = [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973]
+_UPPER = [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973]
+JOINT_RANGE = jnp.array([_LOWER, _UPPER])  # rad, lower and upper
 
 
 def forward_kinematics(q: jax.Array, tip: float = TIP) -> tuple[jax.Array, jax.Array]:

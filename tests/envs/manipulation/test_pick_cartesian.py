@@ -85,7 +85,7 @@ def test_0_2_0_moves_on_where_the_arm_cannot_go(state: State) -> None:
 
 def test_only_progress_pays(task: Any, state: State) -> None:
   still = (0, 0, 1)
-  calm = state.replace(info=state.info | {"best_reward": jnp.zeros(()), "last_act": jnp.array([0.0, 0, 1])})
+  calm = state.replace(info=state.info | {"best_potential": jnp.zeros(()), "last_act": jnp.array([0.0, 0, 1])})
   first = step(task, calm, still, box=(0.63, 0, 0.03))
   assert first.reward > 0.3
   again = step(task, calm.replace(info=first.info), still, box=(0.63, 0, 0.03))
@@ -98,15 +98,18 @@ def test_only_progress_pays(task: Any, state: State) -> None:
 
 
 def test_the_first_step_pays_nothing(task: Any, state: State) -> None:
-  new = state.replace(info=state.info | {"first_step": jnp.array(True), "best_reward": jnp.zeros(())})
+  new = state.replace(info=state.info | {"first_step": jnp.array(True), "best_potential": jnp.zeros(())})
   after = step(task, new, (0, 0, 1))
-  assert after.reward == 0 and after.info["best_reward"] > 0.3 and not after.info["first_step"]
+  assert after.reward == 0 and after.info["best_potential"] > 0.3 and not after.info["first_step"]
 
 
 @pytest.mark.parametrize(("offset", "success"), [(0.049, 1), (0.051, 0)])
 def test_success_ends_the_episode(task: Any, state: State, offset: float, success: int) -> None:
   after = step(task, state, (0, 0, -1), box=np.add(state.data.mocap_pos[0], [0, offset, 0]))
   assert (after.done, after.metrics["success"]) == (success, success)
+  assert (after.metrics["fall"], after.metrics["termination/object_at_goal"]) == (0, success)
+  away = step(task, state, (0, 0, -1), box=(1.1, 0, 0.03))
+  assert (away.done, away.metrics["fall"], away.metrics["termination/object_at_goal"]) == (1, 1, 0)
   assert after.metrics["reward/object_at_goal"] == 2 * success
 
 

@@ -11,7 +11,7 @@ from playground.errors import ConfigError
 from playground.limits import AtLeast0, Vector
 
 if TYPE_CHECKING:
-  from playground.envs.manipulation.tabletop import TabletopTask
+  from playground.envs.manipulation.arm import TabletopTask
   from playground.envs.task import InitialState
 
 
@@ -58,7 +58,7 @@ def reset_joints_uniform(
 ) -> "InitialState":
   """Adds U[low, high) rad to each joint of the arm, within its range; the servos hold it there."""
   robot = env.robot
-  joints = initial.qpos[robot.qpos] + _uniform(key, low, high, len(robot.qpos))
+  joints = initial.qpos[robot.qpos] + _uniform(key, low, high, len(robot.joint_names))
   joints = jnp.clip(joints, *robot.joint_range)
   ctrl = robot.init_ctrl if initial.ctrl is None else initial.ctrl
   qpos = initial.qpos.at[robot.qpos].set(joints)

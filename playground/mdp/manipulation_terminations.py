@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from playground.limits import Share
-from playground.mdp.arms import ArmContext
 from playground.mdp.context import StepContext
+from playground.mdp.manipulators import ArmContext
 
 Bounds = Sequence[float | None]
 

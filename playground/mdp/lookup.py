@@ -1,3 +1,0 @@
-"""Moved to `playground.errors`."""
-
-from playground.errors import lookup as lookup
