@@ -14,7 +14,7 @@ from playground.envs.manipulation.in_hand import HandTask
 from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.mdp import events
-from playground.mdp.pose_noise import Pose, sensed_pose
+from playground.mdp.poses import Pose, sensed_pose
 
 
 class _HandTask(HandTask):

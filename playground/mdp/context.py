@@ -85,10 +85,10 @@ class Robot:
     return np.array(sorted(found))
 
   def check_names(self, params: Mapping[str, Any], key: str) -> None:
-    """Raises UnknownNameError where parameters of a term name joints or sensors that the robot does not have.
+    """Raises UnknownNameError where parameters of a term name parts that the robot or its scene does not have.
 
     Args:
-      params: of the term; `joints`, `sensor` and `sensors` count.
+      params: of the term; `joints`, `sensor`, `sensors`, `body`, `site` and `geom` count.
       key: that of `params` in the configuration.
     """
     if "joints" in params:
@@ -96,6 +96,9 @@ class Robot:
     for name in ("sensor", "sensors"):
       for sensor in (params[name],) if isinstance(params.get(name), str) else params.get(name, ()):
         self.rows(sensor, f"{key}.{name}")
+    for kind in ("body", "site", "geom"):
+      if isinstance(params.get(kind), str):
+        self.find(kind, params[kind], f"{key}.{kind}")
 
 
 _OBJECTS = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in ("body", "site", "geom", "sensor", "key")}

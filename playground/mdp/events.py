@@ -18,7 +18,7 @@ from playground.config.text import format_value
 from playground.envs.physics import PhysicsData, mjx
 from playground.errors import ConfigError
 from playground.limits import MOST, AtLeast0, Share, Span, Vector, count, span
-from playground.mdp.rotations import uniform_quat
+from playground.mdp.poses import uniform_quat
 
 if TYPE_CHECKING:
   from playground.envs.task import InitialState, Task

@@ -13,7 +13,7 @@ from mujoco.mjx._src.math import quat_inv, quat_mul, quat_to_mat
 from playground.limits import AtLeast0
 from playground.mdp.context import StepContext
 from playground.mdp.manipulators import ArmContext, HandContext
-from playground.mdp.rotations import turn_at_random, two_rows
+from playground.mdp.poses import turn_at_random, two_rows
 
 
 def qpos(c: StepContext) -> jax.Array:

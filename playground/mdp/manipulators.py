@@ -13,8 +13,7 @@ from mujoco.mjx._src.math import quat_to_mat
 from playground.envs.physics import PhysicsData, mjx
 from playground.errors import lookup
 from playground.mdp.context import Robot, StepContext
-from playground.mdp.pose_noise import Pose
-from playground.mdp.rotations import angle_between
+from playground.mdp.poses import Pose, angle_between
 
 if TYPE_CHECKING:
   from playground.envs.manipulation.arm import TabletopTask

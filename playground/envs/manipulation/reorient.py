@@ -12,7 +12,7 @@ from playground.envs.manipulation.in_hand import HandTask
 from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.mdp.manipulators import HandContext
-from playground.mdp.rotations import uniform_quat
+from playground.mdp.poses import uniform_quat
 
 _BONUS = "success"  # the reward term that is not times dt
 _SPIN = (1.0, 5.0)  # rad/s about each axis: how fast a new goal turns away from the last

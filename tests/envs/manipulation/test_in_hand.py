@@ -14,7 +14,7 @@ from mujoco.mjx._src.math import quat_integrate
 
 from playground.envs.base import State
 from playground.envs.manipulation.reorient import new_spin
-from playground.mdp.rotations import angle_between
+from playground.mdp.poses import angle_between
 from tests.envs.golden import golden, recorded, without_physics
 
 REORIENT, ROTATE = "LeapCubeReorient", ("LeapCubeRotateZAxis", "AeroCubeRotateZAxis")

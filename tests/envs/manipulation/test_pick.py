@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from playground.envs.base import State
+from playground.errors import UnknownNameError
 from tests.envs.dm_control.states import state_at
 from tests.envs.golden import load_task, recorded, without_physics
 
@@ -170,3 +171,8 @@ def test_the_hand_should_stay_outside_the_cabinet(cabinet: Any) -> None:
   inside = state_at(cabinet, qpos=qpos)
   assert inside.site_xpos[0, 0] > 0.52
   assert judge(cabinet, inside).metrics["reward/no_contact"] == 0
+
+
+def test_names_in_parameters_are_checked_when_the_task_is_built() -> None:
+  with pytest.raises(UnknownNameError, match=r"gripper_pos\.params\.site names the site 'griper', .*'gripper'"):
+    load_task("PandaPickCube", {"observations.state.gripper_pos.params.site": "griper"})

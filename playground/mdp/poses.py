@@ -1,0 +1,64 @@
+"""Orientations as unit quaternions (w, x, y, z), and the noise on the pose of an object that a camera tracks."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from mujoco.mjx._src.math import axis_angle_to_quat, norm, normalize, quat_inv, quat_mul, quat_to_mat
+
+Pose = tuple[jax.Array, jax.Array]  # position m [3], orientation [4]
+
+_INJECTED_REACH = 0.5  # m
+
+
+def uniform_quat(key: jax.Array) -> jax.Array:
+  """An orientation, all equally likely, shape [4] (Shoemake 1992)."""
+  u, v, w = jax.random.uniform(key, (3,))
+  v, w = 2 * jnp.pi * v, 2 * jnp.pi * w
+  inner, outer = jnp.sqrt(1 - u), jnp.sqrt(u)
+  return jnp.array([inner * jnp.sin(v), inner * jnp.cos(v), outer * jnp.sin(w), outer * jnp.cos(w)])
+
+
+def turn_at_random(key: jax.Array, quat: jax.Array, max_angle: float | jax.Array) -> jax.Array:
+  """`quat` [4] turned about an axis in any direction by an angle that is uniform in [0, `max_angle`) rad."""
+  axis_key, angle_key = jax.random.split(key)
+  axis = normalize(jax.random.normal(axis_key, (3,)))
+  return quat_mul(axis_angle_to_quat(axis, jax.random.uniform(angle_key) * max_angle), quat)
+
+
+def angle_between(quat: jax.Array, goal: jax.Array) -> jax.Array:
+  """The smallest angle that turns `quat` into `goal`, rad in [0, pi], shape []."""
+  difference = normalize(quat_mul(quat, quat_inv(goal)))
+  return 2 * jnp.arcsin(jnp.minimum(norm(difference[1:]), 1.0))
+
+
+def two_rows(quat: jax.Array) -> jax.Array:
+  """The last two rows of the rotation matrix, shape [6]: an orientation without the quaternion's double cover."""
+  return quat_to_mat(quat).ravel()[3:]
+
+
+def sensed_pose(
+  key: jax.Array,
+  pose: Pose,
+  config: Any,
+  level: float,
+  turn: Callable[[jax.Array, jax.Array, float], jax.Array] = turn_at_random,
+) -> Pose:
+  """Returns a tracker's reading of a pose (paper, Appendix C.4).
+
+  Args:
+    key: random key.
+    pose: the exact one.
+    config: `pos`: m, uniform in +- on each axis; `angle`: rad, largest turn, about a random axis; `injection`: with
+      this probability the reading has nothing to do with the pose: within +- 0.5 m, in any orientation.
+    level: factor on all of them.
+    turn: turns an orientation at random by at most an angle in rad: (key, orientation, angle) -> orientation.
+  """
+  pos_key, quat_key, wrong_key, wrong_pos_key, wrong_quat_key = jax.random.split(key, 5)
+  offset = jax.random.uniform(pos_key, (3,), minval=-1.0, maxval=1.0)
+  pos, quat = pose[0] + level * config.pos * offset, turn(quat_key, pose[1], level * config.angle)
+  wrong = level * jax.random.bernoulli(wrong_key, config.injection)
+  reach = _INJECTED_REACH
+  wrong_pos = jax.random.uniform(wrong_pos_key, (3,), minval=-reach, maxval=reach)
+  return pos * (1 - wrong) + wrong_pos * wrong, quat * (1 - wrong) + uniform_quat(wrong_quat_key) * wrong
