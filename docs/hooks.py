@@ -12,6 +12,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from playground.config.definitions import RunSettings, defined
+from playground.config.files import task_experiments
 from playground.envs.options import TermsConfig
 from playground.settings import Setting, settings
 from playground.sweep.options import SweepConfig
@@ -79,6 +80,7 @@ def _group_page(group: str) -> str:
     else {"A run": RunSettings, "env of a task made of terms": TermsConfig, "A sweep": SweepConfig}
   )
   parts += [_class_section(name, cls) for name, cls in classes.items()]
+  parts += [_experiments()] if group == "experiment" else []
   shared_first = lambda path: (path.stem[0].isupper(), path.stem)
   for path in sorted((ROOT / "configs" / group).glob("*.yaml"), key=shared_first):
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -94,6 +96,13 @@ def _group_page(group: str) -> str:
     if rows:
       parts.append("\n".join(["| key | value | |", "|---|---|---|", *rows]) + "\n")
   return "\n".join(parts)
+
+
+def _experiments() -> str:
+  """The experiments that have no file."""
+  rows = [f"| {_code(name)} | {_code(task)} |" for name, task in sorted(task_experiments([ROOT / "configs"]).items())]
+  head = "Every task has an experiment of its name, which chooses it with its tuned set. Those below have files.\n"
+  return "\n".join([head, "| experiment | task |", "|---|---|", *rows, ""])
 
 
 def _class_section(name: str, cls: type) -> str:

@@ -11,11 +11,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import hydra
 import pytest
 from omegaconf import OmegaConf
 
 from playground import config
 from playground.config import compose, from_saved
+from playground.config.files import experiment_name
 from playground.errors import ConfigError, UnknownNameError
 from playground.learning.hyperparameters import config_class
 
@@ -124,6 +126,37 @@ def test_several_debug_presets():
   run = compose(["debug=[fast,profile]"])
   assert run.profile.enable
   assert run.agent.num_envs == 8
+
+
+def test_a_task_has_an_experiment_of_its_name(configs: Path):
+  shutil.copy(configs / "env/CartpoleBalance.yaml", configs / "env/MyTaskRoughTerrain.yaml")
+  assert compose(["experiment=my_task_rough"], configs).choices["env"] == "MyTaskRoughTerrain"
+  (configs / "experiment/my_task_rough.yaml").write_text(
+    "# @package _global_\ndefaults:\n  - override /env: MyTaskRoughTerrain\nseed: 7\n"
+  )
+  assert compose(["experiment=my_task_rough"], configs).seed == 7, "a file of the name comes first"
+  chosen = {name: compose([f"experiment={name}"]).choices["env"] for name in ("aero_rotate", "spot_joystick")}
+  assert chosen == {"aero_rotate": "AeroCubeRotateZAxis", "spot_joystick": "SpotFlatTerrainJoystick"}
+  assert {experiment_name(task) for task in config.task_names()} <= set(config.options("experiment"))
+
+
+@pytest.mark.parametrize(
+  ("line", "times"),
+  [("experiment=go1_joystick", 1), ("env=CartpoleBalance agent=sac hardware=gpu", 1), ("debug=fast", 2)],
+)
+def test_a_run_is_composed_once(monkeypatch: pytest.MonkeyPatch, line: str, times: int):
+  """Twice where a file changes keys that only other files define."""
+  calls, composed = [], hydra.compose
+  monkeypatch.setattr(hydra, "compose", lambda *args, **kwargs: calls.append(args) or composed(*args, **kwargs))
+  compose(line.split())
+  assert len(calls) == times
+
+
+def test_a_typo_of_a_tasks_key_in_a_preset_is_refused(configs: Path):
+  (configs / "debug/mine.yaml").write_text("# @package _global_\nenv: {episode_lenth: 1}\n")
+  for debug in ("mine", "[mine,profile]"):
+    with pytest.raises(UnknownNameError, match=r"env\.episode_lenth, set by a chosen file.*'env\.episode_length'"):
+      compose(["env=CartpoleBalance", f"debug={debug}"], configs)
 
 
 # What a RunConfig is

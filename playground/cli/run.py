@@ -1,7 +1,7 @@
 """`playground-run`: composes a run's configuration, checks it, trains.
 
-Our check comes first, so that a mistake is one sentence; the rest is a Hydra app, with its flags (`--cfg job`,
-`--help`, `--info`). `-m` is ours: a sweep of jobs, each a process of its own (`playground.sweep`).
+The flags are Hydra's. `--cfg job` and training take the one composition; `--help`, `--info`, `--shell-completion` and
+`hydra.` keys go to Hydra's app. `-m` is ours: a sweep of jobs, each a process of its own (`playground.sweep`).
 """
 
 import argparse
@@ -26,9 +26,11 @@ from playground.config import (
   config_roots,
   is_hydras,
   parse_with_hydra,
+  register_options,
   search_path_override,
   to_yaml,
   tree,
+  values_to_yaml,
   with_default_experiment,
 )
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, one_sentence
@@ -73,33 +75,50 @@ def _main(argv: Sequence[str]) -> int:
   _check_flags(args, overrides)
   overrides, trusted = _trusted(overrides)
   trust(*trusted)
-  config = None
+  if args.hydra_help or args.info or args.shell_completion:
+    return _hydra_app(flags, overrides)
   if args.help:
-    overrides = with_default_experiment(overrides)
-  elif args.multirun and not (args.hydra_help or args.info or args.shell_completion):
+    return _hydra_app(flags, with_default_experiment(overrides))
+  if args.multirun:
     return _sweep(overrides, args.cfg, trusted)
-  elif not (args.hydra_help or args.info or args.shell_completion):
-    config = compose(overrides)
-    overrides = [*config.overrides, *filter(is_hydras, overrides)]
-    if args.cfg == "job" and args.package and not _has(config.resolved, args.package):
-      raise UnknownNameError(f"--package {args.package}: the configuration has no such key.")
-    if args.cfg == "job" and config.resume:  # the run's own, which Hydra cannot compose
-      print(to_yaml(config))
-      return 0
+  config = compose(overrides)
+  if args.cfg == "job":
+    print(_shown(config, args.package), end="")
+    return 0
+  hydras = [text for text in overrides if is_hydras(text)]
+  if args.cfg or hydras:
+    return _hydra_app(flags, [*config.overrides, *hydras], config)
+  return _train(config)
 
+
+def _hydra_app(flags: Sequence[str], overrides: Sequence[str], config: RunConfig | None = None) -> int:
+  """Lets Hydra show what only it has, such as its own configuration, or train with settings of its own."""
   codes = []
 
   def job(_: object) -> None:
-    assert config is not None, "composed above unless Hydra only shows something"
+    assert config is not None, "composed unless Hydra only shows something"
     try:
       codes.append(_train(config))
     except PlaygroundError as error:  # Hydra would say a line of its own about it
       codes.append(_report(error))
 
+  register_options()
   roots = config_roots()
   sys.argv[1:] = [*flags, *overrides, *search_path_override(roots)]
   hydra.main(config_path=str(roots[0]), config_name="config", version_base="1.3")(job)()
   return next(iter(codes), 0)
+
+
+def _shown(config: RunConfig, package: str | None) -> str:
+  """The configuration as YAML, or what it has at a dotted key."""
+  if package is None:
+    return to_yaml(config)
+  section: Any = config.resolved
+  for part in package.split("."):
+    if not isinstance(section, Mapping) or part not in section:
+      raise UnknownNameError(f"--package {package}: the configuration has no such key.")
+    section = section[part]
+  return values_to_yaml(section)
 
 
 def _refuse(message: str) -> NoReturn:
@@ -115,15 +134,6 @@ def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
     _refuse(f"--{'resolve' if args.resolve else 'package'} goes with --cfg job")
   if args.shell_completion and not (len(overrides) == 1 and _COMPLETION.fullmatch(overrides[0])):
     _refuse("--shell-completion takes install=<shell>, uninstall=<shell> or query=<shell>, of bash, fish and zsh")
-
-
-def _has(resolved: Any, key: str) -> bool:
-  """Whether a nested mapping has a dotted key."""
-  for part in key.split("."):
-    if not isinstance(resolved, Mapping) or part not in resolved:
-      return False
-    resolved = resolved[part]
-  return True
 
 
 def _train(config: RunConfig) -> int:

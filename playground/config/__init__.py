@@ -2,17 +2,18 @@
 
 The only place that knows OmegaConf. Nothing here needs JAX, so that a mistake is reported at once.
 
-How a value is chosen, later wins: config.yaml and the chosen option of every group; the tuned set of the pair agent and
-env; the experiment; debug; the command line. The options alone are also the schema: what they do not have does not
-exist, and what they have fixes each value's type, wherever that value is set.
+How a value is chosen, later wins: the settings classes and the chosen option of every group; the tuned set of the pair
+agent and env; the experiment; debug; the command line. Classes and options alone are also the schema: what they do not
+have does not exist, and what they have fixes each value's type, wherever that value is set.
 
+  definitions  the settings classes: type, default, limit and help of each key that no task owns
   files        where configs/ lies, which groups and options it has
   overrides    the command line, one `key=value` at a time
   sweeps       a command line that stands for many runs
   chains       a curriculum's stages, each a run of its own
   composition  all of it together, for a new run and for one that goes on
   schema       keys that exist and the types of their values
-  limits       what types cannot say: choices, ranges, sizes that must divide
+  limits       checks of choices, ranges and sizes that must divide
   run_config   the result, and how it is saved, read and shown
 """
 
@@ -23,6 +24,7 @@ from playground.config.composition import (
   compose_settings,
   from_saved,
   override_section,
+  register_options,
   saved_section,
 )
 from playground.config.files import ENTRY_POINTS, config_roots, options, search_path_override, task_names
@@ -34,7 +36,17 @@ from playground.config.overrides import (
   parse_with_hydra,
   with_default_experiment,
 )
-from playground.config.run_config import RunConfig, Section, config_dict, from_dict, in_order_of, load, to_yaml, tree
+from playground.config.run_config import (
+  RunConfig,
+  Section,
+  config_dict,
+  from_dict,
+  in_order_of,
+  load,
+  to_yaml,
+  tree,
+  values_to_yaml,
+)
 from playground.config.sweeps import (
   check_saved_job,
   combinations,
@@ -74,6 +86,7 @@ __all__ = [
   "options",
   "override_section",
   "parse_with_hydra",
+  "register_options",
   "saved_section",
   "search_path_override",
   "split",
@@ -81,6 +94,7 @@ __all__ = [
   "task_names",
   "to_yaml",
   "tree",
+  "values_to_yaml",
   "varying",
   "with_default_experiment",
   "with_listed",

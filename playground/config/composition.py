@@ -27,8 +27,26 @@ from playground.config.chains import (
   stage_folders,
   stage_overrides,
 )
-from playground.config.definitions import chosen_names, register
-from playground.config.files import DELTAS, config_roots, groups, lineage, options, search_path_override
+from playground.config.definitions import (
+  RunSettings,
+  chosen_names,
+  defined,
+  register,
+  register_experiments,
+  register_sections,
+)
+from playground.config.files import (
+  DELTAS,
+  Delta,
+  config_roots,
+  delta,
+  find_file,
+  groups,
+  lineage,
+  options,
+  search_path_override,
+  task_experiments,
+)
 from playground.config.limits import check_limits, check_vision
 from playground.config.overrides import (
   Override,
@@ -44,6 +62,7 @@ from playground.config.schema import check_key, fit, is_terms
 from playground.config.text import first_line, join
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
+from playground.learning.hyperparameters import config_class
 from playground.mdp.options import OPTIONS
 from playground.pretrained import locate
 from playground.settings import defaults
@@ -117,6 +136,15 @@ def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Se
   composed = tuple(_compose_stage(config, name, theirs, files, roots) for name, theirs in stages)
   run_dir = config.run_dir or f"results/{config.name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
   return dataclasses.replace(config, run_dir=run_dir, stages=composed)
+
+
+def register_options(roots: Sequence[Path] | None = None) -> None:
+  """Registers with Hydra the options that have no file: those of classes, and an experiment for each task."""
+  roots = config_roots() if roots is None else roots
+  register_sections()
+  register_experiments(task_experiments(roots))
+  for group, classes in defined().items():
+    register(group, [name for name in classes if find_file(group, name, roots) is None])
 
 
 def override_section(section: str, default: Section, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -203,9 +231,40 @@ def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
   if not named and choices["tuned"] is None and (there := [name for name in sets if name in options("tuned", roots)]):
     added = (parse(f"tuned={there[0]}", roots),)  # ppo_v020 without a set of its own takes ppo_paper's, then ppo's
     config, choices = _hydra([*groups, *group_overrides(added)], roots)
-  schema, _ = _hydra([f"{g}={c}" for g, c in choices.items() if c and g not in DELTAS] + _NO_DELTAS, roots)
-  _check_robot(config, choices, roots)
-  return _Files(config, choices, _plain(schema), added)
+  changes = _changes(groups, choices, roots)
+  if "robot" in changes.groups or not changes.is_known or any(text.startswith("robot=") for text in groups):
+    _check_robot(choices, roots)
+  if OmegaConf.is_missing(config.env, "robot"):
+    raise ConfigError(
+      f"env={choices['env']} needs a robot: add robot=<name>, one of {', '.join(options('robot', roots))}."
+    )
+  return _Files(config, choices, _schema(config, choices, changes, roots), added)
+
+
+def _changes(groups: Iterable[str], choices: Mapping[str, str | None], roots: Sequence[Path]) -> Delta:
+  """What the chosen options of `DELTAS` change; of several options of one group (`debug=[a,b]`) that is unknown."""
+  found = Delta(is_known=not any("=[" in text for text in groups))
+  for group in DELTAS:
+    if option := choices.get(group):
+      found |= delta(group, option, roots)
+  return found
+
+
+def _schema(
+  config: DictConfig, choices: Mapping[str, str | None], changes: Delta, roots: Sequence[Path]
+) -> dict[str, Any]:
+  """The keys that exist, with the values that fix their types.
+
+  Most sections have a class. The others are as composed, or where `DELTAS` change them, as composed without.
+  """
+  agent = str(config.agent.name)
+  values = defaults(RunSettings) | {"agent": {"name": agent, **defaults(config_class(agent))}}
+  values |= {group: defaults(defined()[group][name]) for group, name in (("hardware", "auto"), ("tracking", "csv"))}
+  del values["env"]
+  if not changes.is_known or not changes.sections <= set(values):
+    without = [f"{group}={option}" for group, option in choices.items() if option and group not in DELTAS]
+    config, _ = _hydra([*without, *_NO_DELTAS], roots)
+  return {key: values.get(str(key), value) for key, value in _plain(config).items()}
 
 
 def _compose_new(parsed: Sequence[Override], files: Callable[..., _Files], roots: Sequence[Path]) -> RunConfig:
@@ -242,7 +301,7 @@ def _hydra(
   """Hydra's composition of `<name>.yaml`, and what it chose for each group."""
   outer = GlobalHydra.instance().hydra  # the app's, if this is called within it: Hydra allows one at a time
   GlobalHydra.instance().clear()
-  register()
+  register_options(roots)
   try:
     with hydra.initialize_config_dir(str(roots[0]), version_base="1.3"):
       lines = [*overrides, *search_path_override(roots)]
@@ -349,12 +408,9 @@ def _check_path(key: str, value: Any) -> None:
     raise ConfigError(f"{key}={value} is no {what}: {wanted} does not exist.{nearest(path.name, siblings)}")
 
 
-def _check_robot(config: DictConfig, choices: Mapping[str, str | None], roots: Sequence[Path]) -> None:
-  """A task that names a robot gets one, and one that names none gets none."""
+def _check_robot(choices: Mapping[str, str | None], roots: Sequence[Path]) -> None:
+  """Raises ConfigError for a robot whose task takes none."""
   env, robot = choices["env"], choices.get("robot")
-  robots = ", ".join(options("robot", roots))
-  if OmegaConf.is_missing(config.env, "robot"):
-    raise ConfigError(f"env={env} needs a robot: add robot=<name>, one of {robots}.")
   if robot is not None:
     own, chosen = _hydra([f"env={env}", *_NO_DELTAS], roots)
     # `in` would be false for a mandatory robot that nobody has set

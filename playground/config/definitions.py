@@ -7,7 +7,7 @@ and the other options below are registered with Hydra, and files hold what diffe
 import dataclasses
 import functools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any
 
 from hydra.core.config_store import ConfigStore
@@ -68,16 +68,36 @@ def defined() -> dict[str, dict[str, type]]:
   }
 
 
+def register(group: str, names: Iterable[str]) -> None:
+  """Registers with Hydra the options of a group that classes define and no file."""
+  _replace(group, {name: functools.partial(_node, group, name) for name in names}, package=group)
+
+
 @functools.cache
-def register() -> None:
-  """Registers the defaults of all settings with Hydra, once."""
+def register_sections() -> None:
+  """Registers with Hydra the sections that no group chooses."""
+  ConfigStore.instance().store("run_settings", defaults(RunSettings))
+  ConfigStore.instance().store("sweep_settings", defaults(SweepConfig))
+
+
+def register_experiments(tasks: Mapping[str, str]) -> None:
+  """Registers with Hydra the experiments that only choose a task: its name by theirs."""
+  choose = lambda task: {"defaults": [{"override /env": task}]}
+  _replace("experiment", {name: functools.partial(choose, tasks[name]) for name in tasks}, package="_global_")
+
+
+def _node(group: str, name: str) -> dict[str, Any]:
+  named = {"name": name} if group in ("agent", "launcher", "search") else {}
+  return {**named, **defaults(defined()[group][name])}
+
+
+def _replace(group: str, nodes: Mapping[str, Callable[[], Any]], package: str) -> None:
+  """Makes these the options of a group; Hydra refuses an option that has a file, too."""
   store = ConfigStore.instance()
-  store.store("run_settings", defaults(RunSettings))
-  store.store("sweep_settings", defaults(SweepConfig))
-  for group, classes in defined().items():
-    for name, cls in classes.items():
-      named = {"name": name} if group in ("agent", "launcher", "search") else {}
-      store.store(name, {**named, **defaults(cls)}, group=group, package=group)
+  if set(store.repo.get(group, {})) != {f"{name}.yaml" for name in nodes}:
+    store.repo[group] = {}
+    for name, node in nodes.items():
+      store.store(name, node(), group=group, package=package)
 
 
 def definition(key: str, names: Mapping[str, Any]) -> Setting | None:

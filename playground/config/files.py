@@ -2,9 +2,11 @@
 
 import functools
 import importlib.metadata
+import re
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -13,6 +15,14 @@ from playground.config.text import first_line
 
 ENTRY_POINTS = "playground.tasks"
 DELTAS = ("experiment", "tuned", "debug")  # groups that change what the others define, and define nothing
+_EXPERIMENTS = {  # short names, where the rule's is long
+  "AeroCubeRotateZAxis": "aero_rotate",
+  "AlohaHandOver": "aloha_handover",
+  "AlohaSinglePegInsertion": "aloha_peg_insertion",
+  "CartpoleBalanceVision": "cartpole_pixels",
+  "LeapCubeReorient": "leap_reorient",
+  "LeapCubeRotateZAxis": "leap_rotate",
+}
 
 
 def shipped(folder: str) -> Path:
@@ -33,24 +43,67 @@ def groups(roots: Iterable[Path]) -> list[str]:
 
 
 def options(group: str, roots: Iterable[Path] | None = None) -> list[str]:
-  """Names of a group's options, sorted: those that a class defines, and files.
+  """Names of a group's options, sorted: those that a class defines, files, and an experiment for each task.
 
   Files whose name begins with an underscore are parts that options share.
   """
-  folders = [root / group for root in (config_roots() if roots is None else roots)]
+  roots = config_roots() if roots is None else list(roots)
+  folders = [root / group for root in roots]
   files = [(path, folder) for folder in folders for path in folder.rglob("*.yaml") if not path.stem.startswith("_")]
-  return sorted(
-    {path.relative_to(folder).with_suffix("").as_posix() for path, folder in files} | set(defined().get(group, ()))
-  )
+  named = task_experiments(roots) if group == "experiment" else defined().get(group, ())
+  return sorted({path.relative_to(folder).with_suffix("").as_posix() for path, folder in files} | set(named))
+
+
+def experiment_name(task: str) -> str:
+  """Returns the name of the experiment that only chooses a task: Go1JoystickRoughTerrain is go1_joystick_rough."""
+  words = task.replace("FlatTerrain", "").replace("RoughTerrain", "Rough")
+  return _EXPERIMENTS.get(task) or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", words).lower()
+
+
+def task_experiments(roots: Sequence[Path]) -> dict[str, str]:
+  """Returns the task of each experiment that only chooses one, and which therefore has no file."""
+  named = {experiment_name(task): task for task in task_names(roots)}
+  return {name: task for name, task in named.items() if find_file("experiment", name, roots) is None}
 
 
 def lineage(group: str, option: str, roots: Iterable[Path]) -> list[str]:
   """The option and the options its file is built on (the first of its defaults list, and so on), nearest first."""
-  file = next((path for root in roots if (path := root / group / f"{option}.yaml").is_file()), None)
-  defaults = (yaml.safe_load(file.read_text()) or {}).get("defaults", []) if file else []
+  defaults = _read(group, option, roots).get("defaults", [])
   named = [entry.removeprefix(f"/{group}/").partition("@")[0] for entry in defaults if isinstance(entry, str)]
   bases = [name for name in named if name != "_self_"]
   return [option, *(lineage(group, bases[0], roots) if bases else [])]
+
+
+class Delta(NamedTuple):
+  """What the file of an option changes: the sections whose keys it sets, and the groups that it overrides.
+
+  `is_known` is false for a file that cannot be judged without composing it.
+  """
+
+  sections: frozenset[str] = frozenset()
+  groups: frozenset[str] = frozenset()
+  is_known: bool = True
+
+  def __or__(self, other: "Delta") -> "Delta":
+    return Delta(self.sections | other.sections, self.groups | other.groups, self.is_known and other.is_known)
+
+
+def delta(group: str, option: str, roots: Sequence[Path]) -> Delta:
+  """Returns what an option of a group of `DELTAS` changes, the options that its file is built on included."""
+  file = find_file(group, option, roots)
+  if file is None:
+    return Delta(is_known=group == "experiment" and option in task_experiments(roots))
+  content = _read(group, option, roots)
+  known = "# @package _global_" in file.read_text().splitlines()[:1]
+  found = Delta(frozenset(map(str, content)) - {"defaults"}, frozenset(), known)
+  for entry in content.get("defaults", []):
+    if isinstance(entry, str):
+      base = entry.removeprefix(f"/{group}/") if entry.startswith("/") else f"{option.rpartition('/')[0]}/{entry}"
+      found |= delta(group, base.lstrip("/"), roots) if entry != "_self_" else Delta()
+    else:
+      (name,) = entry
+      found |= Delta(groups=frozenset({name.removeprefix("override /")}), is_known=name.startswith("override /"))
+  return found
 
 
 def task_names(roots: Iterable[Path] | None = None) -> list[str]:
@@ -67,6 +120,17 @@ def search_path_override(roots: Sequence[Path]) -> list[str]:
   """The override that makes Hydra look into outside packages' folders too."""
   quoted = ", ".join("'" + f"file://{root}".replace("'", "\\'") + "'" for root in roots[1:])
   return [f"hydra.searchpath=[{quoted}]"] if quoted else []
+
+
+def find_file(group: str, option: str, roots: Iterable[Path]) -> Path | None:
+  """Returns the file of an option, None if it has none."""
+  return next((path for root in roots if (path := root / group / f"{option}.yaml").is_file()), None)
+
+
+def _read(group: str, option: str, roots: Iterable[Path]) -> dict[str, Any]:
+  """The content of an option's file; empty for an option without one."""
+  file = find_file(group, option, roots)
+  return (yaml.safe_load(file.read_text()) if file else None) or {}
 
 
 @functools.cache

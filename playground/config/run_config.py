@@ -117,7 +117,14 @@ def load(path: Path) -> RunConfig:
 
 def to_yaml(config: RunConfig) -> str:
   """The resolved configuration as YAML, which `load` reads."""
-  return OmegaConf.to_yaml(OmegaConf.create(config.resolved))
+  return values_to_yaml(config.resolved)
+
+
+def values_to_yaml(values: Any) -> str:
+  """A section or a single value of a configuration as YAML."""
+  return (
+    OmegaConf.to_yaml(OmegaConf.create(dict(values))) if isinstance(values, Mapping) else format_value(values) + "\n"
+  )
 
 
 def tree(config: RunConfig) -> "Tree":
