@@ -1,4 +1,4 @@
-"""What each command measures: its options, and the jobs that they stand for."""
+"""The commands: the options of each, and the measurements that they stand for."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -192,7 +192,7 @@ class Chain(Measuring):
 
 @dataclasses.dataclass(frozen=True)
 class BesidePeer(OfTasks):
-  """Options of what is measured for another package, too, with the hyperparameters of that one on both sides."""
+  """Options of commands that also measure another package, with its hyperparameters on both sides."""
 
   peer: str = option("playground020", "the package to compare with")
   peer_python: str = option("python3", "interpreter of the environment that it is installed in")
@@ -216,7 +216,7 @@ class BesidePeer(OfTasks):
     check_peer(self.peer, self.peer_python, self.peer_path, self.peer_menagerie)
 
   def peer_job(self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: Any) -> Measurement:
-    """A job of the peer; overrides are of our run and do not reach it."""
+    """A measurement of the peer; overrides are of our run and do not reach it."""
     peer = {"name": self.peer, "python": self.peer_python, "path": self.peer_path, "menagerie": self.peer_menagerie}
     columns = self.columns(task, self.agent, setting, PEERS[self.peer].label)
     return Measurement(measure, {"task": task, "peer": peer, **arguments}, columns, {"quantity": quantity})

@@ -14,12 +14,12 @@ from typing import Any
 from playground.benchmark.arguments import option
 from playground.benchmark.schema import Table, commit_of
 from playground.benchmark.worker import ROW
-from playground.config import compose_settings
 from playground.errors import HardwareError
 from playground.interpreter import PYTHON
 from playground.runs.provenance import git_state
 from playground.sweep.folder import FAILED, Job, JobState, SweepDirectory
 from playground.sweep.local import ALL, LocalLauncher, Slot
+from playground.sweep.options import LocalConfig
 from playground.sweep.runner import Runner
 from playground.sweep.view import View
 
@@ -36,7 +36,7 @@ class Measurement:
   """One measurement.
 
   Attributes:
-    measure: a module of `measures`, and its function unless `measure`: `module:function`.
+    measure: a function of `measures`, `module:function`; without a function, `measure` of the module.
     arguments: of that function; `seeds`, where it takes them, shrinks to those not measured yet.
     columns: of its rows (benchmark, task, agent, who, setting).
     last: columns of its last row; there is one for each seed if it takes seeds.
@@ -44,8 +44,8 @@ class Measurement:
 
   measure: str
   arguments: Mapping[str, Any]
-  columns: Mapping[str, Any]
-  last: Mapping[str, Any]
+  columns: Mapping[str, str]
+  last: Mapping[str, str]
 
   def left(self, table: Table, facts: Mapping[str, Any]) -> "Measurement | None":
     """The part that the table does not have for this device yet; None if there is none."""
@@ -56,7 +56,7 @@ class Measurement:
     return dataclasses.replace(self, arguments={**self.arguments, "seeds": seeds}) if seeds else None
 
   def __str__(self) -> str:
-    return " ".join(str(self.columns[name]) for name in ("task", "agent", "who", "setting") if self.columns[name])
+    return " ".join(self.columns[name] for name in ("task", "agent", "who", "setting") if self.columns[name])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,8 +127,8 @@ def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int
       jobs.append(Job(name, [json.dumps(payload)], {}))
     sweep = SweepDirectory.create(folder, "benchmark", [], [], [], jobs)
     rows = _Rows(sweep, measurements, add)
-    config = compose_settings([f"launcher.grace={GRACE_S}"]).launcher
-    with contextlib.closing(LocalLauncher(sweep, config, WORKER, slots)) as launcher:
+    launch = LocalLauncher(sweep, LocalConfig(grace=GRACE_S), WORKER, slots)
+    with contextlib.closing(launch) as launcher:
       code = Runner(sweep, launcher, rows, seconds=plan.minutes and 60 * plan.minutes).run()
     return code, rows
 
@@ -140,7 +140,7 @@ def probe(overrides: Sequence[str], gpus: Sequence[int]) -> dict[str, Any]:
     HardwareError: the device cannot be used.
   """
   found: list[Row] = []
-  columns = dict.fromkeys(("task", "agent", "who", "setting"), "")
+  columns: dict[str, str] = dict.fromkeys(("task", "agent", "who", "setting"), "")
   machine = Measurement("machine", {"overrides": list(overrides)}, columns, {})
   code, rows = _run([machine], lambda _, row: found.append(row), Plan(gpus=tuple(gpus[:1]), cache=True))
   if code:

@@ -1,4 +1,4 @@
-"""Options that the commands share, and the jobs that they make of them."""
+"""Options that the commands share, and the measurements that they make of them."""
 
 import abc
 import dataclasses
@@ -24,39 +24,39 @@ QUANTITY = {  # the last row of a measurement
 
 @dataclasses.dataclass(frozen=True)
 class Measuring(Plan, abc.ABC):
-  """Options of everything that measures."""
+  """Options of all commands that measure."""
 
   out: str | None = option(None, "CSV that rows are added to; null is results/benchmarks/<command>.csv")
   overrides: tuple[str, ...] = option((), "of the run's configuration")
 
   name = "measuring"
-  alone = False  # whether it needs the machine to itself
+  alone = False  # whether no other measurement may run at the same time
 
   @abc.abstractmethod
   def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
-    """What is to be measured on a machine of which `facts` are known."""
+    """The measurements on a machine of these `facts` (`jobs.probe`)."""
 
   def check(self) -> None:
-    """Raises PlaygroundError for what cannot be measured, before anything expensive."""
+    """Raises PlaygroundError for invalid options, before anything expensive."""
     check_amounts(self)
     if self.alone and self.workers > 1:
       raise ConfigError(f"workers={self.workers}: {self.name} wants the machine to itself, workers=1.")
 
-  def columns(self, task: str, agent: str, setting: Sequence[str] = (), who: str = "ours") -> dict[str, Any]:
+  def columns(self, task: str, agent: str, setting: Sequence[str] = (), who: str = "ours") -> dict[str, str]:
     texts = " ".join((*self.overrides, *setting))
     return {"benchmark": self.name, "task": task, "agent": agent, "who": who, "setting": texts}
 
 
 @dataclasses.dataclass(frozen=True)
 class OfTasks(Measuring):
-  """Options of what is measured for tasks of one algorithm."""
+  """Options of commands that measure tasks with one algorithm."""
 
   suite: str | None = option(None, "dm_control, locomotion, manipulation or all: the tasks of the paper's tables")
   tasks: tuple[str, ...] = option((), "tasks by name, instead of a suite or on top")
   agent: str = option("ppo", "ppo, ppo_paper or sac")
   seconds: float = option(4.0, "how long to time each number, at least one update")
 
-  sets_devices = True  # whether a device's number is the command's to say
+  sets_devices = True  # whether the command sets hardware.devices
 
   def check(self) -> None:
     super().check()
@@ -81,7 +81,7 @@ class OfTasks(Measuring):
     return list(dict.fromkeys([*self.tasks, *(n for n in tasks_of(self.suite or "all") if self.suite and n in known)]))
 
   def configured(self, task: str, *more: str) -> RunConfig:
-    """A task's run; raises ConfigError for overrides that cannot be."""
+    """The configuration of a task's run; raises ConfigError for invalid overrides."""
     return compose([f"env={task}", f"agent={self.agent}", *self.overrides, *more])
 
   def with_envs(self, task: str, count: int) -> list[str]:
@@ -95,20 +95,20 @@ class OfTasks(Measuring):
     return setting
 
   def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: Any) -> Measurement:
-    """A job with overrides, which `setting` says."""
+    """A measurement with the overrides of `setting`."""
     overrides = [*self.overrides, *setting]
     arguments = {"task": task, "agent": self.agent, "overrides": overrides, "seconds": self.seconds, **arguments}
     return Measurement(measure, arguments, self.columns(task, self.agent, setting), {"quantity": QUANTITY[measure]})
 
   def on_one_device(self, job: Measurement) -> Measurement:
-    """The job with one device for each process: what most tables are about, so no setting of its own."""
+    """The measurement with one device for each process; as most tables are about that, `setting` does not say it."""
     arguments = {**job.arguments, "overrides": [*job.arguments["overrides"], "hardware.devices=1"]}
     return dataclasses.replace(job, arguments=arguments)
 
 
 @dataclasses.dataclass(frozen=True)
 class OfRuns(OfTasks):
-  """Options of what trains whole runs, too."""
+  """Options of commands that also train whole runs."""
 
   num_timesteps: int | None = option(None, "control steps of a whole run")
 
@@ -121,7 +121,7 @@ class OfRuns(OfTasks):
     return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
 
   def whole_run(self, task: str, agent: str, seed: int, setting: Sequence[str] = ()) -> Measurement:
-    """A job that trains from beginning to end, for the budget."""
+    """A measurement that trains from beginning to end, for the budget."""
     setting = [*setting, *self.budget()]
     told = [*self.overrides, *setting]
     arguments = {"task": task, "agent": agent, "overrides": told, "told": told, "seeds": [seed]}

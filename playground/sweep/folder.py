@@ -1,4 +1,4 @@
-"""The files of a sweep, and how its jobs stand by them."""
+"""The files of a sweep, and the states of its jobs."""
 
 import contextlib
 import dataclasses
@@ -27,14 +27,14 @@ FAILED = ("failed", "timeout", "killed")
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-  """One run of a sweep.
+  """One process of a sweep or a benchmark.
 
   Attributes:
     name: of its folder.
-    overrides: its command line.
-    varies: the part of it in which the sweep's jobs differ, by key.
+    overrides: its arguments, to which the worker adds its folder.
+    varies: the values in which the sweep's jobs differ, by key.
     needs: how many GPUs it takes on its machine; None is one if there is any.
-    steps: its budget.
+    steps: its budget of environment steps.
   """
 
   name: str
@@ -82,7 +82,7 @@ def _value(config: RunConfig, key: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class JobState:
-  """How a job stands; `where`, `attempt` and the times (ISO 8601) are of its last start."""
+  """The state of a job; `where`, `attempt` and the times (ISO 8601) are those of its last start."""
 
   status: Status = "queued"
   reason: str = ""
@@ -104,7 +104,7 @@ class JobState:
 
 
 class JobFolder:
-  """Where a job's run lies, and what its worker says of it."""
+  """A job's run directory, and the record that its worker keeps there."""
 
   def __init__(self, path: Path):
     self.path = path
@@ -124,16 +124,20 @@ class JobFolder:
 
   @property
   def run(self) -> RunDirectory:
-    """What the job's run says of itself."""
+    """The job's run directory."""
     return RunDirectory(self.path)
 
   def write(self, **fields: Any) -> None:
-    """Records how the job stands."""
+    """Records the job's state."""
     self.path.mkdir(parents=True, exist_ok=True)
     write_json(self.record_path, fields)
 
+  def write_waiting(self, status: Literal["queued", "submitted"]) -> None:
+    """Records that the job waits for its next start."""
+    self.write(status=status, attempt=self.record.get("attempt", 0))
+
   def state(self) -> JobState:
-    """How the job stands, also if its worker had no time to say so."""
+    """The job's state, also if its worker was killed before it recorded one."""
     record = self.record
     fields = {f.name: record[f.name] for f in dataclasses.fields(JobState) if f.name in record}
     state = JobState(**fields)
@@ -145,16 +149,16 @@ class JobFolder:
 
   @contextlib.contextmanager
   def claim(self, patience_s: float = 2.0) -> Iterator[int | None]:
-    """Holds the job as long as the block runs; yields a file descriptor, or None if somebody else has it.
+    """Holds the job's lock during the block; yields its file descriptor, or None if another process holds it.
 
-    Processes that inherit the descriptor hold the job, too: what outlives its worker is still at work.
+    Processes that inherit the descriptor hold the lock, too: a run that outlives its worker still counts as running.
     """
     self.path.mkdir(parents=True, exist_ok=True)
     with locking(self.path / "job.lock", patience_s) as lock:  # `locked` holds it for a moment to see
       yield lock
 
   def locked(self) -> bool:
-    """Whether a process is at the job, on this machine or another that shares its folder."""
+    """Whether a process runs the job, on this machine or another that shares its folder."""
     return is_locked(self.path / "job.lock")
 
   def progress(self) -> tuple[int | None, float | None]:
@@ -228,23 +232,23 @@ class SweepDirectory:
 
   @property
   def group(self) -> str:
-    """What its runs have in common in W&B."""
+    """The group of its runs in W&B."""
     return f"{self.name}/{self.path.resolve().name}"
 
   @property
   def stop_file(self) -> Path:
-    """While it is there, workers stop their jobs, wherever they run."""
+    """While this file exists, workers stop their jobs, wherever they run."""
     return self.path / STOP_FILE
 
   def folder(self, job: Job) -> JobFolder:
     return JobFolder(self.path / "jobs" / job.name)
 
   def states(self) -> dict[str, JobState]:
-    """How every job stands, by name."""
+    """The state of every job, by name."""
     return {job.name: self.folder(job).state() for job in self.jobs}
 
   def add(self, job: Job) -> None:
-    """Another job, of a search."""
+    """Adds a job of a search."""
     self.jobs.append(job)
     self._write()
 
@@ -266,7 +270,7 @@ class SweepDirectory:
 
 
 def _check(content: Any) -> None:
-  """Raises KeyError, TypeError or ValueError where a sweep.yaml does not say what `create` writes."""
+  """Raises KeyError, TypeError or ValueError where a sweep.yaml has not the form that `create` writes."""
   texts = lambda key, value: _need(key, value, list) and [_need(key, text, str) for text in value]
   _need("it", content, dict)
   for key, kind in {"name": str, "cwd": str, "jobs": list}.items():

@@ -1,4 +1,4 @@
-"""Jobs as processes on this machine: each on slots of its GPUs and on cores of its own."""
+"""Jobs as processes on this machine, each on slots of its GPUs and on its own cores."""
 
 import contextlib
 import dataclasses
@@ -7,12 +7,12 @@ import signal
 import subprocess
 from collections.abc import Sequence
 
-from playground.config import Section
 from playground.errors import ConfigError, HardwareError
 from playground.hardware.gpus import visible_gpus
 from playground.interpreter import PYTHON
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.mps import MultiProcessService, control_program
+from playground.sweep.options import LocalConfig
 from playground.sweep.worker import COMMAND
 
 ALL = "all"
@@ -51,9 +51,9 @@ class LocalLauncher:
   outlives = False
 
   def __init__(
-    self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND, slots: Sequence[Slot] = ()
+    self, sweep: SweepDirectory, config: LocalConfig, command: Sequence[str] = COMMAND, slots: Sequence[Slot] = ()
   ):
-    """As of every launcher; `slots` are used instead of those that `config` makes of this machine."""
+    """See `runner.Launcher`; `slots` replace those that `config` makes of this machine."""
     self.check(config, sweep.jobs)
     self._mps = MultiProcessService(sweep.path) if config.mps else None
     cores = sorted(os.sched_getaffinity(0))
@@ -70,7 +70,7 @@ class LocalLauncher:
         self._taken[job.name] = [slot for slot in self.slots if slot.number in numbers]
 
   @staticmethod
-  def check(config: Section, jobs: Sequence[Job]) -> None:
+  def check(config: LocalConfig, jobs: Sequence[Job]) -> None:
     gpus = visible_gpus()
     if config.gpus is not None and config.gpus > len(gpus):
       raise HardwareError(f"launcher.gpus={config.gpus}, but this machine has {len(gpus)}.")
@@ -99,7 +99,7 @@ class LocalLauncher:
     limits = ["--grace", str(self._config.grace)]
     limits += [] if self._config.timeout is None else ["--timeout", str(self._config.timeout)]
     folder = self._sweep.folder(job)
-    folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
+    folder.write_waiting("submitted")
     numbers = [str(slot.number) for slot in slots]
     args = [*limits, "--where", where, "--slots", *numbers, "--cores", *map(str, cores), "--", *self._command]
     with folder.log.open("ab") as log:
@@ -138,7 +138,7 @@ class LocalLauncher:
     return self._sweep.folder(next(job for job in self._sweep.jobs if job.name == name)).locked()
 
   def _environment(self, gpus: Sequence[str]) -> dict[str, str]:
-    """What a job must know of its place; without GPUs none is visible."""
+    """The environment of a job: the GPUs it sees, its share of their memory, the service."""
     env = dict(os.environ) if ALL in gpus else os.environ | {"CUDA_VISIBLE_DEVICES": ",".join(gpus)}
     shared = self._config.slots_per_gpu
     if gpus and shared > 1:

@@ -16,7 +16,7 @@ TIMEOUT_S = 60.0
 
 
 def control_program() -> str:
-  """Where the service's control program is; raises HardwareError if it is not installed."""
+  """The path of the service's control program; raises HardwareError if it is not installed."""
   program = shutil.which(CONTROL)
   if program is None:
     raise HardwareError(
@@ -70,7 +70,7 @@ class MultiProcessService:
     shutil.rmtree(self.environment["CUDA_MPS_PIPE_DIRECTORY"], ignore_errors=True)
 
   def _control(self, *args: str, command: str = "") -> tuple[int, str]:
-    """Runs the control program; returns its exit code and what it says."""
+    """Runs the control program; returns its exit code and output."""
     # All GPUs: a service that sees some of them numbers them anew for the jobs.
     env = {key: value for key, value in os.environ.items() if key != "CUDA_VISIBLE_DEVICES"} | self.environment
     with tempfile.TemporaryFile("w+") as out:  # a file: the service goes on, and would hold a pipe open

@@ -2,9 +2,11 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from playground.limits import SEED, at_least_0, count, positive
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,7 +95,7 @@ class OptunaConfig:
 
 
 LAUNCHERS: dict[str, type[LauncherConfig]] = {"local": LocalConfig, "ray": RayConfig, "slurm": SlurmConfig}
-SEARCHES: dict[str, type] = {"grid": GridConfig, "optuna": OptunaConfig}
+SEARCHES: dict[str, type[Any]] = {"grid": GridConfig, "optuna": OptunaConfig}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,3 +104,8 @@ class SweepConfig:
 
   sweep_dir: Annotated[str | None, "the sweep's folder; null is results/sweeps/<name>/<date_time>"] = None
   on_error: Annotated[Literal["continue", "stop"], "stop: the first job that fails stops the others"] = "continue"
+
+
+def typed(classes: Mapping[str, type[T]], section: Mapping[str, Any]) -> T:
+  """Returns a section's settings as an object of the class of its `name`."""
+  return classes[section["name"]](**{key: value for key, value in section.items() if key != "name"})

@@ -10,13 +10,14 @@ from playground import config as configs
 from playground.config import RunConfig, Section
 from playground.errors import ConfigError
 from playground.sweep.folder import Job, SweepDirectory
+from playground.sweep.options import LAUNCHERS, typed
 from playground.sweep.runner import launcher_class
 
 ROOT = Path("results/sweeps")
 
 
 def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
-  """The configurations of all jobs that `-m` is given; of a search, of its first one."""
+  """The configurations of all jobs of a `-m` command line; of a search, that of its first job."""
   _, chosen, sets = _lines(overrides)
   if chosen.search.name != "grid":
     from playground.sweep.search import first_values
@@ -26,16 +27,16 @@ def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
 
 
 def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
-  """Composes and checks every job, and lays the sweep out on disk or finds it there.
+  """Composes and checks every job, and writes the sweep to disk or finds it there.
 
-  With `sweep_dir` of a sweep of the same jobs that one goes on; so does, without `sweep_dir`, the newest one of that
-  name that has something left to do.
+  A `sweep_dir` that holds the same jobs is continued. Without `sweep_dir`, the newest unfinished sweep of the same name
+  and jobs is continued.
 
   Returns:
-    The sweep, and how it is to be run.
+    The sweep, and its settings.
 
   Raises:
-    PlaygroundError: whatever cannot work, the launcher included; nothing is written then.
+    PlaygroundError: a job, a setting or the launcher is invalid; nothing is written then.
   """
   settings, chosen, sets = _lines(overrides)
   lines = sets[0]
@@ -57,14 +58,17 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
   found = _find(chosen.sweep_dir, name, lines, jobs)
   if found is not None:
     return found, chosen
-  launcher_class(chosen.launcher.name).check(chosen.launcher, jobs)
+  launcher_class(chosen.launcher.name).check(typed(LAUNCHERS, chosen.launcher), jobs)
   path = chosen.sweep_dir or _new(ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
   settings = [line for line in settings if not line.startswith("sweep_dir=")]
   return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen
 
 
 def _lines(overrides: Sequence[str]) -> tuple[list[str], Section, list[list[str]]]:
-  """What is said of the sweep, what that makes, and what is said of its jobs: a set of lines for each that is listed.
+  """Splits a command line.
+
+  Returns:
+    The overrides of the sweep, the settings they make, and the overrides of its jobs, one list for each listed job.
 
   Raises:
     ConfigError: what `configs.expand`, `split` and `listed_jobs` raise; a search of listed jobs.
@@ -77,7 +81,7 @@ def _lines(overrides: Sequence[str]) -> tuple[list[str], Section, list[list[str]
 
 
 def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
-  """The sweep file's name, or that of what its jobs train."""
+  """The sweep file's name, or the names of the jobs' runs."""
   for text in overrides:
     if text.startswith("sweep="):
       return text.partition("=")[2]
@@ -86,7 +90,7 @@ def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
 
 
 def _find(path: str | None, name: str, lines: Sequence[str], jobs: Sequence[Job]) -> SweepDirectory | None:
-  """The sweep that this is, if it has been started before."""
+  """The earlier sweep of the same jobs, if there is one."""
   if path is not None:
     if not (Path(os.path.expanduser(path)) / "sweep.yaml").exists():
       return None
@@ -120,10 +124,10 @@ def _new(path: Path) -> Path:
 
 
 def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> Section:
-  """How a sweep is run: as it was started, changed by what is given now.
+  """The settings that a sweep was started with, changed by `extra`.
 
   Raises:
-    ConfigError: keys that say nothing of a sweep, or cannot be.
+    ConfigError: a key that is none of a sweep, or an invalid value.
   """
   for text in extra:
     if not configs.is_of_sweep(text.lstrip("+~").partition("=")[0]):
@@ -142,7 +146,7 @@ def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> Section:
 
 
 def _is_plain(setting: str) -> bool:
-  """Whether a setting that was read from a sweep's folder, which may be somebody else's, can do no harm.
+  """Whether a setting of a sweep.yaml, which another user may have written, is harmless.
 
   Text that goes to a scheduler must be one word; CMA-ES keeps pickles in the sweep's study.
   """

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from playground.config import Section
 from playground.errors import ConfigError, HardwareError
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import MEMORY_FRACTION
+from playground.sweep.options import RayConfig
 from playground.sweep.worker import COMMAND, Worker
 
 try:
@@ -32,7 +32,7 @@ class RayLauncher:
   outlives = False
   _owned = False  # whether the connection, of which a process has one, was made here
 
-  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
+  def __init__(self, sweep: SweepDirectory, config: RayConfig, command: Sequence[str] = COMMAND):
     self.check(config, sweep.jobs)
     self._sweep = sweep
     self._config = config
@@ -41,7 +41,7 @@ class RayLauncher:
     self._run = ray.remote(max_calls=1)(_run)  # a process for each job, as with the other launchers
 
   @staticmethod
-  def check(config: Section, jobs: Sequence[Job]) -> None:
+  def check(config: RayConfig, jobs: Sequence[Job]) -> None:
     """See `runner.Launcher`; connects to the cluster, or starts one, until `close` or the end of the process."""
     if not ray.is_initialized():
       address = config.address or os.environ.get("RAY_ADDRESS")
@@ -63,7 +63,7 @@ class RayLauncher:
 
   def start(self, job: Job) -> bool:
     folder, gpus = self._sweep.folder(job), _gpus(self._config, job)
-    folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
+    folder.write_waiting("submitted")
     task = self._run.options(
       num_cpus=_cores(self._config), num_gpus=gpus, max_retries=self._config.retries, name=job.name
     )
@@ -87,21 +87,21 @@ class RayLauncher:
 
 
 def _knock(address: str | None) -> None:
-  """Raises OSError where an address names a host and a port and nobody is there: Ray tries for most of a minute."""
+  """Raises OSError if nothing listens at an address of host and port: Ray itself tries for most of a minute."""
   place = urlsplit(address if address and "//" in address else f"//{address or ''}")
   if place.hostname and place.port:
     socket.create_connection((place.hostname, place.port), timeout=10.0).close()
 
 
-def _gpus(config: Section, job: Job) -> float:
-  """What a job takes of the cluster's GPUs."""
+def _gpus(config: RayConfig, job: Job) -> float:
+  """The GPUs of the cluster that a job takes."""
   if config.gpus_per_job is not None:
     return 0 if job.needs == 0 else config.gpus_per_job
   return job.needs if job.needs is not None else min(1, ray.cluster_resources().get("GPU", 0))
 
 
-def _cores(config: Section) -> float:
-  """What a job takes of a node's cores."""
+def _cores(config: RayConfig) -> float:
+  """The cores of a node that a job takes."""
   if config.cores_per_job is not None:
     return config.cores_per_job
   return min(_CORES, max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]))

@@ -9,13 +9,14 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from types import FrameType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rich.console import Console
 
 from playground.config import Section, check_saved_job
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
+from playground.sweep.options import LAUNCHERS, SEARCHES, typed
 from playground.sweep.report import write_result
 from playground.sweep.view import View
 from playground.sweep.worker import COMMAND
@@ -36,11 +37,11 @@ class Launcher(Protocol):
 
   outlives: bool
 
-  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND):
-    """Takes a sweep, its section `launcher` and the command that runs a job's overrides; raises as `check`."""
+  def __init__(self, sweep: SweepDirectory, config: Any, command: Sequence[str] = COMMAND):
+    """Takes a sweep, settings (of `LAUNCHERS`), and the command that runs a job's overrides; raises as `check`."""
 
   @staticmethod
-  def check(config: Section, jobs: Sequence[Job]) -> None:
+  def check(config: Any, jobs: Sequence[Job]) -> None:
     """Raises PlaygroundError for missing software, invalid settings and jobs that can never start; writes nothing."""
 
   def start(self, job: Job) -> bool:
@@ -97,10 +98,10 @@ def run_sweep(
     if settings.search.name != "grid":
       from playground.sweep.search import Search
 
-      search = Search(sweep, settings.search, view.print)
+      search = Search(sweep, typed(SEARCHES, settings.search), view.print)
     wait = settings.launcher.get("wait", True)
     make_launcher = launcher_class(settings.launcher.name)
-    with contextlib.closing(make_launcher(sweep, settings.launcher, command)) as launcher:
+    with contextlib.closing(make_launcher(sweep, typed(LAUNCHERS, settings.launcher), command)) as launcher:
       code = Runner(sweep, launcher, view, search, settings.on_error == "stop", wait).run()
     if wait:
       write_result(sweep, view.print)

@@ -1,4 +1,4 @@
-"""A search in place of every combination: Optuna draws a job's values, and learns from what came out of it.
+"""Search instead of every combination: Optuna draws each job's values and learns from its result.
 
 The study lies in the sweep's folder (`study.log`), a trial is one of its jobs; both go on where they stopped.
 """
@@ -10,10 +10,10 @@ from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSw
 from hydra.core.override_parser.types import Override as HydraOverride
 
 from playground import config as configs
-from playground.config import Section
 from playground.config.overrides import parse_with_hydra
 from playground.errors import ConfigError, PlaygroundError
 from playground.sweep.folder import Job, JobFolder, SweepDirectory
+from playground.sweep.options import OptunaConfig
 
 try:
   import optuna
@@ -34,7 +34,7 @@ _SAMPLERS = {
 class Search:
   """Asks Optuna for jobs and tells it how they ended."""
 
-  def __init__(self, sweep: SweepDirectory, config: Section, notify: Callable[[str], None] = print):
+  def __init__(self, sweep: SweepDirectory, config: OptunaConfig, notify: Callable[[str], None] = print):
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     self._sweep = sweep
     self._config = config
@@ -60,16 +60,16 @@ class Search:
 
   @property
   def trials(self) -> int:
-    """How many there are to be."""
+    """The number of trials in all."""
     return self._config.trials
 
   @property
   def done(self) -> bool:
-    """Whether there is nothing left to ask for."""
+    """Whether all trials have been drawn."""
     return len(self._sweep.jobs) + self._refused >= self.trials
 
   def ask(self, at_work: int) -> Job | None:
-    """The next job, written to the sweep; None while as many are at work as may be, or if its values do not fit."""
+    """Adds the next job to the sweep and returns it; None if enough jobs run, or if the drawn values are invalid."""
     if self.done or at_work >= self._config.parallel:
       return None
     trial = self._study.ask(self._drawn)
@@ -87,7 +87,7 @@ class Search:
     return job
 
   def tell(self, job: Job, folder: JobFolder) -> None:
-    """Takes note of how a job ended; one that was only interrupted stays open."""
+    """Records a job's result; a job that was only interrupted stays open."""
     state = folder.state().status
     if state == "preempted":
       return
@@ -102,7 +102,7 @@ class Search:
       self._study.add_trial(again)
 
   def best(self) -> str:
-    """What was found, in a sentence."""
+    """The best trial, in a sentence."""
     if not self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
       return "No trial has finished."
     trial = self._study.best_trial
@@ -111,7 +111,7 @@ class Search:
 
 
 def distribution(override: HydraOverride) -> BaseDistribution:
-  """What a line of the command line lets Optuna draw from; `tag(log, interval(a, b))` is drawn on a log scale.
+  """The distribution of an override; `tag(log, interval(a, b))` is drawn on a log scale.
 
   Raises:
     ConfigError: it cannot draw from that.
@@ -134,7 +134,7 @@ def distribution(override: HydraOverride) -> BaseDistribution:
 
 
 def first_values(lines: Sequence[str]) -> list[str]:
-  """The overrides of a job that the search could draw: the first value of each list, the low end of each interval."""
+  """The overrides of one possible job: the first value of each list, the low end of each interval."""
   overrides, drawn = [], False
   for line in lines:
     override = parse_with_hydra(line)

@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from playground.config import Section
 from playground.errors import ConfigError, HardwareError
 from playground.interpreter import PYTHON
 from playground.sweep.folder import ENDED, STOP_FILE, Job, JobFolder, SweepDirectory
+from playground.sweep.options import SlurmConfig
 from playground.sweep.worker import COMMAND, Worker
 
 try:
@@ -35,7 +35,7 @@ QUEUE_S = 5.0  # how often Slurm is asked
 
 @dataclasses.dataclass
 class SlurmJob:
-  """What Slurm runs: a worker that can be told to save and come back."""
+  """The callable that submitit runs: a worker that saves and is queued again."""
 
   folder: Path
   command: tuple[str, ...]
@@ -57,7 +57,7 @@ class SlurmJob:
     return submitit.helpers.DelayedSubmission(dataclasses.replace(self))
 
   def _taken(self) -> bool:
-    """Whether the job itself heard that Slurm wants its place, and nobody cancelled it."""
+    """Whether the run, not submitit, got Slurm's preemption signal, and nobody cancelled the job."""
     if JobFolder(self.folder).state().status != "preempted" or (self.folder.parents[1] / STOP_FILE).exists():
       return False
     job_id = os.environ.get("SLURM_JOB_ID")
@@ -72,7 +72,7 @@ class Queue:
     self.forget()
 
   def forget(self) -> None:
-    """What was seen is out of date."""
+    """Makes the next question go to Slurm."""
     self._asked = -math.inf
 
   def state(self, job_id: str) -> str | None:
@@ -91,16 +91,10 @@ class SlurmLauncher:
 
   outlives = True
 
-  def __init__(self, sweep: SweepDirectory, config: Section, command: Sequence[str] = COMMAND, executor: Any = None):
-    """Args:
-      sweep: what to launch.
-      config: `launcher`.
-      command: what jobs are run with.
-      executor: of submitit; Slurm's if not given.
-
-    Raises:
-      PlaygroundError: as `check`.
-    """
+  def __init__(
+    self, sweep: SweepDirectory, config: SlurmConfig, command: Sequence[str] = COMMAND, executor: Any = None
+  ):
+    """See `runner.Launcher`; `executor` is submitit's for Slurm if not given."""
     self.check(config, sweep.jobs)
     self._folder = sweep.path.absolute() / "slurm"
     self._executor = executor or _executor(self._folder, config.requeues)
@@ -111,8 +105,8 @@ class SlurmLauncher:
     self.submitted: dict[str, Any] = {}
 
   @staticmethod
-  def check(config: Section, jobs: Sequence[Job]) -> None:
-    """See `runner.Launcher`; what it cannot give a job Slurm itself says."""
+  def check(config: SlurmConfig, jobs: Sequence[Job]) -> None:
+    """See `runner.Launcher`; whether the cluster can run a job, sbatch answers."""
     if not config.wait and config.max_parallel is not None:
       raise ConfigError("launcher.wait=false submits all jobs at once: leave launcher.max_parallel out.")
     if config.minutes * 60 <= _notice_s(config):
@@ -130,12 +124,12 @@ class SlurmLauncher:
     folder = self._sweep.folder(job)
     if isinstance(self._executor, submitit.SlurmExecutor):
       self._executor.update_parameters(**slurm_parameters(self._config, job))
-    folder.write(status="submitted", attempt=folder.record.get("attempt", 0))
+    folder.write_waiting("submitted")
     task = SlurmJob(folder.path.absolute(), self._command, self._config.timeout, self._config.grace)
     try:
       submitted = self._executor.submit(task)
     except submitit.core.utils.FailedJobError as error:
-      folder.write(status="queued", attempt=folder.record.get("attempt", 0))
+      folder.write_waiting("queued")
       why = str(error).strip().splitlines()[-1].removeprefix("sbatch: ")
       raise HardwareError(
         f"launcher=slurm: sbatch refused job {job.name} ({why}); what was submitted before goes on, and so does the "
@@ -164,7 +158,7 @@ class SlurmLauncher:
     """Jobs go on by themselves."""
 
   def _submitted(self, job: Job, folder: JobFolder) -> Any:
-    """What submitit knows of a job, also of one that an earlier process submitted."""
+    """Submitit's handle of a job, also of one that an earlier process submitted."""
     known = folder.path / "slurm_id"
     if job.name not in self.submitted and known.is_file() and _SLURM_ID.fullmatch(job_id := known.read_text()):
       self.submitted[job.name] = self._executor.job_class(self._folder, job_id)
@@ -176,8 +170,8 @@ def _executor(folder: Path, requeues: int) -> Any:
   return submitit.SlurmExecutor(folder, max_num_timeout=requeues, python=shlex.join(PYTHON))
 
 
-def slurm_parameters(config: Section, job: Job) -> dict[str, Any]:
-  """What sbatch is told of a job, in submitit's words."""
+def slurm_parameters(config: SlurmConfig, job: Job) -> dict[str, Any]:
+  """The parameters of sbatch for a job, by submitit's names."""
   gpus = config.gpus_per_job if config.gpus_per_job is not None else 1 if job.needs is None else job.needs
   parameters = {
     "job_name": job.name,
@@ -190,10 +184,10 @@ def slurm_parameters(config: Section, job: Job) -> dict[str, Any]:
     "setup": list(config.setup),
     "additional_parameters": dict(config.parameters),
   }
-  named = {key: config[key] for key in ("partition", "account", "qos", "constraint")}
+  named = {key: getattr(config, key) for key in ("partition", "account", "qos", "constraint")}
   return parameters | {key: value for key, value in named.items() if value} | ({"gpus_per_node": gpus} if gpus else {})
 
 
-def _notice_s(config: Section) -> int:
-  """How long before its time limit a job is asked to save."""
+def _notice_s(config: SlurmConfig) -> int:
+  """Seconds before its time limit at which a job is asked to save."""
   return int(config.grace) + 30

@@ -1,4 +1,4 @@
-"""What one sees of a sweep: a live table on a terminal, a line for each change in a log."""
+"""The output of a sweep: a live table on a terminal, a line for each change in a log."""
 
 import time
 from collections import Counter
@@ -17,7 +17,7 @@ _COLORS = {"finished": "green", "running": "cyan", "failed": "red", "timeout": "
 
 
 class View:
-  """Shows how jobs stand. On a terminal redraws a table twice a second at most."""
+  """Shows the states of jobs. On a terminal it redraws a table at most twice a second."""
 
   def __init__(self, sweep: SweepDirectory, console: Console | None = None):
     self._sweep = sweep
@@ -37,7 +37,7 @@ class View:
       self._live.stop()
 
   def print(self, text: str) -> None:
-    """A line above the table."""
+    """Prints a line above the table."""
     self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
   def begin(self, states: Mapping[str, JobState], at_work: int, trials: int | None = None) -> None:
@@ -50,11 +50,11 @@ class View:
     self.print(f"{what} in {self._sweep.path}{already}")
 
   def update(self, states: Mapping[str, JobState], now: bool = False) -> None:
-    """Shows what is new.
+    """Shows changes.
 
     Args:
-      states: how every job stands, by name.
-      now: at once, not when it is due.
+      states: the state of every job, by name.
+      now: redraws the table at once, not when it is due.
     """
     if not self._live:
       self._lines(states)
@@ -81,9 +81,9 @@ def status_table(sweep: SweepDirectory, states: Mapping[str, JobState], rows: in
   """A table of jobs.
 
   Args:
-    sweep: whose.
-    states: how they stand, by name.
-    rows: at most, the most telling ones; None is all.
+    sweep: of the jobs.
+    states: the states of its jobs, by name.
+    rows: the largest number of rows; None is all.
   """
   counts = Counter(state.status for state in states.values())
   title = f"{sweep.path}: {', '.join(f'{n} {status}' for status, n in counts.items())}"
@@ -107,7 +107,7 @@ def status_table(sweep: SweepDirectory, states: Mapping[str, JobState], rows: in
 
 
 def _most_telling(jobs: Sequence[Job], states: Mapping[str, JobState], rows: int | None) -> list[Job]:
-  """What runs, what failed, what ended last, what comes next; in their own order."""
+  """Running, failed and long jobs before the others; in the sweep's order."""
   if rows is None or len(jobs) <= rows:
     return list(jobs)
 

@@ -26,7 +26,7 @@ POLL_S = 0.2
 
 
 def job_command(trusted: Sequence[str] = (), lines: Sequence[str] = ()) -> tuple[str, ...]:
-  """What a sweep's jobs are run with: packages to trust, and lines that its folder does not keep (`is_of_command`)."""
+  """The command of jobs, with trusted packages and the overrides that sweep.yaml never holds (`is_of_command`)."""
   return (*COMMAND, *([f"trust=[{','.join(trusted)}]"] if trusted else []), *lines)
 
 
@@ -34,13 +34,11 @@ class Worker:
   """Runs one job. `stop` may be called by a signal handler or another thread."""
 
   def __init__(self, folder: Path, command: Sequence[str] = COMMAND, timeout: float | None = None, grace: float = 60.0):
-    """Takes charge of a job.
-
-    Args:
-      folder: of the job, `<sweep>/jobs/<job>`.
-      command: what the job's overrides are handed to.
-      timeout: seconds until the job is asked to stop.
-      grace: seconds from then until it is killed.
+    """Args:
+    folder: of the job, `<sweep>/jobs/<job>`.
+    command: what the job's overrides are handed to.
+    timeout: seconds until the job is asked to stop.
+    grace: seconds from then until it is killed.
     """
     self._folder = JobFolder(Path(folder).absolute())
     self._command = tuple(command)
@@ -56,7 +54,7 @@ class Worker:
     self._stopping = True
 
   def run(self, where: str = "", **facts: Any) -> int:
-    """Returns the job's exit code when it has ended; 0, too, if another worker is at it.
+    """Runs the job to its end and returns its exit code; returns 0 if another worker runs it.
 
     Args:
       where: what it runs on, for people.
@@ -81,7 +79,7 @@ class Worker:
     return code
 
   def interrupt(self, reason: str) -> None:
-    """For a signal handler that does not return to `run`: ends the job, saved, and records that it is to go on."""
+    """Stops the job, which saves it, and records it as preempted; for signal handlers that do not return to `run`."""
     self.stop()
     if self._child is not None:
       self._watch(self._child)
@@ -169,7 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _blocked(signum: int) -> Iterator[None]:
-  """What is started meanwhile never hears the signal; this process hears it when the block ends."""
+  """Blocks a signal for processes started in the block; this process gets it when the block ends."""
   before = signal.pthread_sigmask(signal.SIG_BLOCK, {signum})
   try:
     yield
@@ -186,7 +184,7 @@ def _signal(child: "subprocess.Popen[bytes]", signum: int, group: bool) -> None:
 
 
 def _last_line(log: Path) -> str:
-  """The last thing a job said, mostly its error."""
+  """The last line of a job's log, mostly its error."""
   lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
   return (lines or ["it said nothing"])[-1][:300]
 

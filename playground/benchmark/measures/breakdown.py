@@ -1,4 +1,4 @@
-"""Where the time of training goes: the loop timed with its parts added one by one, as in the paper's pixel tables."""
+"""The time of each part of training: the loop with its parts added one by one, as in the paper's pixel tables."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -42,8 +42,8 @@ def measure(
 ) -> None:
   """A row for each of `PARTS` up to `until`: seconds a control step of one environment takes with all parts so far.
 
-  The parts take turns, and the best of each one's turns counts: their differences are what is looked at. The memory is
-  what all parts took together: JAX's, and with `watch_memory` what the GPU's driver says.
+  The parts take turns, and the best turn of each counts, since their differences matter. The memory is that of all
+  parts together: JAX's, and with `watch_memory` the GPU driver's.
   """
   with used_memory(facts) if watch_memory else nullcontext():
     subject = Subject.build(facts, task, agent, overrides)

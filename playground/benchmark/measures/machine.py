@@ -1,4 +1,4 @@
-"""What this machine is: device, driver, versions."""
+"""This machine: device, driver, versions."""
 
 import contextlib
 import os
@@ -21,7 +21,7 @@ INTERVAL_S = 0.5  # between two questions to the driver
 
 
 def measure(facts: Facts, overrides: list[str]) -> None:
-  """Says what jobs with these overrides run on: a row whose value is the number of devices."""
+  """A row whose value is the number of devices of a run with these overrides."""
   hardware = setup(compose(["env=CartpoleBalance", *overrides]).hardware)
   facts.emit("devices", hardware.mesh.size, "", device=device_name(), versions=versions())
 
@@ -37,7 +37,7 @@ def device_name() -> str:
 
 
 def versions() -> str:
-  """Versions of what decides speed, in one line."""
+  """Versions of the packages that decide speed, in one line."""
   found = package_versions()
   parts = [f"{name} {found[key]}" for key, name in _NAMES.items() if found.get(key)]
   driver = _query_gpu("driver_version")
@@ -48,7 +48,7 @@ def versions() -> str:
 def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
   """A row for the most memory in use on the GPU during the block beyond what was before it; none without a GPU.
 
-  Asked of the driver twice a second, so that what is not JAX's (Warp's arrays, compiled code) counts.
+  The driver is asked twice a second, so that memory outside JAX (Warp's arrays, compiled code) counts.
   """
   ask = lambda: float(_query_gpu("memory.used") or "nan")
   before, most, ended = ask(), 0.0, threading.Event()
@@ -69,7 +69,7 @@ def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
 
 
 def _query_gpu(field: str) -> str | None:
-  """What nvidia-smi says of the first GPU that this process may use; None without one."""
+  """A field of nvidia-smi for the first GPU that this process may use; None without one."""
   first = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0] or "0"
   if not shutil.which("nvidia-smi"):
     return None

@@ -1,4 +1,4 @@
-"""What the measurements share: a task with its trainer, clocks, and the facts of this process."""
+"""Shared by the measurements: a task with its trainer, clocks, and the facts of this process."""
 
 import contextlib
 import dataclasses
@@ -67,12 +67,12 @@ class Subject:
     return self.draw(self.config.seed)[0]
 
   def key(self, seed: int) -> jax.Array:
-    """A random key that all devices have."""
+    """A random key, on all devices."""
     return jax.device_put(jax.random.PRNGKey(seed), NamedSharding(self.hardware.mesh, P()))
 
 
 def told(overrides: Sequence[str]) -> list[str]:
-  """Overrides that make a setting: that one device is used goes without saying."""
+  """The overrides that a row's setting shows: all but the default of one device."""
   return [text for text in overrides if text != ONE_DEVICE]
 
 
@@ -84,7 +84,7 @@ def _precision(hardware: Hardware, trainer: Trainer) -> str:
 
 @contextlib.contextmanager
 def alone(lock: str | None) -> Iterator[None]:
-  """The device to itself: others that measure on it wait until the block is done (they may be compiling)."""
+  """Holds the device during the block: other measurements wait with their timing (they may compile)."""
   if lock is None:
     yield
     return

@@ -23,8 +23,8 @@ def measure(
 ) -> None:
   """Rows for compile time, time to the first update and memory, and for each seed the steps a second.
 
-  A seed starts from fresh networks, environments and randomised models; its first update is not timed. No evaluation
-  and no fresh start of all environments is in the time. One compilation serves all seeds.
+  A seed starts from new networks, environments and randomised models; its first update is not timed. The time holds no
+  evaluation and no reset of all environments. One compilation serves all seeds.
 
   Args:
     facts: takes the rows.
