@@ -98,10 +98,6 @@ class ObservationManager:
     """
     self._level = noise_level
     self._frames = frames
-    if not isinstance(frames, int) or frames < 1:
-      raise ConfigError(f"env.observation_frames={frames!r} must be a number of steps, 1 or more.")
-    if ACTOR not in section or section[ACTOR] is None:
-      raise ConfigError(f"env.observations has no group {ACTOR!r}, which the policy reads.")
     self.groups: dict[str, list[Term]] = {}
     for group in sorted(section, key=lambda name: (name != ACTOR, name)):
       entries = {name: entry for name, entry in (section[group] or {}).items() if entry is not None}
@@ -114,12 +110,7 @@ class ObservationManager:
         noisy += [name] if term.options.noise and "same_as" not in term.options.noise else []
         self.groups.setdefault(group, []).append(term)
     if ACTOR not in self.groups:
-      raise ConfigError(f"env.observations.{ACTOR} is empty: the policy would read nothing.")
-
-  @property
-  def keeps_past(self) -> bool:
-    """Whether `info` has an entry `observation_buffers`."""
-    return self._frames > 1 or any(_depth(term) > 1 for terms in self.groups.values() for term in terms)
+      raise ConfigError(f"env.observations.{ACTOR} is missing or empty: the policy would read nothing.")
 
   def compute(self, c: StepContext, key: jax.Array, buffers: Info | None = None) -> tuple[Any, Info]:
     """Observes.

@@ -169,10 +169,6 @@ class _DelayedObservations(ObservationManager):
     super().__init__(config.observations, config.noise_level, config.observation_frames, config.observation_order)
     self._bounds = bounds
 
-  @property
-  def keeps_past(self) -> bool:
-    return True
-
   def compute(self, c: ArmContext, key: jax.Array, buffers: Any = None) -> tuple[Any, dict[str, Any]]:
     key, delay_key = jax.random.split(key)
     obs, past = super().compute(c, key, buffers)
