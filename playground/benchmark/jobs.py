@@ -143,8 +143,10 @@ def probe(overrides: Sequence[str], gpus: Sequence[int]) -> dict[str, Any]:
   columns: dict[str, str] = dict.fromkeys(("task", "agent", "who", "setting"), "")
   machine = Measurement("machine", {"overrides": list(overrides)}, columns, {})
   code, rows = _run([machine], lambda _, row: found.append(row), Plan(gpus=tuple(gpus[:1]), cache=True))
+  if code >= 128:  # interrupted
+    sys.exit(code)
   if code:
-    raise HardwareError(rows.reasons.get("000", "the machine was not asked: interrupted."))
+    raise HardwareError(rows.reasons["000"])
   return {"devices": int(found[0]["value"]), "device": found[0]["device"], "versions": found[0]["versions"]}
 
 
