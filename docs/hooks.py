@@ -26,7 +26,14 @@ API = {
   "Randomisation": ["randomization"],
   "Scenes": ["robots.scene", "robots.terrain", "robots.tabletop", "robots.in_hand"],
   "Learning": ["learning"],
-  "Runs": ["config.run_config", "config.composition", "runs.train", "runs.trained", "runs.run_dir", "rendering.video"],
+  "Runs": [
+    "config.run_config",
+    "config.composition",
+    "runs.train",
+    "runs.loaded_policy",
+    "runs.run_dir",
+    "rendering.video",
+  ],
   "Adapters": ["adapters"],
   "Deployment": ["deploy"],
 }

@@ -151,18 +151,18 @@ def test_an_algorithm_of_a_package_trains_resumes_and_is_exported(reinforce: Pat
   code = f"""
     from playground.config import compose
     from playground.deploy.export import export_run
-    from playground.runs.job import Job
+    from playground.runs.callbacks import RunCallbacks
     from playground.runs.run_dir import RunDirectory
     from playground.runs.train import train
 
     fast = ["env=CartpoleBalance", "agent=reinforce", "debug=fast", "hardware=cpu", "tracking=csv"]
     whole, parts = ({str(tmp_path)!r} + name for name in ("/whole", "/parts"))
     assert train(compose([*fast, f"run_dir={{whole}}"])) == 0
-    should_stop = Job.should_stop
-    Job.should_stop = lambda job: job._step >= 160
+    should_stop = RunCallbacks.should_stop
+    RunCallbacks.should_stop = lambda job: job._step >= 160
     train(compose([*fast, f"run_dir={{parts}}"]))
     assert RunDirectory(parts).status["status"] == "preempted"
-    Job.should_stop = should_stop
+    RunCallbacks.should_stop = should_stop
     assert train(compose([f"resume={{parts}}"])) == 0
     for key in ("params_sha256", "final_return", "steps"):
       assert RunDirectory(parts).summary[key] == RunDirectory(whole).summary[key], key

@@ -14,7 +14,7 @@ from playground.config import compose
 from playground.deploy.play import play
 from playground.errors import CheckpointError, ConfigError, UnknownNameError
 from playground.pretrained import POLICIES, cards, check_task, locate, working_copy
-from playground.runs.start import weights_of
+from playground.runs.restore_plan import weights_of
 
 TASK = "G1JoystickFlatTerrain"
 

@@ -11,10 +11,10 @@ from playground.learning.evaluation import make_evaluator
 from playground.paper import paper_table
 from playground.rendering.video import need_camera, need_place, render_video
 from playground.rendering.visuals import drawn_model
+from playground.runs.callbacks import episodes_of
 from playground.runs.files import need_folder, write_json
-from playground.runs.job import episodes_of
+from playground.runs.loaded_policy import load_policy
 from playground.runs.train import model_sampler
-from playground.runs.trained import load_trained
 
 
 def evaluate_run(
@@ -47,7 +47,7 @@ def evaluate_run(
   """
   console = console or Console()
   film = need_place(video, camera)
-  trained = load_trained(path)
+  trained = load_policy(path)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
   folder = trained.run_dir.path / "eval"
   need_folder(folder, str(folder))

@@ -8,8 +8,8 @@ from rich.table import Table
 from playground.config import compose, format_value
 from playground.errors import ConfigError
 from playground.learning.buffers import ROOM, Act, BufferSizes, measure_buffers
+from playground.runs.loaded_policy import load_policy
 from playground.runs.progress import Progress
-from playground.runs.trained import load_trained
 
 # By key of a task's config: what it bounds, and how much of that was needed.
 _BUFFERS: dict[str, tuple[str, Callable[[BufferSizes], str]]] = {
@@ -41,7 +41,7 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   config = compose([f"env={task}", *overrides]).env
   policies: dict[str, Act | None] = {"random": None}
   if run is not None:
-    trained = load_trained(run)
+    trained = load_policy(run)
     if trained.task != task:
       raise ConfigError(f"--run={run} is one of {trained.task}, not of {task}.")
     policies["trained"] = trained.act

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from playground.errors import CheckpointError
 from playground.learning.checkpoints import BEST, find_checkpoints, find_stages
-from playground.runs.trained import Trained
+from playground.runs.loaded_policy import LoadedPolicy
 
 # Keys of a run's config that give meaning to what an actor reads and gives; how many numbers that is, its arrays tell.
 _ENV = ("task", "robot", "observations", "observation_order", "observation_frames", "vision")
@@ -22,7 +22,7 @@ class Menu:
     trained: the checkpoint to begin with.
   """
 
-  def __init__(self, folder: Path, trained: Trained, say: Callable[[str], object]):
+  def __init__(self, folder: Path, trained: LoadedPolicy, say: Callable[[str], object]):
     """Takes the absolute folder of a run or a chain, a checkpoint of its last stage, and who shows a sentence."""
     self.trained = trained
     self._folder, self._say = folder, say

@@ -23,9 +23,9 @@ from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
 from playground.rendering.video import need_camera, need_place, render_video
+from playground.runs.callbacks import episodes_of
 from playground.runs.files import need_folder, write_json
-from playground.runs.job import episodes_of
-from playground.runs.trained import Trained
+from playground.runs.loaded_policy import LoadedPolicy
 
 _BACKENDS = {"jax": "MJX ", "warp": "MJX-Warp "}  # by the manifest's `impl`; a policy exported long ago tells none
 
@@ -130,7 +130,7 @@ class Opened:
   exported: ExportedPolicy
   env: Env
   folder: Path
-  trained: Trained | None = None
+  trained: LoadedPolicy | None = None
 
 
 def open_policy(path: str) -> Opened:
@@ -181,7 +181,7 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
   return env
 
 
-def _menu(given: Path, trained: Trained, console: Console) -> Menu:
+def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
   """The checkpoints of the run that `given` is, or is in; of all stages, if it is a chain."""
   run = trained.run_dir.path
   return Menu(given if given == run.parent else run, trained, lambda said: console.print(said, soft_wrap=True))

@@ -19,21 +19,21 @@ from playground.envs.options import sees
 from playground.envs.wrappers import wrap_for_training
 from playground.extras import need
 from playground.runs.csv_tracker import read_metrics
-from playground.runs.trained import Trained, load_trained
+from playground.runs.loaded_policy import LoadedPolicy, load_policy
 
 _EXACT = "highest"  # precision of matrix products: what the exported policy computes
 
 
-def load_exact(path: str | Path) -> Trained:
+def load_exact(path: str | Path) -> LoadedPolicy:
   """Reads a run's newest checkpoint, or the one given, with its task on C MuJoCo; all of it computes on the CPU.
 
   Raises:
     PlaygroundError: no such run or checkpoint, or one that does not fit.
   """
-  return load_trained(path, load_task=load_on_c_physics, platform="cpu", precision=_EXACT)
+  return load_policy(path, load_task=load_on_c_physics, platform="cpu", precision=_EXACT)
 
 
-def record(trained: Trained, num_envs: int, decisions: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:
+def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:
   """Lets the policy's mode act, noise and all.
 
   Returns:
@@ -55,7 +55,7 @@ def record(trained: Trained, num_envs: int, decisions: int) -> tuple[dict[str, n
   return obs, actions, jax.tree.map(lambda x: x[0], state)
 
 
-def export_policy(trained: Trained, state: State | None = None) -> ExportedPolicy:
+def export_policy(trained: LoadedPolicy, state: State | None = None) -> ExportedPolicy:
   """The policy as a controller has it; `state` is any of one environment (a fresh one if None)."""
   need("deploy", "onnx", "onnxruntime")
   policy, agent, networks = jax.device_get(trained.policy), trained.config.agent, trained.trainer.networks
@@ -79,7 +79,7 @@ def export_policy(trained: Trained, state: State | None = None) -> ExportedPolic
   return ExportedPolicy(content, contract)
 
 
-def _newest_evaluation(trained: Trained) -> dict[str, float]:
+def _newest_evaluation(trained: LoadedPolicy) -> dict[str, float]:
   """`steps` and the scores of the last evaluation in the training run, {} if there was none."""
   table = read_metrics(trained.run_dir.metrics_csv)
   if "eval/episode_reward" not in table:

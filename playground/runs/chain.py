@@ -27,8 +27,8 @@ from playground.rendering.video import need_camera
 from playground.runs.chain_result import write_result
 from playground.runs.interrupts import Interrupts, exit_code
 from playground.runs.provenance import process_age_s
+from playground.runs.restore_plan import RestorePlan, weights_of
 from playground.runs.run_dir import RunDirectory
-from playground.runs.start import Start, weights_of
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
@@ -109,8 +109,8 @@ def _check(config: "RunConfig") -> None:
       facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
       facts |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(trainer.policy_shape())}
       if before is None and config.init_from is not None:
-        start = Start(weights=weights_of(config.init_from))
-        start.restore(trainer, stage.agent.name, lambda: ({}, {}))
+        plan = RestorePlan(weights=weights_of(config.init_from))
+        plan.restore(trainer, stage.agent.name, lambda: ({}, {}))
       if before is not None:
         _compare(f"env={stage.choices['env']}", facts, *before)
       before = name, facts

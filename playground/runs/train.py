@@ -22,14 +22,13 @@ from playground.learning.trainer import Trainer, TrainState
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
 from playground.rendering.visuals import drawn_model
+from playground.runs.callbacks import NonMainCallbacks, RunCallbacks
 from playground.runs.chain import train_chain
-from playground.runs.follower import Follower
 from playground.runs.interrupts import Interrupted, Interrupts, exit_code
-from playground.runs.job import Job
 from playground.runs.progress import Progress
 from playground.runs.provenance import process_age_s
+from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
-from playground.runs.start import Start
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
@@ -61,17 +60,19 @@ def train(config: "RunConfig") -> int:
 
 def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) -> int:
   """One run; `began_s` is the age of the process by then, 0 for its first."""
-  start = Start.find(config, began_s)
-  if not start.finished:
+  plan = RestorePlan.find(config, began_s)
+  if not plan.finished:
     hardware = setup(config.hardware)
-    with start.locked(config) as start:
-      if not start.finished:
-        return _train_locked(config, interrupts, began_s, start, hardware)
+    with plan.locked(config) as plan:
+      if not plan.finished:
+        return _train_locked(config, interrupts, began_s, plan, hardware)
   print(f"{config.resume} is finished: nothing to resume (init_from={config.resume} trains on from its weights).")
   return 0
 
 
-def _train_locked(config: "RunConfig", interrupts: Interrupts, began_s: float, start: Start, hardware: Hardware) -> int:
+def _train_locked(
+  config: "RunConfig", interrupts: Interrupts, began_s: float, plan: RestorePlan, hardware: Hardware
+) -> int:
   """One run, new or to resume, that no other process writes."""
   preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
   agent = read_config(config.agent)
@@ -81,45 +82,45 @@ def _train_locked(config: "RunConfig", interrupts: Interrupts, began_s: float, s
   need_camera(drawn, config.video.camera, "video.camera")
   draw = partial(model_sampler(env, config, agent.num_envs, agent.num_eval_envs), config.seed)
   trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision)
-  start.notices += trainer.notices()
+  plan.notices += trainer.notices()
   if hardware.mesh.size > 1:
-    start.notices.append(describe_division(config.agent, hardware.mesh.size))
-  start.restore(trainer, config.agent.name, draw)
-  preflight(config.hardware, [start.step, start.weights and start.weights.step], "checkpoint")  # one may see it damaged
+    plan.notices.append(describe_division(config.agent, hardware.mesh.size))
+  plan.restore(trainer, config.agent.name, draw)
+  preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # one may see it damaged
 
   num_updates = math.ceil(agent.num_timesteps / trainer.steps_per_update)
   events = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
-  start.notices += cut_short(agent, env.episode_length, events, trainer.steps_per_update)
+  plan.notices += cut_short(agent, env.episode_length, events, trainer.steps_per_update)
   num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
   evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, hardware.mesh, num_recorded)
   if not is_main():
     with noting_loss(RunDirectory(share()).note_loss):
-      program = compile_program(trainer, evaluate, draw, start.policy)
-      follower = Follower(config, env, interrupts, start.step)
-      loop = Loop(trainer, program, events, config.seed, follower)
-      _, completed = _run(loop, start, interrupts)
+      program = compile_program(trainer, evaluate, draw, plan.policy)
+      callbacks = NonMainCallbacks(config, env, interrupts, plan.step)
+      loop = Loop(trainer, program, events, config.seed, callbacks)
+      _, completed = _run(loop, plan, interrupts)
     return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
-  run_dir = start.run_dir or RunDirectory.create(
+  run_dir = plan.run_dir or RunDirectory.create(
     str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
   )
   share(str(run_dir.path.absolute()))
   with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(num_updates * trainer.steps_per_update) as progress:
     run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=env.impl, **hardware.facts)
-    for notice in start.notices:
+    for notice in plan.notices:
       progress.print(notice)
     progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
-    program = compile_program(trainer, evaluate, draw, start.policy)
+    program = compile_program(trainer, evaluate, draw, plan.policy)
     if program.notice:
       progress.print(program.notice)
     to_compiled_s = process_age_s() - began_s
     timings = {"start_to_compiled_s": to_compiled_s, "trace_s": program.trace_s, "compile_s": program.compile_s}
     run_dir.update_manifest(timings=timings)
 
-    job = Job(config, run_dir, env, trainer, progress, interrupts, start, drawn)
-    with contextlib.closing(job):
-      loop = Loop(trainer, program, events, config.seed, job)
-      state, completed = _run(loop, start, interrupts)
-      job.finish(loop, state, completed)
+    callbacks = RunCallbacks(config, run_dir, env, trainer, progress, interrupts, plan, drawn)
+    with contextlib.closing(callbacks):
+      loop = Loop(trainer, program, events, config.seed, callbacks)
+      state, completed = _run(loop, plan, interrupts)
+      callbacks.finish(loop, state, completed)
   _say_where(run_dir)
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
 
@@ -145,12 +146,12 @@ def cut_short(agent: Any, episode_length: int, events: Sequence[ScheduleEvent], 
   ]
 
 
-def _run(loop: Loop, start: Start, interrupts: Interrupts) -> tuple[TrainState, bool]:
+def _run(loop: Loop, plan: RestorePlan, interrupts: Interrupts) -> tuple[TrainState, bool]:
   """Trains from where the run begins; returns the last state, and whether the schedule was completed."""
   wait_for_all()  # a first exchange waits for half a minute on CPUs: not all compile equally fast
   interrupts.start_saving()
-  state = loop.init(start.policy) if start.state is None else start.state
-  return loop.run(state, start.update)
+  state = loop.init(plan.policy) if plan.state is None else plan.state
+  return loop.run(state, plan.update)
 
 
 def model_sampler(

@@ -10,7 +10,7 @@ from playground import pretrained
 from playground.cli.pretrained import add_policy, show_policies
 from playground.config import compose
 from playground.errors import ConfigError
-from playground.runs.start import weights_of
+from playground.runs.restore_plan import weights_of
 from playground.runs.train import train
 from tests.runs.helpers import TASK
 

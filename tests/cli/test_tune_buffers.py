@@ -15,7 +15,7 @@ from tests.command import Command, caller
 RUN = "results/somewhere"
 
 
-class Trained:
+class LoadedPolicy:
   task = "PandaPickCube"
   config = compose(["env=PandaPickCube", "env.success_distance=0.01", "env.njmax=200"])
 
@@ -34,7 +34,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     return BufferSizes(19, 4.0, 1) if act is None else BufferSizes(49, 6.56, 4)
 
   monkeypatch.setattr(command_module, "measure_buffers", measure)
-  monkeypatch.setattr(command_module, "load_trained", lambda path: Trained)
+  monkeypatch.setattr(command_module, "load_policy", lambda path: LoadedPolicy)
   return asked
 
 
@@ -66,7 +66,7 @@ def test_random_actions(command: Command, measured: list[Any], capsys: pytest.Ca
 
 def test_a_policy_beside_them(command: Command, measured: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
   assert command("PandaPickCube", "--run", RUN) == 0
-  assert [asked[:2] for asked in measured] == [(0.01, None), (0.01, Trained.act)], "the task as the run had it"
+  assert [asked[:2] for asked in measured] == [(0.01, None), (0.01, LoadedPolicy.act)], "the task as the run had it"
   assert rows(capsys.readouterr().out) == {
     "njmax": ["19", "49", "64", "200"],
     "naconmax_per_env": ["4.00", "6.56", "9", "24"],

@@ -26,7 +26,7 @@ import jax, numpy as np
 from playground.config import compose
 from playground.learning.checkpoints import checksum
 from playground.learning.loop import Loop
-from playground.runs.job import Job
+from playground.runs.callbacks import RunCallbacks
 from playground.runs.train import train
 
 run, ended = Loop.run, []
@@ -39,7 +39,7 @@ def remember(loop, *args):
 Loop.run = remember
 
 def trained(*overrides, until=None):
-  Job.should_stop = lambda job: until is not None and job._step >= until
+  RunCallbacks.should_stop = lambda job: until is not None and job._step >= until
   code = train(compose([*sys.argv[1:], *overrides]))
   assert code == 0, code
   return ended[-1]

@@ -12,7 +12,7 @@ from playground.envs.base import State
 from playground.envs.physics import PhysicsData, mjx
 from playground.hardware.mesh import make_mesh
 from playground.learning.evaluation import make_evaluator
-from playground.runs.job import episodes_of
+from playground.runs.callbacks import episodes_of
 from tests.dummy import PointTask
 
 

@@ -16,7 +16,7 @@ from playground.config import compose
 from playground.errors import CheckpointError, ConfigError
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
 from playground.learning.loop import Loop
-from playground.runs.job import Job
+from playground.runs.callbacks import RunCallbacks
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.dummy import Point
@@ -48,7 +48,7 @@ def agent(run: Path) -> str:
 def interrupted(run: Path, *overrides: str) -> list[Path]:
   """A run that is stopped halfway; returns its checkpoints, newest first."""
   with pytest.MonkeyPatch.context() as patch:
-    patch.setattr(Job, "should_stop", lambda job: job._step >= STEPS / 2)
+    patch.setattr(RunCallbacks, "should_stop", lambda job: job._step >= STEPS / 2)
     train(compose([*LONG, f"run_dir={run}", *overrides]))
   assert RunDirectory(run).status["status"] == "preempted"
   return find_checkpoints(run)

@@ -22,7 +22,7 @@ from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoin
 from playground.learning.loop import Loop
 from playground.runs import chain as chain_module
 from playground.runs import train as train_module
-from playground.runs.job import Job
+from playground.runs.callbacks import RunCallbacks
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.dummy import Point
@@ -182,10 +182,10 @@ def test_a_signal_at_any_moment_changes_nothing(
   tmp_path: Path,
 ) -> None:
   path = tmp_path / "chain"
-  on_metrics, compiling = Job.on_metrics, train_module.compile_program
+  on_metrics, compiling = RunCallbacks.on_metrics, train_module.compile_program
 
   def at(stage: str, step: int) -> Callable[..., None]:
-    def row(job: Job, reached: int, *args: Any) -> None:
+    def row(job: RunCallbacks, reached: int, *args: Any) -> None:
       on_metrics(job, reached, *args)
       if (job._run_dir.path.name, reached) == (stage, step):
         kill()
@@ -199,15 +199,15 @@ def test_a_signal_at_any_moment_changes_nothing(
 
   with pytest.MonkeyPatch.context() as patch:
     if moment == "in the first stage":
-      patch.setattr(Job, "on_metrics", at("1_near", 80))
+      patch.setattr(RunCallbacks, "on_metrics", at("1_near", 80))
     elif moment == "at the end of the first stage":
-      patch.setattr(Job, "on_metrics", at("1_near", 320))
+      patch.setattr(RunCallbacks, "on_metrics", at("1_near", 320))
     elif moment == "between the stages":
       patch.setattr(chain_module.gc, "collect", kill)
     elif moment == "while the second stage compiles":
       patch.setattr(train_module, "compile_program", compile_second)
     else:
-      patch.setattr(Job, "on_metrics", at("2_far", 80))
+      patch.setattr(RunCallbacks, "on_metrics", at("2_far", 80))
     assert train(composed(f"run_dir={path}")) == 128 + signal.SIGTERM
   chain = RunDirectory(path)
   assert chain.status["status"] == chain.summary["status"] == "preempted"

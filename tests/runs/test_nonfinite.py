@@ -13,7 +13,7 @@ import pytest
 from playground.cli.replay import replay
 from playground.config import compose
 from playground.learning.checkpoints import find_checkpoints
-from playground.runs.job import NonfiniteError
+from playground.runs.callbacks import NonfiniteError
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.runs.helpers import TASK, resume

@@ -9,7 +9,7 @@ import pytest
 from playground.cli.eval import evaluate_run
 from playground.config import compose
 from playground.errors import ConfigError
-from playground.runs.job import Job
+from playground.runs.callbacks import RunCallbacks
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 
@@ -22,7 +22,7 @@ def test_a_resumed_run_ends_as_if_it_had_never_stopped(tmp_path: Path, monkeypat
   whole, run = tmp_path / "whole", tmp_path / "run"
   assert train(compose([*RUN, f"run_dir={whole}"])) == 0
   with monkeypatch.context() as patch:
-    patch.setattr(Job, "should_stop", lambda job: job._step >= 160)
+    patch.setattr(RunCallbacks, "should_stop", lambda job: job._step >= 160)
     train(compose([*RUN, f"run_dir={run}"]))
   assert RunDirectory(run).status["status"] == "preempted"
   assert train(compose([f"resume={run}"])) == 0

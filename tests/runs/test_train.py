@@ -28,8 +28,8 @@ from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoin
 from playground.learning.loop import schedule
 from playground.runs import train as train_module
 from playground.runs.files import is_locked
+from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
-from playground.runs.start import Start
 from playground.runs.train import cut_short, train
 from tests.runs.helpers import TASK, resume
 
@@ -452,7 +452,7 @@ def test_weights_that_a_link_has_lost(copy: Path, refused: Callable[..., str]) -
 
 def test_resumed_before_its_first_checkpoint_it_starts_from_the_weights_again(whole: Path, tmp_path: Path) -> None:
   run = RunDirectory.create(tmp_path / "run", compose([*TASK, f"init_from={whole}"]).resolved)
-  found = Start.find(compose([f"resume={run.path}"]))
+  found = RestorePlan.find(compose([f"resume={run.path}"]))
   assert found.weights is not None
   assert found.weights.path == find_checkpoints(whole)[0]
 

@@ -16,15 +16,15 @@ from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import Checkpoint
 from playground.learning.hyperparameters import read_config
 from playground.learning.trainer import Trainer
+from playground.runs.restore_plan import weights_of
 from playground.runs.run_dir import RunDirectory
-from playground.runs.start import weights_of
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
 
 
 @dataclasses.dataclass(frozen=True)
-class Trained:
+class LoadedPolicy:
   """A checkpoint's policy.
 
   Attributes:
@@ -53,7 +53,7 @@ class Trained:
     """Actions in [-1, 1], [..., action_size]."""
     return self.trainer.act(self.policy, obs, key, deterministic)
 
-  def at(self, path: Path) -> "Trained":
+  def at(self, path: Path) -> "LoadedPolicy":
     """The policy of another checkpoint of the run, or of a stage of its chain, with this one's task and configuration.
 
     Raises:
@@ -64,13 +64,13 @@ class Trained:
     return dataclasses.replace(self, run_dir=RunDirectory(path.parents[1]), checkpoint=checkpoint, policy=policy)
 
 
-def load_trained(
+def load_policy(
   path: str | Path,
   *,
   load_task: Callable[[str, ConfigDict], Env] | None = None,
   platform: str | None = None,
   precision: str | None = None,
-) -> Trained:
+) -> LoadedPolicy:
   """Reads a run's newest checkpoint, or the checkpoint given.
 
   Args:
@@ -91,4 +91,4 @@ def load_trained(
   env = (load_task or registry.load)(config.choices["env"], config.env)
   trainer = Trainer(env, read_config(config.agent), hardware.mesh, precision or hardware.network_precision)
   policy = trainer.place_policy(checkpoint.restore("policy", trainer.policy_shape()))
-  return Trained(run_dir, config, checkpoint, env, hardware, trainer, policy)
+  return LoadedPolicy(run_dir, config, checkpoint, env, hardware, trainer, policy)

@@ -1,4 +1,4 @@
-"""What a run does with what its loop reports: logs, pictures, checkpoints, and the result at the end."""
+"""Writes metrics, checkpoints and videos of one run, and its result at the end."""
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,8 +24,8 @@ from playground.runs.nonfinite import write_dump
 from playground.runs.plots import plot_learning_curve
 from playground.runs.progress import Progress
 from playground.runs.provenance import process_age_s
+from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
-from playground.runs.start import Start
 from playground.runs.top_ops import format_ops, write_top_ops
 from playground.runs.trackers import make_trackers
 
@@ -37,7 +37,7 @@ class NonfiniteError(PlaygroundError):
   """Too many environment steps went NaN, infinite or absurd for the run to go on."""
 
 
-class Job:
+class RunCallbacks:
   """The loop's callbacks for one run directory (`learning.loop.Callbacks`)."""
 
   def __init__(
@@ -48,7 +48,7 @@ class Job:
     trainer: Trainer,
     progress: Progress,
     interrupts: Interrupts,
-    start: Start,
+    plan: RestorePlan,
     drawn: mujoco.MjModel,
   ):
     self._config = config
@@ -59,16 +59,16 @@ class Job:
     self._progress = progress
     self._interrupts = interrupts
     # A run that is resumed from the beginning logs all its rows again: step 0 is after "step -1".
-    continued = -1 if start.run_dir and start.step is None else start.step
-    self._trackers = make_trackers(config.resolved, run_dir, continued, progress.print, start.columns)
+    continued = -1 if plan.run_dir and plan.step is None else plan.step
+    self._trackers = make_trackers(config.resolved, run_dir, continued, progress.print, plan.columns)
     self._store = CheckpointStore(run_dir.checkpoints, config.checkpoint.keep, continued)
     self._videos = ThreadPoolExecutor(1, thread_name_prefix="video")
     self._video: Future[Path | None] | None = None
-    self._earlier_s = start.wall_clock_s
+    self._earlier_s = plan.wall_clock_s
     self._began = time.perf_counter()
-    self._process_began_s = start.began_s
+    self._process_began_s = plan.began_s
     self._evaluations = 0
-    self._step = start.step or 0
+    self._step = plan.step or 0
     self._return: float | None = None  # of the newest row
     self._recording: Any = None
     self._rates: list[float] = []  # steps per second, by row
@@ -242,6 +242,28 @@ class Job:
       where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
       self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or absurd.{where}")
     check_fraction(bad * self._env.action_repeat / max(taken, 1), self._config.on_nonfinite.max_fraction, step, where)
+
+
+class NonMainCallbacks:
+  """Callbacks of a process that writes nothing (`learning.loop.Callbacks`): it stops when process 0 does."""
+
+  def __init__(self, config: "RunConfig", env: Env, interrupts: Interrupts, step: int | None):
+    self._allowed = config.on_nonfinite.max_fraction
+    self._action_repeat = env.action_repeat
+    self._interrupts = interrupts
+    self._step = step or 0
+
+  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
+    taken, self._step = step - self._step, step
+    bad = metrics.get("training/nonfinite", 0.0)
+    check_fraction(bad * self._action_repeat / max(taken, 1), self._allowed, step)
+    check_updates(metrics, self._allowed, step)
+
+  def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
+    """Process 0 saves."""
+
+  def should_stop(self) -> bool:
+    return self._interrupts.signum is not None
 
 
 def check_fraction(fraction: float, allowed: float, step: int, where: str = "") -> None:

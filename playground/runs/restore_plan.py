@@ -35,7 +35,7 @@ def weights_of(path: str | Path) -> Checkpoint:
 
 
 @dataclasses.dataclass
-class Start:
+class RestorePlan:
   """What was found on disk before anything expensive began, and then what was restored from it.
 
   Attributes:
@@ -72,16 +72,16 @@ class Start:
     """
     if config.resume is not None:
       run_dir = RunDirectory.open(config.resume)
-      start = cls(run_dir=run_dir, began_s=began_s)
+      plan = cls(run_dir=run_dir, began_s=began_s)
       try:
-        start.checkpoints = find_checkpoints(config.resume)
+        plan.checkpoints = find_checkpoints(config.resume)
       except NoCheckpointError:
         if run_dir.status:  # else a chain made it, and has only now come to it
-          start.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
+          plan.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
         # A resumed run's `config` says this only for a chain, which may have been moved.
         weights = config.init_from or run_dir.config["init_from"]
-        start.weights = weights_of(weights) if weights else None
-      return start
+        plan.weights = weights_of(weights) if weights else None
+      return plan
     assert config.run_dir is not None, "composing names one"
     if config.resolved["run_dir"] is not None:  # else the name is a proposal, which `create` numbers if it is taken
       RunDirectory(config.run_dir).must_be_new()
