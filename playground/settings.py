@@ -15,9 +15,11 @@ import dataclasses
 import functools
 import types
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from playground.limits import Limit
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +56,16 @@ def defaults(cls: type) -> dict[str, Any]:
   hints = get_type_hints(cls, include_extras=True)
   values = {field.name: _default(field, hints[field.name]) for field in dataclasses.fields(cls)}
   return {name: value for name, value in values.items() if value is not dataclasses.MISSING}
+
+
+def build(cls: type[T], values: Mapping[str, Any]) -> T:
+  """Builds a settings class from nested mappings: missing fields get their defaults, unknown keys are ignored."""
+  hints, known = get_type_hints(cls, include_extras=True), {}
+  for field in dataclasses.fields(cls):  # pyright: ignore[reportArgumentType]
+    if field.name in values:
+      value, inner = values[field.name], nested(hints[field.name])
+      known[field.name] = build(inner, value) if inner and isinstance(value, Mapping) else value
+  return cls(**known)
 
 
 def nested(hint: Any) -> type | None:

@@ -20,6 +20,7 @@ from playground.config import compose, from_saved
 from playground.config.files import experiment_name
 from playground.errors import ConfigError, UnknownNameError
 from playground.learning.hyperparameters import config_class
+from playground.runs.options import ProfileConfig, TrackingConfig, VideoConfig, WandbConfig
 
 TUNED = ["experiment=cartpole_balance"]
 
@@ -235,8 +236,16 @@ def test_foreign_configuration_is_refused(tmp_path: Path):
 def test_null_keys_can_be_assigned():
   run = compose()
   run.agent.max_grad_norm = 1.0
-  run.video.camera = "side"
-  assert (run.agent.max_grad_norm, run.video.camera) == (1.0, "side")
+  run.env.vision.camera = "side"
+  assert (run.agent.max_grad_norm, run.env.vision.camera) == (1.0, "side")
+
+
+def test_sections_are_typed():
+  run = compose(["env=CartpoleBalance", "video.width=320", "tracking.wandb.tags=[a]"])
+  assert run.video == VideoConfig(width=320)
+  assert run.tracking == TrackingConfig(tensorboard=True, wandb=WandbConfig(tags=["a"]))
+  saved = {**run.resolved, "profile": {"enable": True, "steps": 3}, "video": {"width": 8}}
+  assert (config.from_dict(saved).profile, config.from_dict(saved).video.height) == (ProfileConfig(enable=True), 480)
 
 
 def test_run_dir(run: Path):

@@ -12,6 +12,8 @@ from yaml import YAMLError
 
 from playground.config.text import first_line, format_value
 from playground.errors import ConfigError
+from playground.runs.options import CheckpointConfig, NonfiniteConfig, ProfileConfig, TrackingConfig, VideoConfig
+from playground.settings import build
 
 if TYPE_CHECKING:
   from rich.tree import Tree
@@ -20,9 +22,16 @@ SECTIONS = (
   *("env", "agent", "curriculum", "hardware", "tracking"),
   *("video", "checkpoint", "on_nonfinite", "profile"),
 )
+TYPED: dict[str, type] = {
+  "tracking": TrackingConfig,
+  "video": VideoConfig,
+  "checkpoint": CheckpointConfig,
+  "on_nonfinite": NonfiniteConfig,
+  "profile": ProfileConfig,
+}
 SCALARS = ("seed", "run_dir", "resume", "init_from")
 
-Section = Any  # a ConfigDict; pyright cannot know its attributes
+Section = Any  # a ConfigDict, of a section whose keys depend on the task, the algorithm or the launcher
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,11 +53,11 @@ class RunConfig:
   agent: Section
   curriculum: Section
   hardware: Section
-  tracking: Section
-  video: Section
-  checkpoint: Section
-  on_nonfinite: Section
-  profile: Section
+  tracking: TrackingConfig
+  video: VideoConfig
+  checkpoint: CheckpointConfig
+  on_nonfinite: NonfiniteConfig
+  profile: ProfileConfig
   seed: int
   run_dir: str | None
   resume: str | None
@@ -96,7 +105,8 @@ def from_dict(resolved: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
     raise ConfigError(f"This is not the configuration of a run: its {wrong[0]} has the wrong type.")
   return RunConfig(
     name=resolved["name"],
-    **{key: config_dict(resolved[key]) for key in SECTIONS},
+    **{key: config_dict(resolved[key]) for key in SECTIONS if key not in TYPED},
+    **{key: build(cls, resolved[key]) for key, cls in TYPED.items()},  # pyright: ignore[reportArgumentType]
     **{key: resolved[key] for key in SCALARS},
     choices=dict(resolved["choices"]),
     overrides=tuple(overrides),

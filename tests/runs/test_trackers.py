@@ -1,4 +1,5 @@
 import copy
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -7,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import wandb
-from hydra import compose, initialize_config_dir
 
+from playground import config
 from playground.runs import wandb_tracker
 from playground.runs.csv_tracker import CsvTracker
 from playground.runs.run_dir import RunDirectory
@@ -242,12 +243,9 @@ def test_wandb_is_online_only_with_a_key(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_every_tracking_config_has_the_same_keys():
-  folder = Path(__file__).parents[2] / "configs" / "tracking"
   chosen = {}
-  with initialize_config_dir(str(folder.parent), version_base=None):
-    for path in folder.glob("*.yaml"):
-      tracking = compose(overrides=[f"+tracking={path.stem}"])["tracking"]
-      assert path.read_text().startswith("# @package tracking\n")
-      assert set(tracking) == {"tensorboard", "wandb"} and set(tracking["wandb"]) == set(WANDB)
-      chosen[path.stem] = (tracking["tensorboard"], tracking["wandb"]["enable"])
+  for option in config.options("tracking"):
+    tracking = config.compose(["env=CartpoleBalance", f"tracking={option}"]).tracking
+    assert {field.name for field in dataclasses.fields(tracking.wandb)} == set(WANDB)
+    chosen[option] = (tracking.tensorboard, tracking.wandb.enable)
   assert chosen == {"csv": (False, False), "tensorboard": (True, False), "wandb": (False, True), "all": (True, True)}
