@@ -11,7 +11,14 @@ from playground.envs.base import Env, State
 from playground.envs.physics import STATE_FIELDS, PhysicsData, mjx
 from playground.envs.wrappers import MAX_VELOCITY
 from playground.hardware.mesh import make_mesh
-from playground.learning.hyperparameters import PPOConfig, SACConfig
+from playground.learning.hyperparameters import (
+  FastTD3Config,
+  FastTD3NetworkConfig,
+  PPOConfig,
+  REPPOConfig,
+  REPPONetworkConfig,
+  SACConfig,
+)
 from playground.learning.loop import Metrics
 from playground.learning.networks import NetworkConfig, SoftNetworkConfig
 from playground.learning.rollout import Step
@@ -104,8 +111,19 @@ SMALL_SAC = SACConfig(
   min_replay_size=64, max_replay_size=500, learning_rate=3e-3, discounting=0.95, normalize_observations=True,
   network=SoftNetworkConfig((16, 16), q_network_layer_norm=True, value_obs_key="privileged_state"),
 )  # fmt: skip
+SMALL_REPPO = REPPOConfig(
+  num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, unroll_length=10, num_minibatches=4,
+  num_updates_per_batch=2, learning_rate=3e-3, discounting=0.95, min_value=-30.0, max_value=10.0, num_bins=51,
+  init_at_random_ep_len=False, network=REPPONetworkConfig((16, 16), 16, value_obs_key="privileged_state"),
+)  # fmt: skip
+SMALL_FAST_TD3 = FastTD3Config(
+  num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, batch_size=32, grad_updates_per_step=2,
+  min_replay_size=64, max_replay_size=500, learning_rate=3e-3, discounting=0.95, min_value=-30.0, max_value=10.0,
+  network=FastTD3NetworkConfig((16, 16), (16, 16), value_obs_key="privileged_state"),
+)  # fmt: skip
+SMALL = {"ppo": SMALL_PPO, "sac": SMALL_SAC, "reppo": SMALL_REPPO, "fast_td3": SMALL_FAST_TD3}
 
-Config = PPOConfig | SACConfig
+Config = PPOConfig | SACConfig | REPPOConfig | FastTD3Config
 
 
 def point_trainer(config: Config, num_devices: int = 1, **events: Any) -> Trainer:

@@ -36,7 +36,8 @@ def scale_envs(config: "RunConfig", devices: int) -> "tuple[RunConfig, str]":
 
 def describe_division(agent: Any, devices: int) -> str:
   """How environments and batch divide, in a sentence."""
-  shares = [f"{agent[key] // devices} of agent.{key}={agent[key]}" for key in (*SCALED, "num_eval_envs")]
+  sizes = [key for key in (*SCALED, "num_eval_envs") if key in agent]
+  shares = [f"{agent[key] // devices} of agent.{key}={agent[key]}" for key in sizes]
   return f"On each of {devices} devices: {', '.join(shares)}."
 
 

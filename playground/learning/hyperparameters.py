@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self, get_type_hints
 
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.limits import SHARE, SIZES, at_least_0, count, positive
+from playground.limits import SHARE, SIZES, Limit, at_least_0, count, positive
 
 ENTRY_POINTS = "playground.agents"
 _MOST = 2**31 - 1  # transitions on a device: they are drawn by int32
@@ -221,12 +221,148 @@ class SACConfig(AgentConfig):
 
   def check(self, num_devices: int) -> None:
     super().check(num_devices)
-    for name in ("num_envs", "min_replay_size"):
-      if getattr(self, name) > self.max_replay_size:
-        size = getattr(self, name)
-        raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must not be below agent.{name}={size}.")
-    if self.max_replay_size // num_devices > _MOST:
-      raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must be at most {_MOST} for each device.")
+    _check_replay(self.max_replay_size, self.num_envs, self.min_replay_size, num_devices)
+
+
+@dataclasses.dataclass(frozen=True)
+class REPPONetworkConfig:
+  """Sizes and inputs of REPPO's actor and critic."""
+
+  hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"] = (512, 512)
+  q_hidden_layer_size: Annotated[int, count(1, 65536), "units of each of the critic's hidden layers"] = 512
+  activation: Annotated[str, "of the actor's hidden layers"] = "swish"
+  min_std: Annotated[float, positive(), "smallest standard deviation of actions before squashing"] = 0.1
+  policy_obs_key: Annotated[str, "observation group that the actor reads"] = "state"
+  value_obs_key: Annotated[str, "observation group that the critic reads; privileged_state for an asymmetric pair"] = (
+    "state"
+  )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class REPPOConfig(AgentConfig):
+  """Hyperparameters of REPPO; the defaults are the published ones for DM Control."""
+
+  algorithm = "playground.learning.reppo:REPPO"
+
+  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
+  deterministic_eval: Annotated[bool, "whether evaluations act by the mode of the policy; else they sample"] = True
+  unroll_length: Annotated[int, count(1, 100_000), "policy steps of all environments in one training step"] = 128
+  num_minibatches: Annotated[int, count(1, 100_000), "minibatches of an epoch"] = 64
+  num_updates_per_batch: Annotated[int, count(1, 100_000), "epochs over the collected steps"] = 8
+  learning_rate: Annotated[float, positive(1), "of Adam, for actor and critic"] = 3e-4
+  max_grad_norm: Annotated[float, positive(), "gradients of actor and critic are each scaled down to this norm"] = 0.5
+  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
+  gae_lambda: Annotated[float, SHARE, "of the critic's λ-returns"] = 0.95
+  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
+  min_value: Annotated[float, Limit(), "lowest bin of the critic; the bins must hold the discounted return"] = 0.0
+  max_value: Annotated[float, Limit(), "highest bin of the critic"] = 150.0
+  num_bins: Annotated[int, count(2, 10_000), "bins of the critic's distribution"] = 151
+  auxiliary_coefficient: Annotated[
+    float, at_least_0(), "factor on the critic's loss in predicting the next reward and embedding"
+  ] = 1.0
+  kl_bound: Annotated[float, positive(), "largest KL divergence of a state's policy from the one that collected"] = 0.1
+  target_entropy: Annotated[float, Limit(), "of the policy, nats an action"] = -0.5
+  initial_temperature: Annotated[float, positive(), "factor on the entropy bonus at first"] = 0.01
+  initial_kl_multiplier: Annotated[float, positive(), "factor on the KL divergence at first"] = 0.01
+  init_at_random_ep_len: Annotated[
+    bool, "whether a reset gives environments random ages, so that a batch holds all parts of episodes"
+  ] = True
+  network: Annotated[REPPONetworkConfig, "actor and critic"] = dataclasses.field(default_factory=REPPONetworkConfig)
+
+  @property
+  def steps_per_update(self) -> int:
+    return self.num_envs * self.unroll_length
+
+  @property
+  def random_episode_ages(self) -> bool:
+    return self.init_at_random_ep_len
+
+  def check(self, num_devices: int) -> None:
+    super().check(num_devices)
+    if (self.num_envs // num_devices * self.unroll_length) % self.num_minibatches:
+      raise ConfigError(
+        f"agent.num_envs * agent.unroll_length = {self.steps_per_update} must be a multiple of "
+        f"agent.num_minibatches={self.num_minibatches} on each of {num_devices} devices."
+      )
+    _check_values(self.min_value, self.max_value)
+
+
+@dataclasses.dataclass(frozen=True)
+class FastTD3NetworkConfig:
+  """Sizes and inputs of FastTD3's actor and twin critics."""
+
+  policy_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"] = (512, 256, 128)
+  q_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of each critic's hidden layers"] = (1024, 512, 256)
+  activation: Annotated[str, "of the hidden layers"] = "relu"
+  policy_output_scale: Annotated[float, positive(), "standard deviation of the actor's last weights at first"] = 0.01
+  policy_obs_key: Annotated[str, "observation group that the actor reads"] = "state"
+  value_obs_key: Annotated[str, "observation group that the critics read; privileged_state for an asymmetric pair"] = (
+    "state"
+  )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FastTD3Config(AgentConfig):
+  """Hyperparameters of FastTD3; the defaults are those of public runs on DM Control."""
+
+  algorithm = "playground.learning.fast_td3:FastTD3"
+
+  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
+  deterministic_eval: Annotated[bool, "has no effect: the policy is deterministic"] = True
+  batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 32_768
+  grad_updates_per_step: Annotated[int, count(1, 100_000), "critic updates for each step of all environments"] = 2
+  policy_frequency: Annotated[int, count(1, 100_000), "the actor is updated with every n-th critic update"] = 2
+  min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 10_240
+  max_replay_size: Annotated[
+    int, count(1, 2**40), "transitions kept over all devices, the newest; a run prints their memory"
+  ] = 1_048_576
+  learning_rate: Annotated[float, positive(1), "of AdamW, for actor and critics"] = 3e-4
+  weight_decay: Annotated[float, at_least_0(), "of AdamW"] = 0.1
+  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
+  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each critic update"] = 0.1
+  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
+  min_value: Annotated[float, Limit(), "lowest atom of the critics; the atoms must hold the discounted return"] = -150.0
+  max_value: Annotated[float, Limit(), "highest atom of the critics"] = 150.0
+  num_atoms: Annotated[int, count(2, 10_000), "atoms of the critics' distributions"] = 101
+  min_noise: Annotated[
+    float, at_least_0(), "standard deviation of the exploration noise in the quietest environment"
+  ] = 0.001
+  max_noise: Annotated[float, at_least_0(), "and in the noisiest"] = 0.4
+  policy_noise: Annotated[float, at_least_0(), "standard deviation of the noise on next actions in targets"] = 0.001
+  noise_clip: Annotated[float, at_least_0(), "largest noise on next actions in targets"] = 0.5
+  use_smaller_q: Annotated[
+    bool, "whether targets are of the critic with the smaller value (clipped double Q-learning); else each its own"
+  ] = True
+  checkpoint_replay: Annotated[
+    bool, "whether the newest checkpoint holds the buffer, for an exact resume; else it is refilled"
+  ] = True
+  network: Annotated[FastTD3NetworkConfig, "actor and critics"] = dataclasses.field(
+    default_factory=FastTD3NetworkConfig
+  )
+
+  @property
+  def prefill_updates(self) -> int:
+    return math.ceil(self.min_replay_size / self.num_envs)
+
+  def check(self, num_devices: int) -> None:
+    super().check(num_devices)
+    _check_replay(self.max_replay_size, self.num_envs, self.min_replay_size, num_devices)
+    _check_values(self.min_value, self.max_value)
+    if self.max_noise < self.min_noise:
+      raise ConfigError(f"agent.max_noise={self.max_noise} must not be below agent.min_noise={self.min_noise}.")
+
+
+def _check_values(low: float, high: float) -> None:
+  if not low <= 0 <= high or low == high:
+    raise ConfigError(f"agent.min_value={low} and agent.max_value={high} must hold 0 between them.")
+
+
+def _check_replay(size: int, num_envs: int, min_replay_size: int, num_devices: int) -> None:
+  for name, least in (("num_envs", num_envs), ("min_replay_size", min_replay_size)):
+    if least > size:
+      raise ConfigError(f"agent.max_replay_size={size} must not be below agent.{name}={least}.")
+  if size // num_devices > _MOST:
+    raise ConfigError(f"agent.max_replay_size={size} must be at most {_MOST} for each device.")
 
 
 def config_class(name: str) -> type[AgentConfig]:
@@ -264,7 +400,12 @@ def agent_names() -> list[str]:
   return [*_BUILT_IN, *(name for name in _entry_points() if name not in _BUILT_IN)]
 
 
-_BUILT_IN: dict[str, type[AgentConfig]] = {"ppo": PPOConfig, "sac": SACConfig}
+_BUILT_IN: dict[str, type[AgentConfig]] = {
+  "ppo": PPOConfig,
+  "sac": SACConfig,
+  "reppo": REPPOConfig,
+  "fast_td3": FastTD3Config,
+}
 
 
 @functools.cache

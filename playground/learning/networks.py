@@ -15,7 +15,13 @@ from flax import linen, struct
 from playground.envs.base import PIXELS, Observation
 from playground.errors import ConfigError, nearest
 from playground.learning.cnn import ESTIMATOR, PixelNetwork, check_cnn
-from playground.learning.hyperparameters import CNNConfig, NetworkConfig, SoftNetworkConfig
+from playground.learning.hyperparameters import (
+  CNNConfig,
+  FastTD3NetworkConfig,
+  NetworkConfig,
+  REPPONetworkConfig,
+  SoftNetworkConfig,
+)
 
 ACTIVATIONS = {"swish": linen.swish, "relu": linen.relu, "elu": linen.elu, "tanh": linen.tanh, "gelu": linen.gelu}
 
@@ -38,7 +44,7 @@ class Actor:
     obs_size: ObservationSize,
     action_size: int,
     hidden_layer_sizes: Sequence[int],
-    config: NetworkConfig | SoftNetworkConfig,
+    config: NetworkConfig | SoftNetworkConfig | REPPONetworkConfig | FastTD3NetworkConfig,
     precision: str | None = None,
     layer_norm: bool = False,
   ):

@@ -17,8 +17,7 @@ from playground.learning.evaluation import make_evaluator
 from playground.learning.loop import CompiledFunctions, Loop, compile_program, schedule
 from playground.learning.trainer import Trainer
 from tests.dummy import (
-  SMALL_PPO,
-  SMALL_SAC,
+  SMALL,
   Config,
   PointTask,
   Recorder,
@@ -26,7 +25,7 @@ from tests.dummy import (
   point_trainer,
 )
 
-every_algorithm = pytest.mark.parametrize("config", [SMALL_PPO, SMALL_SAC], ids=["ppo", "sac"])
+every_algorithm = pytest.mark.parametrize("config", SMALL.values(), ids=SMALL)
 
 
 @cache
@@ -50,15 +49,16 @@ def run(
 
 
 @pytest.mark.parametrize(
-  ("config", "updates", "names"),
+  ("name", "updates", "names"),
   [
-    (SMALL_PPO, 150, ("training/total_loss", "training/approx_kl", "training/grad_norm")),
-    (SMALL_SAC, 1500, ("training/critic_loss", "training/entropy", "training/grad_norm")),
+    ("ppo", 150, ("training/total_loss", "training/approx_kl", "training/grad_norm")),
+    ("sac", 1500, ("training/critic_loss", "training/entropy", "training/grad_norm")),
+    ("reppo", 150, ("training/critic_loss", "training/kl", "training/grad_norm")),
+    ("fast_td3", 1500, ("training/critic_loss", "training/q_mean", "training/grad_norm")),
   ],
-  ids=["ppo", "sac"],
 )
-def test_it_learns_and_reports(config: Config, updates: int, names: tuple[str, ...]) -> None:
-  callbacks = Recorder()
+def test_it_learns_and_reports(name: str, updates: int, names: tuple[str, ...]) -> None:
+  callbacks, config = Recorder(), SMALL[name]
   _, completed = run(config, callbacks, updates=updates)
   assert completed
   scores = [row["eval/episode_reward"] for _, row in callbacks.rows if "eval/episode_reward" in row]

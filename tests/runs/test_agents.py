@@ -33,7 +33,7 @@ def point() -> Iterator[None]:
     yield
 
 
-@pytest.fixture(scope="module", params=["ppo", "sac"])
+@pytest.fixture(scope="module", params=["ppo", "sac", "reppo", "fast_td3"])
 def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
   """A run that nothing happens to."""
   run = tmp_path_factory.mktemp(request.param) / "run"
@@ -59,13 +59,14 @@ def test_a_resumed_run_ends_as_if_it_had_never_stopped(
 ) -> None:
   run = tmp_path / "run"
   newest, *older = interrupted(run, f"agent={agent(whole)}")
-  assert Checkpoint(newest).has("replay") == (agent(whole) == "sac")
+  has_replay = agent(whole) in ("sac", "fast_td3")
+  assert Checkpoint(newest).has("replay") == has_replay
   assert not any(Checkpoint(path).has("replay") for path in older)
   capsys.readouterr()
   assert train(compose([f"resume={run}"])) == 0
   said = " ".join(capsys.readouterr().out.split())
   assert f"Resuming the whole training state of {newest}" in said
-  assert ("Replay buffer: 256 transitions of 9 numbers" in said) == (agent(whole) == "sac")
+  assert ("Replay buffer: 256 transitions of 9 numbers" in said) == has_replay
   ours, theirs = RunDirectory(run), RunDirectory(whole)
   for key in ("params_sha256", "final_return", "best_return", "best_step", "steps", "status"):
     assert ours.summary[key] == theirs.summary[key], key
