@@ -130,7 +130,7 @@ def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Se
       given[key] = _resolve(given[key])
       _check_path(key, given[key])
   if given.get("resume") is not None:
-    return _compose_resumed(Path(given["resume"]), parsed, roots)
+    return _compose_resumed(Path(os.path.expanduser(given["resume"])), parsed, roots)
   config = _compose_new(parsed, files, roots)
   stages = stage_overrides(config.resolved["curriculum"], parsed, roots)
   composed = tuple(_compose_stage(config, name, theirs, files, roots) for name, theirs in stages)
@@ -401,7 +401,7 @@ def _check_path(key: str, value: Any) -> None:
   """What `resume` and `init_from` name must be there."""
   if key == "init_from":
     value = locate(str(value))
-  path = Path(str(value))
+  path = Path(os.path.expanduser(str(value)))
   wanted, what = (path / "config.yaml", "run directory") if key == "resume" else (path, "run directory or checkpoint")
   if not os.path.lexists(wanted):  # a link that points to nothing is for `find_checkpoints` to name
     siblings = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []

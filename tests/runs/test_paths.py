@@ -93,6 +93,16 @@ def test_a_name_needs_no_quotes(
     assert compose(config.overrides).run_dir == shape, "as Hydra's app gets it"
 
 
+@pytest.mark.parametrize("key", ["resume", "init_from"])
+def test_a_path_may_begin_at_home(
+  key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resolved: dict[str, Any]
+) -> None:
+  monkeypatch.setenv("HOME", str(tmp_path))
+  RunDirectory.create(tmp_path / "run", resolved)
+  config = compose(["resume=~/run"] if key == "resume" else [*TASK, "init_from=~/run"])
+  assert Path(str(getattr(config, key))).expanduser() == tmp_path / "run"
+
+
 def test_a_sweep_dir_of_any_name() -> None:
   for shape in SHAPES:
     assert compose_settings([f"sweep_dir={quoted(shape)}"]).sweep_dir == shape
