@@ -32,7 +32,7 @@ def test_cold_and_warm_share_a_new_cache_and_nothing_else(monkeypatch: pytest.Mo
   monkeypatch.setattr(runs.signal, "signal", lambda *_: None)
   monkeypatch.setattr(runs.subprocess, "Popen", run)
   monkeypatch.setattr(Facts, "emit", lambda *_, setting: settings.append(setting))
-  runs.restore_planup(Facts(), "CartpoleBalance", "ppo", ["agent.num_envs=64"], seconds=1.0)
+  runs.startup(Facts(), "CartpoleBalance", "ppo", ["agent.num_envs=64"], seconds=1.0)
   cold, warm = given
   assert settings == ["agent.num_envs=64 cold"] * 3 + ["agent.num_envs=64 warm"] * 3
   assert cold["caches of the user"] == "" and cold["hardware.cache_dir"] == warm["hardware.cache_dir"]
