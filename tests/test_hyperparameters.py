@@ -31,7 +31,7 @@ OURS: dict[str, dict[str, Any]] = {
   "ppo_paper": {"num_resets_per_eval": 10},  # the default of the script that the paper was run with
 }
 # Sets that are no task's own.
-FOR_ANY_TASK = ("sparse_reward", "estimated_state")
+FOR_ANY_TASK = ("robust", "sparse_reward", "estimated_state")
 # What a source lists and nobody can have used: Brax's SAC has no such argument and refuses it.
 UNUSABLE = {"sac": ("num_resets_per_eval",), "sac_v020": ("num_resets_per_eval",)}
 

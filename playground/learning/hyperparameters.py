@@ -11,7 +11,7 @@ import functools
 import importlib.metadata
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Self, get_type_hints
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.limits import SHARE, SIZES, Limit, at_least_0, count, positive
@@ -157,6 +157,26 @@ class PPOConfig(AgentConfig):
   estimation_coefficient: Annotated[
     float, at_least_0(), "factor on the error (Huber) in estimating network.estimated_obs_key"
   ] = 1.0
+  targets: Annotated[
+    Literal["minibatch", "epoch"], "when targets and advantages are computed anew; normalised over what they are of"
+  ] = "minibatch"
+  clip_advantages: Annotated[float | None, positive(), "largest normalised advantage; null: they are not clipped"] = (
+    None
+  )
+  normalize_value_targets: Annotated[
+    bool, "whether errors of the critic are divided by the running standard deviation of its targets"
+  ] = False
+  value_huber_delta: Annotated[
+    float | None, positive(), "error of the critic from which on its loss is linear; null: it is squared"
+  ] = None
+  desired_kl: Annotated[
+    float | None, positive(), "KL divergence that the learning rate is adapted to; null: it is constant"
+  ] = None
+  min_learning_rate: Annotated[float, positive(1), "of the adapted learning rate"] = 1e-5
+  max_learning_rate: Annotated[float, positive(1), "of the adapted learning rate"] = 1e-2
+  max_kl: Annotated[float | None, positive(), "KL divergence of an epoch after which no other follows; null: any"] = (
+    None
+  )
   reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
   normalize_advantage: Annotated[bool, "whether advantages are normalised in each minibatch"] = True
   bootstrap_on_timeout: Annotated[

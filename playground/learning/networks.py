@@ -150,6 +150,12 @@ class Actor:
     logits = self.logits(policy, normalize(self.select(obs), normalizer))
     return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
 
+  def kl(self, old: jax.Array, new: jax.Array) -> jax.Array:
+    """KL(old || new), [...], of the Gaussians before squashing, which is that of the actions."""
+    before, after = self.distribution.create_dist(old), self.distribution.create_dist(new)
+    ratio, distance = before.scale / after.scale, (before.loc - after.loc) / after.scale
+    return (0.5 * (jnp.square(ratio) + jnp.square(distance) - 1) - jnp.log(ratio)).sum(axis=-1)
+
   def mlp(self, policy: Any, normalizer: Any) -> tuple[Mapping[str, Any], tuple[Any, Any] | None]:
     """The layers that act as Flax has them, with mean and deviation of the vector (None without one, or as it is)."""
     key = self.policy_obs_key

@@ -25,7 +25,10 @@ from playground.learning.rollout import Environments, side_by_side, unroll
 
 LOSSES = ("total_loss", "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")  # what is logged
 ESTIMATION = "estimation_loss"  # with them where something is estimated
+KL = "kl"  # and where the configuration bounds it
 _UNROLL = 64  # steps of a trajectory that are one kernel
+_LEAST_SCALE = 1e-2  # of the critic's targets
+_NO_KL = 1e-6  # a divergence below it is rounding
 
 
 class Batch(struct.PyTreeNode):
@@ -40,6 +43,9 @@ class Batch(struct.PyTreeNode):
     termination: 1 where the task ended the episode, [T, B].
     truncation: 1 where the time limit cut it, [T, B].
     value: the critic's value when the action was taken, [T, B]; only where the value loss is clipped, else None.
+    targets: of the critic, [T, B], and
+    advantages: [T, B]; only where they are computed once an epoch, else None.
+    old_logits: of the policy before the update, [T, B, 2 * action_size]; only where the KL divergence is bounded.
   """
 
   obs: dict[str, jax.Array]
@@ -50,9 +56,18 @@ class Batch(struct.PyTreeNode):
   termination: jax.Array
   truncation: jax.Array
   value: jax.Array | None = None
+  targets: jax.Array | None = None
+  advantages: jax.Array | None = None
+  old_logits: jax.Array | None = None
 
 
-class PPO(Algorithm[PPOConfig, ActorCritic, AlgorithmState]):
+class PPOState(AlgorithmState):
+  """Also count, mean and sum of squared deviations of the critic's targets so far, [3], where they are normalised."""
+
+  targets_seen: jax.Array | None = None
+
+
+class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
   """PPO for one task."""
 
   def __init__(self, env: Env, config: PPOConfig, network_precision: str | None = None):
@@ -63,17 +78,20 @@ class PPO(Algorithm[PPOConfig, ActorCritic, AlgorithmState]):
       )
     super().__init__(config, networks)
     clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm else optax.identity()
-    self.optimizer = optax.chain(clip, optax.adam(config.learning_rate))
-    self.losses = (*LOSSES, ESTIMATION) if networks.estimated_obs_key else LOSSES
+    # With a desired KL divergence the learning rate is part of the optimiser's state.
+    adam = optax.adam if config.desired_kl is None else optax.inject_hyperparams(optax.adam)
+    self.optimizer = optax.chain(clip, adam(learning_rate=config.learning_rate))
+    self.bounds_kl = config.desired_kl is not None or config.max_kl is not None
+    self.losses = LOSSES + (ESTIMATION,) * bool(networks.estimated_obs_key) + (KL,) * self.bounds_kl
 
-  def init(self, key: jax.Array, policy: Policy | None) -> AlgorithmState:
+  def init(self, key: jax.Array, policy: Policy | None) -> PPOState:
     params = self.networks.init(key) if policy is None else policy.params
     normalizer = self.networks.init_normalizer() if policy is None else policy.normalizer
-    return AlgorithmState(params=params, opt_state=self.optimizer.init(ravel_pytree(params)[0]), normalizer=normalizer)
+    opt_state = self.optimizer.init(ravel_pytree(params)[0])
+    seen = jnp.zeros(3) if self.config.normalize_value_targets else None
+    return PPOState(params=params, opt_state=opt_state, normalizer=normalizer, targets_seen=seen)
 
-  def train_step(
-    self, state: AlgorithmState, envs: Environments, key: jax.Array
-  ) -> tuple[AlgorithmState, Environments, Metrics]:
+  def train_step(self, state: PPOState, envs: Environments, key: jax.Array) -> tuple[PPOState, Environments, Metrics]:
     config, networks = self.config, self.networks
     rollout_key, update_key = jax.random.split(key)
 
@@ -100,24 +118,42 @@ class PPO(Algorithm[PPOConfig, ActorCritic, AlgorithmState]):
       batch = batch.replace(value=networks.value(state.params.value, normalize(data.obs, state.normalizer)))
     if data.final_value is not None:
       batch = pay_time_outs(batch, data.final_value, config)
+    if self.bounds_kl:
+      batch = batch.replace(old_logits=networks.logits(state.params.policy, batch.obs))
+    scale, seen = None, state.targets_seen
+    if seen is not None:
+      seen = count_targets(seen, self._with_targets(batch, state.params).targets)
+      scale = jnp.maximum(jnp.sqrt(seen[2] / seen[0]), _LEAST_SCALE)
 
     # Learn: several epochs, each over its own shuffle of the trajectories.
     flat, unravel = ravel_pytree(state.params)
 
-    def update(carry: tuple[jax.Array, Any], x: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
-      minibatch, key = self._minibatch(batch, *x)
-      grads, parts = jax.grad(ppo_loss, has_aux=True)(unravel(carry[0]), minibatch, key, networks, config)
-      params, opt_state, norm, finite = gradient_step(self.optimizer, grads, *carry)
-      log = jnp.stack([*(parts[name] for name in self.losses), norm])
-      return (params, opt_state), jnp.append(jnp.where(finite, log, 0.0), 1.0 - finite)
-
-    def epoch(carry: tuple[jax.Array, Any], key: jax.Array) -> tuple[Any, jax.Array]:
+    def epoch(carry: tuple[jax.Array, Any, jax.Array], key: jax.Array) -> tuple[Any, jax.Array]:
+      *start, stopped = carry
       shuffle_key, loss_key = jax.random.split(key)
       columns = jax.random.permutation(shuffle_key, batch.reward.shape[1]).reshape(config.num_minibatches, -1)
-      return jax.lax.scan(update, carry, (columns, jax.random.split(loss_key, config.num_minibatches)))
+      data = self._with_targets(batch, unravel(carry[0])) if config.targets == "epoch" else batch
+
+      def update(carry: tuple[jax.Array, Any], x: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+        flat, opt_state = carry
+        minibatch, key = self._minibatch(data, *x)
+        grads, parts = jax.grad(ppo_loss, has_aux=True)(unravel(flat), minibatch, key, networks, config, scale)
+        if config.desired_kl is not None:
+          opt_state = self._adapt(opt_state, jax.lax.pmean(parts[KL], AXIS))
+        flat, opt_state, norm, finite = gradient_step(self.optimizer, grads, flat, opt_state)
+        log = jnp.stack([*(parts[name] for name in self.losses), norm])
+        return (flat, opt_state), jnp.append(jnp.where(finite, log, 0.0), 1.0 - finite)
+
+      keys = jax.random.split(loss_key, config.num_minibatches)
+      learned, log = jax.lax.scan(update, tuple(start), (columns, keys))
+      if config.max_kl is not None:  # an epoch that went too far is the last one
+        learned = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), learned, tuple(start))
+        kl = jax.lax.pmean(log[:, self.losses.index(KL)].mean(), AXIS)
+        stopped |= kl > config.max_kl
+      return (*learned, stopped), log
 
     epochs = jax.random.split(update_key, config.num_updates_per_batch)
-    (flat, opt_state), log = jax.lax.scan(epoch, (flat, state.opt_state), epochs)
+    (flat, opt_state, stopped), log = jax.lax.scan(epoch, (flat, state.opt_state, jnp.array(False)), epochs)
     params = unravel(flat)
 
     names = (*self.losses, "grad_norm", "nonfinite_updates")
@@ -130,8 +166,29 @@ class PPO(Algorithm[PPOConfig, ActorCritic, AlgorithmState]):
     logits = networks.logits(params.policy, jax.tree.map(lambda x: x[0], obs))
     std = networks.distribution.create_dist(logits).scale.mean()  # before squashing, on the first step of the data
     metrics["policy_std"] = jax.lax.pmean(std, AXIS)
+    if config.desired_kl is not None:
+      metrics["learning_rate"] = opt_state[1].hyperparams["learning_rate"]
+    if config.max_kl is not None:
+      metrics["stopped_early"] = stopped.astype(jnp.float32)
     normalizer = state.normalizer if normalizer is None else normalizer
-    return state.replace(params=params, opt_state=opt_state, normalizer=normalizer), envs, metrics
+    learned = {"params": params, "opt_state": opt_state, "targets_seen": seen}
+    return state.replace(**learned, normalizer=normalizer), envs, metrics
+
+  def _with_targets(self, batch: Batch, params: ActorCriticParams) -> Batch:
+    """The batch with targets and advantages by the critic of `params`; the advantages normalised over all devices."""
+    values = self.networks.value(params.value, _all_obs(batch))
+    targets, advantages = gae(batch, values, self.config)
+    if self.config.normalize_advantage:
+      mean = jax.lax.pmean(advantages.mean(), AXIS)
+      std = jnp.sqrt(jax.lax.pmean(jnp.square(advantages - mean).mean(), AXIS))
+      advantages = (advantages - mean) / (std + 1e-8)
+    return batch.replace(targets=targets, advantages=advantages)
+
+  def _adapt(self, opt_state: Any, kl: jax.Array) -> Any:
+    """The optimiser's state with the learning rate that follows from a minibatch's divergence."""
+    clip, adam = opt_state
+    rate = adapted_rate(adam.hyperparams["learning_rate"], kl, self.config)
+    return clip, adam._replace(hyperparams=adam.hyperparams | {"learning_rate": rate})
 
   def _minibatch(self, batch: Batch, columns: jax.Array, key: jax.Array) -> tuple[Batch, jax.Array]:
     """The trajectories in `columns`, their images shifted if `augment_pixels` says so, and a key for the loss."""
@@ -146,7 +203,12 @@ class PPO(Algorithm[PPOConfig, ActorCritic, AlgorithmState]):
 
 
 def ppo_loss(
-  params: ActorCriticParams, batch: Batch, key: jax.Array, networks: ActorCritic, config: PPOConfig
+  params: ActorCriticParams,
+  batch: Batch,
+  key: jax.Array,
+  networks: ActorCritic,
+  config: PPOConfig,
+  value_scale: jax.Array | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   """Clipped surrogate, value and entropy loss (Schulman et al., 2017) with GAE on the present critic.
 
@@ -156,28 +218,38 @@ def ppo_loss(
     key: for the sampled entropy of the squashed Gaussian.
     networks: the networks the parameters belong to.
     config: hyperparameters.
+    value_scale: what errors of the critic are divided by, []; None is 1.
 
   Returns:
-    The loss, and `LOSSES` by name, with `ESTIMATION` where something is estimated.
+    The loss, and `LOSSES` by name, with `ESTIMATION` where something is estimated and `KL` where it is bounded.
   """
   logits, estimate = networks.logits_and_estimate(params.policy, batch.obs)
-  obs = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), batch.obs, batch.last_obs)
-  values = networks.value(params.value, obs)  # in one go: the critic is most of the cost
-  targets, advantages = gae(batch, values, config)
-  values = values[:-1]
-  if config.normalize_advantage:
-    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+  if batch.targets is None or batch.advantages is None:
+    values = networks.value(params.value, _all_obs(batch))  # in one go: the critic is most of the cost
+    targets, advantages = gae(batch, values, config)
+    values = values[:-1]
+    if config.normalize_advantage:
+      advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+  else:
+    values, targets, advantages = networks.value(params.value, batch.obs), batch.targets, batch.advantages
+  if (limit := config.clip_advantages) is not None:
+    advantages = jnp.clip(advantages, -limit, limit)
 
   log_ratio = networks.distribution.log_prob(logits, batch.raw_action) - batch.log_prob
   ratio = jnp.exp(log_ratio)
   clipped_ratio = jnp.clip(ratio, 1 - config.clipping_epsilon, 1 + config.clipping_epsilon)
   policy_loss = -jnp.minimum(ratio * advantages, clipped_ratio * advantages).mean()
 
-  value_error = jnp.square(targets - values)
+  def squared(error: jax.Array) -> jax.Array:
+    error = error if value_scale is None else error / value_scale
+    delta = config.value_huber_delta
+    return jnp.square(error) if delta is None else 2 * optax.huber_loss(error, delta=delta)
+
+  value_error = squared(targets - values)
   if (limit := config.clipping_epsilon_value) is not None:  # beyond it the loss stops paying
     assert batch.value is not None
     near = batch.value + jnp.clip(values - batch.value, -limit, limit)
-    value_error = jnp.maximum(value_error, jnp.square(targets - near))
+    value_error = jnp.maximum(value_error, squared(targets - near))
   value_loss = 0.5 * config.vf_loss_coefficient * value_error.mean()
 
   entropy = networks.distribution.entropy(logits, key).mean()
@@ -190,7 +262,42 @@ def ppo_loss(
   approx_kl = (ratio - 1 - log_ratio).mean()
   clip_fraction = (jnp.abs(ratio - 1) > config.clipping_epsilon).mean()
   parts = (loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
-  return loss, dict(zip(LOSSES, parts, strict=True)) | estimation
+  bounded = {} if batch.old_logits is None else {KL: networks.kl(batch.old_logits, logits).mean()}
+  return loss, dict(zip(LOSSES, parts, strict=True)) | estimation | bounded
+
+
+def adapted_rate(rate: jax.Array, kl: jax.Array, config: PPOConfig) -> jax.Array:
+  """The learning rate of a gradient step (Schulman et al., 2017, section 4, as RSL-RL has it).
+
+  Above twice the desired divergence it falls by a third, below half of it it grows by a half; at 0, where the policy
+  has not changed yet, it stays.
+
+  Args:
+    rate: the learning rate so far, [].
+    kl: divergence of the policy from the one before the update, [].
+    config: `desired_kl`, `min_learning_rate`, `max_learning_rate`.
+  """
+  desired = config.desired_kl
+  assert desired is not None
+  lower, higher = jnp.maximum(rate / 1.5, config.min_learning_rate), jnp.minimum(rate * 1.5, config.max_learning_rate)
+  return jnp.where(kl > 2 * desired, lower, jnp.where((kl > _NO_KL) & (kl < desired / 2), higher, rate))
+
+
+def count_targets(seen: jax.Array, targets: jax.Array | None) -> jax.Array:
+  """Count, mean and sum of squared deviations, [3], with the targets of all devices added (Chan et al., 1983)."""
+  assert targets is not None
+  devices = jax.lax.axis_size(AXIS)
+  count = jnp.float32(targets.size * devices)
+  mean = jax.lax.pmean(targets.mean(), AXIS)
+  squares = jax.lax.psum(jnp.square(targets - mean).sum(), AXIS)
+  total, difference = seen[0] + count, mean - seen[1]
+  merged = seen[2] + squares + jnp.square(difference) * seen[0] * count / total
+  return jnp.stack([total, seen[1] + difference * count / total, merged])
+
+
+def _all_obs(batch: Batch) -> dict[str, jax.Array]:
+  """Observations of all steps and after the last one, each [T + 1, B, ...]."""
+  return jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), batch.obs, batch.last_obs)
 
 
 def pay_time_outs(batch: Batch, final_value: jax.Array, config: PPOConfig) -> Batch:

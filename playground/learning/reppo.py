@@ -154,12 +154,6 @@ class REPPONetworks(Actor):
     raw = normal.loc + normal.scale * jax.random.normal(key, normal.loc.shape)
     return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
 
-  def kl(self, old: jax.Array, new: jax.Array) -> jax.Array:
-    """KL(old || new), [...], of the Gaussians before squashing, which is that of the actions."""
-    before, after = self.distribution.create_dist(old), self.distribution.create_dist(new)
-    ratio, distance = before.scale / after.scale, (before.loc - after.loc) / after.scale
-    return (0.5 * (jnp.square(ratio) + jnp.square(distance) - 1) - jnp.log(ratio)).sum(axis=-1)
-
 
 class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
   """REPPO for one task."""
