@@ -54,7 +54,7 @@ class Worker:
     self._stopping = True
 
   def run(self, where: str = "", **facts: Any) -> int:
-    """Runs the job to its end and returns its exit code; returns 0 if another worker runs it.
+    """Runs the job to its end and returns its exit code; returns 0 if another worker runs it or has finished it.
 
     Args:
       where: what it runs on, for people.
@@ -68,6 +68,9 @@ class Worker:
       attempt = self._folder.record.get("attempt", 0) + 1
       self._record = {"attempt": attempt, "host": socket.gethostname(), "where": where, "started": now()}
       self._record |= {"pid": os.getpid(), **facts}
+      if self._folder.run.status.get("status") == "finished":  # another worker had the lock while this one started
+        self._write("finished")
+        return 0
       if sweep.stop_file.exists():
         self._write("preempted", "stopped before it began")
         return 128 + signal.SIGTERM

@@ -12,7 +12,8 @@ import pytest
 from playground.cli import sweep as command
 from playground.errors import CheckpointError, ConfigError
 from playground.sweep.folder import SweepDirectory
-from tests.sweep.helpers import controller, make_sweep, output, run, starts, statuses, wait_for
+from playground.sweep.worker import Worker
+from tests.sweep.helpers import STUB, controller, make_sweep, output, run, starts, statuses, wait_for
 
 
 def alive(pid: int) -> bool:
@@ -112,6 +113,14 @@ def test_jobs_outlive_a_controller_that_is_killed(tmp_path: Path) -> None:
   assert run(sweep) == 0
   assert set(statuses(sweep).values()) == {"finished"}
   assert [len(found) for found in starts(sweep).values()] == [1, 1, 1], "nothing is done twice"
+
+
+def test_a_worker_does_nothing_again(tmp_path: Path) -> None:
+  """A killed controller may leave a worker that has yet to take its job's lock; the next controller starts another."""
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  folder = sweep.folder(sweep.jobs[0])
+  assert [Worker(folder.path, STUB).run() for _ in range(2)] == [0, 0]
+  assert len(starts(sweep)[0]) == 1 and folder.state().status == "finished"
 
 
 def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
