@@ -2,4 +2,5 @@
 
 from typing import Any
 
-PyTree = Any  # nested dataclasses, dicts, tuples and None of arrays: JAX lets programs register more, so none is excluded
+# Nested dataclasses, dicts, tuples and None of arrays. Programs may register classes more, so JAX excludes none either.
+PyTree = Any
