@@ -39,9 +39,11 @@ QUANTITIES = {
   "peak_memory_gib": "most memory that JAX's allocator held on one device (Warp's own is not in it)",
   "used_memory_gib": "most memory in use on the GPU while it ran, what was in use before taken off (nvidia-smi)",
   "seconds_per_step": "breakdown, pixels: time of one control step of one environment, with the parts so far",
-  "return": "mean return of one evaluation; setting says after how many steps",
+  "return": "mean return of one evaluation (agent.deterministic_eval); setting says after how many steps",
+  "mode_return": "the same where the policy acts by its mode",
   "best_return": "best mean return of an evaluation, that of the untrained policy apart",
   "final_return": "mean return of the last evaluation",
+  "final_mode_return": "the same where the policy acts by its mode",
   "steps": "control steps trained",
   "wall_clock_s": "of a run without compiling (conditions say where it is in), evaluations included",
 }

@@ -1,9 +1,10 @@
 """The interface of an algorithm. The trainer does what is the same for all (`playground.learning.trainer`)."""
 
 import abc
+import functools
 import importlib
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -60,10 +61,13 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
   `(env, config, network_precision)` and fills `init` and `train_step`.
 
   Attributes:
+    samples: whether the policy can sample its actions; else it has only a mode.
     config: hyperparameters, checked.
     networks: the actor, with the networks that only training needs.
     replay: the buffer of an algorithm that trains on past experience, else None.
   """
+
+  samples: ClassVar[bool] = True
 
   def __init__(self, config: ConfigT, networks: NetworksT, replay: ReplayBuffer | None = None):
     self.config, self.networks, self.replay = config, networks, replay
@@ -96,6 +100,11 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
     normalizer = policy.normalizer if self.config.normalize_observations else None
     deterministic = self.config.deterministic_eval if deterministic is None else deterministic
     return self.networks.act(policy.params.policy, normalizer, obs, key, deterministic)
+
+  def other_acts(self) -> dict[str, Callable[..., jax.Array]]:
+    """The way to act that `deterministic_eval` does not choose, by its name in metrics.csv: `mode` or `sampled`."""
+    mode = not self.config.deterministic_eval
+    return {"mode" if mode else "sampled": functools.partial(self.act, deterministic=mode)} if self.samples else {}
 
 
 def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None) -> Algorithm[Any, Any, Any]:

@@ -1,6 +1,7 @@
 """Evaluation: whole episodes of a batch of environments, each environment's first episode counted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from playground.envs.base import Env, State, newest_picture
+from playground.envs.base import Env, Observation, State, newest_picture
 from playground.envs.wrappers import ModelFields, wrap_for_evaluation
 from playground.hardware.mesh import AXIS, jit_on_mesh
 
@@ -18,7 +19,14 @@ Act = Callable[[Any, Any, jax.Array], jax.Array]  # (policy, obs [N, ...], key) 
 Evaluate = Callable[..., tuple[dict[str, jax.Array], dict[str, jax.Array]]]
 
 
-def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: int = 0) -> Evaluate:
+def make_evaluator(
+  env: Env,
+  act: Act,
+  num_envs: int,
+  mesh: Mesh,
+  num_recorded: int = 0,
+  others: Mapping[str, Act] = MappingProxyType({}),
+) -> Evaluate:
   """Builds a jitted evaluation of a policy over `num_envs` episodes, spread over the mesh.
 
   Args:
@@ -27,26 +35,37 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
     num_envs: episodes, a multiple of the number of devices.
     mesh: devices, one axis named "data".
     num_recorded: episodes on each device to record for a video.
+    others: other ways to act on the same parameters, by name. Each gets `num_envs` episodes of its own, which start
+      from the same states on the same models and run side by side with those of `act`.
 
   Returns:
     A function (policy, key, model fields [num_envs, ...]) -> (scalars, recording). The scalars: `episode_reward` and
     `episode_length` with their deviation over episodes (`_std`), the mean over episodes of every metric
     (`episode_<metric>`, see `wrappers.Episode`), and `nonfinite`, the number of episodes
-    that ended in NaN. The recording: `qpos`, `mocap_pos`, `mocap_quat`, `seen` (the newest picture, where there are
-    any) and `active` (1 until the episode ended) before each decision, [decisions, episodes, ...].
+    that ended in NaN. Those of another way to act are `<name>/<scalar>`, without its reward terms.
+    The recording: `qpos`, `mocap_pos`, `mocap_quat`, `seen` (the newest picture, where there are any) and `active`
+    (1 until the episode ended) before each decision, [decisions, episodes, ...].
   """
   wrapped = wrap_for_evaluation(env)
   decisions = -(-env.episode_length // env.action_repeat)
   per_device = num_envs // mesh.size
+  acts = (act, *others.values())
+  repeat = lambda tree: jax.tree.map(lambda x: jnp.concatenate([x] * len(acts)) if others else x, tree)
+
+  def act_all(policy: Any, obs: Observation, key: jax.Array) -> jax.Array:
+    """Each way to act on its own environments, which lie one after the other."""
+    share = lambda i: jax.tree.map(lambda x: x[i * per_device : (i + 1) * per_device], obs)
+    return jnp.concatenate([each(policy, share(i), key) for i, each in enumerate(acts)])
 
   def evaluate(policy: Any, key: jax.Array, model: ModelFields) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
     reset_key, act_key = jax.random.split(key)
-    state = wrapped.reset(jax.random.split(reset_key, per_device), model)
+    model = repeat(model)
+    state = wrapped.reset(repeat(jax.random.split(reset_key, per_device)), model)
     # Constants become of the type that may differ between devices, as in training: the task is traced once for both.
     always = jax.lax.axis_index(AXIS) >= 0
     state = jax.tree.map(lambda x: jax.lax.select(jax.lax.broadcast(always, x.shape), x, x), state)
-    zeros = jnp.zeros(per_device)
+    zeros = jnp.zeros_like(state.done)
     totals = {name: zeros for name in ("nonfinite", *state.info["episode_metrics"])}
 
     def view(state: State, active: jax.Array) -> dict[str, jax.Array]:
@@ -55,7 +74,7 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
       shown |= {} if picture is None else {"seen": picture}
       return jax.tree.map(lambda x: x[:num_recorded], shown | {"active": active})
 
-    active = jnp.ones(per_device)
+    active = jnp.ones_like(state.done)
     recording = jax.tree.map(lambda x: jnp.zeros((decisions, *x.shape), x.dtype), view(state, active))
 
     def running(carry: tuple[Any, ...]) -> jax.Array:
@@ -66,17 +85,27 @@ def make_evaluator(env: Env, act: Act, num_envs: int, mesh: Mesh, num_recorded: 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
       step, state, active, totals, recording = carry
       recording = jax.tree.map(lambda tape, x: tape.at[step].set(x), recording, view(state, active))
-      state = wrapped.step(state, act(policy, state.obs, jax.random.fold_in(act_key, step)), model)
+      state = wrapped.step(state, act_all(policy, state.obs, jax.random.fold_in(act_key, step)), model)
       now = state.info["episode_metrics"] | {"nonfinite": totals["nonfinite"] + state.info["nonfinite"]}
       totals = {k: jnp.where(active > 0, now[k], total) for k, total in totals.items()}
       return step + 1, state, active * (1 - state.done), totals, recording
 
     totals, recording = jax.lax.while_loop(running, step, (0, state, active, totals, recording))[3:]
     totals["reward"] = totals.pop("sum_reward")
-    everywhere = {k: jax.lax.all_gather(v, AXIS, tiled=True) for k, v in totals.items()}
-    report = {f"episode_{k}": v.mean() for k, v in everywhere.items() if k != "nonfinite"}
-    for name in ("reward", "length"):
-      report[f"episode_{name}_std"] = everywhere[name].std()
-    return report | {"nonfinite": everywhere["nonfinite"].sum()}, recording
+    by_act = {k: v.reshape(len(acts), per_device) for k, v in totals.items()}
+    everywhere = {k: jax.lax.all_gather(v, AXIS, axis=1, tiled=True) for k, v in by_act.items()}
+    report = _scores({k: v[0] for k, v in everywhere.items()})
+    for i, name in enumerate(others, start=1):
+      whole = {k: v[i] for k, v in everywhere.items() if not k.startswith("reward/")}
+      report |= {f"{name}/{k}": v for k, v in _scores(whole).items()}
+    return report, recording
 
   return jit_on_mesh(evaluate, mesh, (P(), P(), P(AXIS)), (P(), P(None, AXIS)))
+
+
+def _scores(totals: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
+  """The scalars of episodes, from what each of them comes to, each [episodes]."""
+  report = {f"episode_{k}": v.mean() for k, v in totals.items() if k != "nonfinite"}
+  for name in ("reward", "length"):
+    report[f"episode_{name}_std"] = totals[name].std()
+  return report | {"nonfinite": totals["nonfinite"].sum()}

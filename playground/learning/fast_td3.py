@@ -134,6 +134,8 @@ class FastTD3Networks(Actor):
 class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
   """FastTD3 for one task."""
 
+  samples = False
+
   def __init__(self, env: Env, config: FastTD3Config, network_precision: str | None = None):
     networks = FastTD3Networks(env, config, network_precision)
     obs = {key: jax.ShapeDtypeStruct(size, jnp.float32) for key, size in networks.obs_sizes.items()}

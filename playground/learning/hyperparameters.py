@@ -40,7 +40,9 @@ class AgentConfig:
   num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 2048
   num_eval_envs: Annotated[int, count(1, 2**24), "environments of an evaluation"] = 128
   normalize_observations: Annotated[bool, "whether observations are scaled to mean 0 and standard deviation 1"] = True
-  deterministic_eval: Annotated[bool, "whether evaluations act by the mode of the policy; else they sample"] = False
+  deterministic_eval: Annotated[
+    bool, "whether eval/episode_reward is of the mode of the policy, and eval/sampled/... of samples; else the reverse"
+  ] = False
 
   @classmethod
   def from_config(cls, config: Any) -> Self:
@@ -265,7 +267,9 @@ class REPPOConfig(AgentConfig):
   algorithm = "playground.learning.reppo:REPPO"
 
   num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
-  deterministic_eval: Annotated[bool, "whether evaluations act by the mode of the policy; else they sample"] = True
+  deterministic_eval: Annotated[
+    bool, "whether eval/episode_reward is of the mode of the policy, and eval/sampled/... of samples; else the reverse"
+  ] = True
   unroll_length: Annotated[int, count(1, 100_000), "policy steps of all environments in one training step"] = 128
   num_minibatches: Annotated[int, count(1, 100_000), "minibatches of an epoch"] = 64
   num_updates_per_batch: Annotated[int, count(1, 100_000), "epochs over the collected steps"] = 8

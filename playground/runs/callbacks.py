@@ -18,7 +18,7 @@ from playground.learning.loop import Loop, Metrics
 from playground.learning.rollout import Step
 from playground.learning.trainer import Trainer
 from playground.rendering.video import render_video
-from playground.runs.csv_tracker import read_metrics
+from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_metrics
 from playground.runs.interrupts import Interrupts
 from playground.runs.nonfinite import write_dump
 from playground.runs.plots import plot_learning_curve
@@ -86,7 +86,7 @@ class RunCallbacks:
     return self._earlier_s + time.perf_counter() - self._began
 
   def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
-    score = metrics.get("eval/episode_reward")
+    score = metrics.get(RETURN)
     self._trackers.log(step, metrics | {"time/wall_clock_s": self.wall_clock_s})
     self._progress.update(step, metrics.get("time/steps_per_second"), score)
     taken = step - self._step
@@ -168,7 +168,9 @@ class RunCallbacks:
     """The result as metrics.csv has it: of the whole run, however often it was resumed."""
     table = read_metrics(self._run_dir.metrics_csv)
     column = lambda name: np.asarray(table[name] if name in table else np.full(len(table), np.nan), float)
-    steps, returns, rate = (column(name) for name in ("step", "eval/episode_reward", "time/steps_per_second"))
+    steps, returns, rate = (column(name) for name in ("step", RETURN, "time/steps_per_second"))
+    last = lambda name: next((value for value in column(name)[::-1].tolist() if np.isfinite(value)), None)
+    chosen = "mode" if self._trainer.config.deterministic_eval else "sampled"
     scores = [(value, int(step)) for value, step in zip(returns.tolist(), steps, strict=True) if np.isfinite(value)]
     # As `checkpoints/best` has it: of several the last, and never the untrained policy, which is not saved.
     best_return, best_step = max((score for score in scores if score[1] > 0), default=(None, None))
@@ -176,7 +178,9 @@ class RunCallbacks:
     taken = np.diff(steps, prepend=0)[trained]
     seconds = float((taken / rate[trained]).sum())
     return {
-      "final_return": scores[-1][0] if scores else None,
+      "final_return": last(RETURN),
+      "final_sampled_return": last(RETURN if chosen == "sampled" else OTHER_RETURNS["sampled"]),
+      "final_mode_return": last(RETURN if chosen == "mode" else OTHER_RETURNS["mode"]),
       "best_return": best_return,
       "best_step": best_step,
       "steps": self._step,

@@ -8,7 +8,8 @@ from playground.runs.files import write_text
 from playground.runs.plots import plot_learning_curve
 from playground.runs.run_dir import RunDirectory
 
-_RESULT = ("env", "final_return", "best_return", "best_step", "params_sha256")
+_RETURNS = ("final_return", "final_sampled_return", "final_mode_return", "best_return")
+_RESULT = ("env", *_RETURNS, "best_step", "params_sha256")
 _OF_A_RUN = (*_RESULT, "steps", "steps_per_second", "wall_clock_s")
 
 

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 _STEP = re.compile(r"[0-9]{1,18}")
 STAGE = "stage"  # the one column of text, in a chain's metrics.csv
+RETURN = "eval/episode_reward"  # of actions as `agent.deterministic_eval` says
+OTHER_RETURNS = {"mode": "eval/mode/episode_reward", "sampled": "eval/sampled/episode_reward"}  # of the other kind
 
 
 class Table(NamedTuple):

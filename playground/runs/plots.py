@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from playground.runs.csv_tracker import read_metrics
+from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_metrics
 from playground.runs.files import replacing
 
 _AXES = {  # file name -> (column, its label)
@@ -20,6 +20,7 @@ def plot_learning_curve(metrics_csv: str | Path, out_dir: str | Path) -> list[Pa
 
   Args:
     metrics_csv: needs columns `step` and `eval/episode_reward`; `eval/episode_reward_std` adds the band,
+      `eval/mode/episode_reward` or `eval/sampled/episode_reward` a line of the other way to act,
       `time/wall_clock_s` (seconds) the second picture and `stage` (names) a line where each stage begins.
     out_dir: made if needed.
 
@@ -28,9 +29,9 @@ def plot_learning_curve(metrics_csv: str | Path, out_dir: str | Path) -> list[Pa
   """
   metrics_csv, out_dir = Path(metrics_csv), Path(out_dir)
   table = read_metrics(metrics_csv)
-  if "eval/episode_reward" not in table:
+  if RETURN not in table:
     return []
-  table = table.dropna(subset=["eval/episode_reward"]).sort_values("step", kind="stable")
+  table = table.dropna(subset=[RETURN]).sort_values("step", kind="stable")
   out_dir.mkdir(parents=True, exist_ok=True)
   written = []
   for name, (column, label) in _AXES.items():
@@ -46,13 +47,15 @@ def _draw(rows: Any, column: str, label: str, path: Path) -> None:
   from matplotlib.figure import Figure  # not pyplot: no global state, no display, safe in any thread
   from matplotlib.ticker import EngFormatter
 
-  x, mean = rows[column].to_numpy(float), rows["eval/episode_reward"].to_numpy(float)
+  x, mean = rows[column].to_numpy(float), rows[RETURN].to_numpy(float)
   if column == "time/wall_clock_s":
     unit, seconds = next((u, s) for u, s in (("h", 3600), ("min", 60), ("s", 1)) if x.max() >= 3 * s or s == 1)
     x, label = x / seconds, f"{label} ({unit})"
   figure = Figure(figsize=(7, 4.2), layout="constrained")
   axes = figure.subplots()
   std = rows["eval/episode_reward_std"].fillna(0).to_numpy(float) if "eval/episode_reward_std" in rows else None
+  others = {name: rows[key].to_numpy(float) for name, key in OTHER_RETURNS.items() if key in rows}
+  own = {"mode": "sampled", "sampled": "mode"}[next(iter(others))] if len(others) == 1 else ""
   names = rows["stage"].to_numpy(str) if "stage" in rows else np.full(len(rows), "")
   begins = [0, *np.flatnonzero(names[1:] != names[:-1]) + 1, len(rows)]
   for begin, end in pairwise(begins):  # a line each, since stages need not be paid the same way
@@ -61,8 +64,11 @@ def _draw(rows: Any, column: str, label: str, path: Path) -> None:
       low, high = (mean - std)[part], (mean + std)[part]
       shade = "± std" if first else None
       axes.fill_between(x[part], low, high, color="tab:blue", alpha=0.18, linewidth=0, label=shade)
-    line = "mean" if first else None
+    line = f"mean, {own}" if first and own else "mean" if first else None
     axes.plot(x[part], mean[part], color="tab:blue", linewidth=1.8, marker="o", markersize=3.5, label=line)
+    for name, values in others.items():
+      line = f"mean, {name}" if first else None
+      axes.plot(x[part], values[part], color="tab:orange", linewidth=1.2, linestyle="--", label=line)
     if names[begin]:
       axes.axvline(x[begin], color="0.5", linewidth=0.9, linestyle="--", zorder=1)
       place: Any = {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points", "ha": "left", "va": "top"}

@@ -18,7 +18,8 @@ from playground.runs.files import lock_holder, locking, plain, read_json, write_
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
 
-_NUMBERS_OF_SUMMARY = ("final_return", "best_return", "best_step", "steps", "steps_per_second", "wall_clock_s")
+_RETURNS = ("final_return", "final_sampled_return", "final_mode_return", "best_return")
+_NUMBERS_OF_SUMMARY = (*_RETURNS, "best_step", "steps", "steps_per_second", "wall_clock_s")
 RunStatus = Literal["running", "finished", "failed", "preempted"]
 
 

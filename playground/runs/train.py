@@ -92,7 +92,8 @@ def _train_locked(
   events = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
   plan.notices += cut_short(agent, env.episode_length, events, trainer.steps_per_update)
   num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
-  evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, hardware.mesh, num_recorded)
+  other_acts = trainer.algorithm.other_acts()
+  evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, hardware.mesh, num_recorded, other_acts)
   if not is_main():
     with noting_loss(RunDirectory(share()).note_loss):
       program = compile_program(trainer, evaluate, draw, plan.policy)

@@ -15,6 +15,7 @@ import yaml
 from playground.config import RunConfig, format_value, is_of_command
 from playground.config.text import first_line
 from playground.errors import CheckpointError, ConfigError, nearest
+from playground.runs.csv_tracker import RETURN
 from playground.runs.files import is_locked, lock_holder, locking, read_json, write_json, write_text
 from playground.runs.run_dir import RunDirectory
 
@@ -169,7 +170,7 @@ class JobFolder:
         file.seek(max(file.tell(), file.seek(0, os.SEEK_END) - 16384))
         rows = [line.split(",") for line in file.read().decode(errors="replace").split("\n")[:-1]]
       rows = [row for row in rows if len(row) == len(columns)]
-      column = columns.index("eval/episode_reward") if "eval/episode_reward" in columns else None
+      column = columns.index(RETURN) if RETURN in columns else None
       returns = [row[column] for row in rows if row[column]] if column is not None else []
       return int(rows[-1][0]) if rows else None, float(returns[-1]) if returns else None
     except (FileNotFoundError, ValueError):  # none yet, or damaged

@@ -87,7 +87,8 @@ class OptunaConfig:
   trials: Annotated[int, count(1), "trials in all, those of earlier starts of the same sweep included"] = 20
   parallel: Annotated[int, count(1), "trials at a time, if the launcher has room"] = 4
   metric: Annotated[
-    Literal["final_return", "best_return", "steps_per_second", "wall_clock_s"], "of a job's summary.json"
+    Literal["final_return", "final_mode_return", "best_return", "steps_per_second", "wall_clock_s"],
+    "of a job's summary.json",
   ] = "final_return"
   direction: Annotated[Literal["maximize", "minimize"], "whether the metric should be high or low"] = "maximize"
   sampler: Annotated[Literal["tpe", "random", "cmaes"], "Optuna's sampler"] = "tpe"

@@ -20,7 +20,7 @@ from playground.reporting.page import (
   t_factor,
   to_html,
 )
-from playground.runs.csv_tracker import read_metrics
+from playground.runs.csv_tracker import RETURN, read_metrics
 from playground.runs.files import replacing, write_text
 from playground.sweep.folder import FAILED, SweepDirectory
 
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
   import numpy as np
   import pandas as pd
 
-FIGURES = ("final_return", "best_return", "steps", "steps_per_second", "wall_clock_s")  # of a run's summary.json
-AVERAGED = ("final_return", "best_return", "steps_per_second", "wall_clock_s")
-RETURN = "eval/episode_reward"
+AVERAGED = ("final_return", "final_mode_return", "best_return", "steps_per_second", "wall_clock_s")
+FIGURES = (*AVERAGED, "final_sampled_return", "steps")  # of a run's summary.json
 SEED = "seed"  # jobs of one group differ in it
 PANEL = "env"  # returns of tasks are not comparable: each task has a panel of its own
 POINTS = 200  # of a mean curve
@@ -169,7 +168,11 @@ def _page(
     reasons = [[_job_link(job), reason] for job, reason in zip(failed["job"], failed["reason"], strict=True)]
     blocks += [Heading(2, "What failed"), Table(["job", "reason"], reasons)]
   if len(groups):
-    mean = "Mean ± 95 % confidence interval over seeds (Student's t), finished jobs."
+    mean = (
+      "Mean ± 95 % confidence interval over seeds (Student's t), finished jobs. `final return`, `best return` and the "
+      "curves are of `eval/episode_reward`, where the policy acts as `agent.deterministic_eval` says; in `final mode "
+      "return` it acts by its mode."
+    )
     blocks += [Heading(2, "Groups"), Text(mean), Table(*_group_rows(groups))]
   blocks += [Picture(path.stem, path.read_bytes(), "") for path in curves]
   columns = [name for name in jobs.columns if name != "overrides"]

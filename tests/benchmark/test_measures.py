@@ -163,9 +163,17 @@ def test_a_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
     folder.mkdir()
     manifest = {"impl": "warp", "num_devices": 1, "matmul_precision": "highest", "network_precision": "highest"}
     write_json(folder / "manifest.json", {**manifest, "timings": {"steady_steps_per_second": 50.0}})
-    scores = {"best_return": 4.0, "final_return": 3.0, "steps": 200, "steps_per_second": 45.0, "wall_clock_s": 7.5}
+    scores = {
+      "best_return": 4.0,
+      "final_return": 3.0,
+      "final_mode_return": 8.0,
+      "steps": 200,
+      "steps_per_second": 45.0,
+      "wall_clock_s": 7.5,
+    }
     write_json(folder / "summary.json", {"status": "finished", **scores})
-    lines = ["step,time/wall_clock_s,eval/episode_reward", "0,0.5,1.0", "50,1.5,", "100,3.0,4.0", "200,7.0,3.0"]
+    columns = "step,time/wall_clock_s,eval/episode_reward,eval/mode/episode_reward"
+    lines = [columns, "0,0.5,1.0,2.0", "50,1.5,,", "100,3.0,4.0,5.0", "200,7.0,3.0,8.0"]
     (folder / "metrics.csv").write_text("\n".join(lines))
 
   monkeypatch.setattr(runs, "run_training", train)
@@ -175,8 +183,9 @@ def test_a_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
   setting = "agent.num_timesteps=200 step="
   assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
     ("return", 1.0, f"{setting}0"), ("return", 4.0, f"{setting}100"), ("return", 3.0, f"{setting}200"),
+    ("mode_return", 2.0, f"{setting}0"), ("mode_return", 5.0, f"{setting}100"), ("mode_return", 8.0, f"{setting}200"),
     ("steps", 200, None), ("wall_clock_s", 7.5, None), ("training_steps_per_s", 50.0, None),
-    ("best_return", 4.0, None), ("final_return", 3.0, None),
+    ("best_return", 4.0, None), ("final_mode_return", 8.0, None), ("final_return", 3.0, None),
   ]  # fmt: skip
   assert all(row["seed"] == 3 and row["backend"] == "warp" and row["devices"] == 1 for row in found)
   assert found[1]["conditions"].endswith("; after 3.0 s")

@@ -63,6 +63,22 @@ def test_metrics_of_an_episode(action_repeat: int) -> None:
   assert recording["active"][:, 0].sum() == steps[0]
 
 
+def test_both_ways_to_act_run_side_by_side_from_the_same_states() -> None:
+  env, key = PointTask(), jax.random.PRNGKey(1)
+  stay = lambda policy, obs, key: jnp.zeros((len(obs["state"]), 2))
+  home = lambda policy, obs, key: -obs["state"]
+  both, recording = make_evaluator(env, stay, 8, make_mesh(1), 2, {"mode": home})(jnp.zeros(()), key, {})
+  for act, prefix in ((stay, ""), (home, "mode/")):
+    alone, recorded = make_evaluator(env, act, 8, make_mesh(1), 2)(jnp.zeros(()), key, {})
+    of_it = {name.removeprefix(prefix): x for name, x in both.items() if ("mode/" in name) == bool(prefix)}
+    assert set(of_it) == set(alone)
+    for name, value in alone.items():
+      np.testing.assert_array_equal(of_it[name], value, err_msg=name)
+    if not prefix:
+      assert jax.tree.all(jax.tree.map(lambda x, y: bool((x == y).all()), recorded, recording))
+  assert both["mode/episode_reward"] > both["episode_reward"]
+
+
 class Seeing(Counting):
   """Two frames of what it sees: one brighter, and then the number of the step."""
 

@@ -31,7 +31,8 @@ every_algorithm = pytest.mark.parametrize("config", SMALL.values(), ids=SMALL)
 @cache
 def built(config: Config, **events: Any) -> tuple[Trainer, CompiledFunctions]:
   trainer = point_trainer(config, **events)
-  evaluate = make_evaluator(trainer.env.unwrapped, trainer.act, config.num_eval_envs, trainer.mesh, 1)
+  others = trainer.algorithm.other_acts()
+  evaluate = make_evaluator(trainer.env.unwrapped, trainer.act, config.num_eval_envs, trainer.mesh, 1, others)
   return trainer, compile_program(trainer, evaluate, lambda: ({}, {}))
 
 
@@ -51,9 +52,9 @@ def run(
 @pytest.mark.parametrize(
   ("name", "updates", "names"),
   [
-    ("ppo", 150, ("training/total_loss", "training/approx_kl", "training/grad_norm")),
-    ("sac", 1500, ("training/critic_loss", "training/entropy", "training/grad_norm")),
-    ("reppo", 150, ("training/critic_loss", "training/kl", "training/grad_norm")),
+    ("ppo", 150, ("training/total_loss", "training/approx_kl", "training/grad_norm", "eval/mode/episode_reward")),
+    ("sac", 1500, ("training/critic_loss", "training/entropy", "training/grad_norm", "eval/mode/episode_reward")),
+    ("reppo", 150, ("training/critic_loss", "training/kl", "training/grad_norm", "eval/sampled/episode_reward")),
     ("fast_td3", 1500, ("training/critic_loss", "training/q_mean", "training/grad_norm")),
   ],
 )

@@ -31,6 +31,16 @@ def test_one_evaluation_without_clock_or_std_draws_what_it_can(tmp_path: Path):
   assert [p.name for p in written] == ["return_over_steps.png"]
 
 
+def test_the_other_way_to_act_has_a_line_and_both_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+  (tmp_path / "metrics.csv").write_text("step,eval/episode_reward,eval/mode/episode_reward\n0,1.0,2.0\n100,5.0,6.0\n")
+  drawn: list[Figure] = []
+  monkeypatch.setattr(Figure, "savefig", lambda figure, path, **kwargs: drawn.append(figure))
+  plot_learning_curve(tmp_path / "metrics.csv", tmp_path)
+  (axes,) = drawn[0].axes
+  lines = {line.get_label(): list(line.get_ydata()) for line in axes.lines}  # pyright: ignore[reportArgumentType]
+  assert lines == {"mean, sampled": [1, 5], "mean, mode": [2, 6]}
+
+
 def test_the_curve_of_a_chain_has_a_line_and_a_mark_for_each_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
   rows = "0,flat,1.0\n100,flat,5.0\n100,rough,2.0\n200,rough,6.0\n"
   (tmp_path / "metrics.csv").write_text("step,stage,eval/episode_reward\n" + rows)

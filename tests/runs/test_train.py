@@ -132,7 +132,9 @@ def test_a_run_leaves_everything_behind(whole: Path) -> None:
   summary = run.summary
   assert STEPS - 10 <= summary["steps"] < STEPS - 10 + BATCH, "the budget is met to within one batch"
   assert table["step"].to_numpy()[-1] == summary["steps"]
-  assert summary["final_return"] == table["eval/episode_reward"].to_numpy()[-1]
+  assert summary["final_return"] == summary["final_sampled_return"] == table["eval/episode_reward"].to_numpy()[-1]
+  assert summary["final_mode_return"] == table["eval/mode/episode_reward"].to_numpy()[-1]
+  assert "eval/mode/episode_length" in table and not any(name.startswith("eval/mode/episode_reward/") for name in table)
   returns = table[table["step"] > 0].set_index("step")["eval/episode_reward"]
   assert (summary["best_return"], summary["best_step"]) == (returns.max(), returns.idxmax())
   assert summary["steps_per_second"] == pytest.approx(summary["steps"] / timings["train_s"])

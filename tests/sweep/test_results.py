@@ -43,7 +43,7 @@ def test_groups_differ_in_all_but_the_seed(sweep: SweepDirectory) -> None:
 
 def test_seeds_alone_are_one_group(tmp_path: Path) -> None:
   jobs = pd.DataFrame({"seed": [1, 2], "status": "finished", "final_return": [1.0, 3.0]})
-  for name in ("best_return", "steps_per_second", "wall_clock_s"):
+  for name in ("final_mode_return", "best_return", "steps_per_second", "wall_clock_s"):
     jobs[name] = np.nan
   groups = group(jobs, [])
   assert (groups["jobs"][0], groups["final_return"][0]) == (2, 2.0)

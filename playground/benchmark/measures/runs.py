@@ -19,11 +19,12 @@ from playground.config import RunConfig, compose
 from playground.errors import PlaygroundError
 from playground.interpreter import PYTHON
 from playground.learning.hyperparameters import read_config
+from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
 from playground.runs.run_dir import RunDirectory
 
-RESULT = ("steps", "wall_clock_s", "training_steps_per_s", "best_return", "final_return")
+RESULT = ("steps", "wall_clock_s", "training_steps_per_s", "best_return", "final_mode_return", "final_return")
 _UNITS = {"steps": "steps", "wall_clock_s": "s", "training_steps_per_s": "steps/s"}
-_RETURN, _TIME = "eval/episode_reward", "time/wall_clock_s"
+_TIME = "time/wall_clock_s"
 _CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH")  # environment variables that replace the run's own caches
 
 
@@ -63,8 +64,11 @@ def whole(facts: Facts, task: str, agent: str, overrides: list[str], told: list[
     with alone(facts.lock):
       run_training([*chosen, "video.enable=false", "tracking=csv", f"run_dir={run.path}"])
     facts.update(facts_of(run.manifest), conditions="a whole run, evaluations and saving in its time, compiling not")
-    evaluations = pd.read_csv(run.metrics_csv).dropna(subset=[_RETURN])
-    emit_returns(facts, evaluations[["step", _RETURN, _TIME]].itertuples(index=False), told, seed)
+    evaluations = pd.read_csv(run.metrics_csv).dropna(subset=[RETURN])
+    emit_returns(facts, evaluations[["step", RETURN, _TIME]].itertuples(index=False), told, seed)
+    if run.summary.get("final_mode_return") is not None:
+      mode = OTHER_RETURNS["mode"] if OTHER_RETURNS["mode"] in evaluations else RETURN
+      emit_returns(facts, evaluations[["step", mode, _TIME]].itertuples(index=False), told, seed, "mode_return")
     result = {**run.summary, "training_steps_per_s": run.manifest["timings"]["steady_steps_per_second"]}
     emit_result(facts, result, RESULT, seed=seed)
 
@@ -112,11 +116,13 @@ def facts_of(manifest: Mapping[str, Any]) -> dict[str, Any]:
   return {"backend": manifest["impl"], "devices": manifest["num_devices"], "precision": precision}
 
 
-def emit_returns(facts: Facts, evaluations: Iterable[Sequence[Any]], setting: Sequence[str], seed: int) -> None:
+def emit_returns(
+  facts: Facts, evaluations: Iterable[Sequence[Any]], setting: Sequence[str], seed: int, quantity: str = "return"
+) -> None:
   """A row for each evaluation: (steps trained, mean return, seconds into the run)."""
   for step, score, seconds in evaluations:
     columns = {"setting": " ".join((*setting, f"step={step:.0f}")), "seed": seed}
-    facts.emit("return", score, "", **columns, conditions=f"{facts['conditions']}; after {seconds:.1f} s")
+    facts.emit(quantity, score, "", **columns, conditions=f"{facts['conditions']}; after {seconds:.1f} s")
 
 
 def emit_result(facts: Facts, result: Mapping[str, Any], quantities: Sequence[str], **columns: Any) -> None:

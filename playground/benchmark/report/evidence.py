@@ -19,7 +19,7 @@ _WORDS = {
   "peak_gib": "peak_memory_gib",
 }
 _UNITS = {"training_steps_per_s": "steps/s", "steps": "steps", "peak_memory_gib": "GiB"}
-_UNITS |= dict.fromkeys(("return", "best_return", "final_return"), "")
+_UNITS |= dict.fromkeys(("return", "mode_return", "best_return", "final_return", "final_mode_return"), "")
 
 Row = dict[str, Any]  # the columns of a row as text, `value` as a number, and `source`: the file
 
