@@ -2,11 +2,13 @@
 
 import difflib
 import errno
+import os
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 T = TypeVar("T")
 _MANY = 20  # names, of which only the nearest is named
+_ALIKE, _LISTED = 3, 5  # letters that begin alike, and names listed that do
 
 
 class PlaygroundError(ValueError):
@@ -45,11 +47,14 @@ def one_sentence(error: Exception) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-  """Returns ' Did you mean X?' for a name that begins so, else for the closest; '' if none is close."""
+  """Returns ' Did you mean X?' for a name that begins so, else for the closest or those that begin alike; '' if none."""
   lowered = {k.lower(): k for k in known}
   begun = [k for k in lowered if len(name) > 3 and k.startswith(name.lower())]
   match = begun or difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
-  return f" Did you mean {lowered[match[0]]!r}?" if match else ""
+  if match:
+    return f" Did you mean {lowered[match[0]]!r}?"
+  alike = [lowered[k] for k in lowered if len(os.path.commonprefix([k, name.lower()])) >= _ALIKE]
+  return f" These begin alike: {', '.join(sorted(alike)[:_LISTED])}." if alike else ""
 
 
 def lookup(table: Mapping[str, T], name: str, key: str) -> T:

@@ -1,6 +1,7 @@
-"""`playground`: the commands beside training. They parse, call and print."""
+"""`playground`: all commands; `train` and `bench` are `playground-run` and `playground-bench`."""
 
 import argparse
+import importlib
 import sys
 from typing import Any
 
@@ -22,11 +23,19 @@ _NUMBERS = {
 }
 
 
+# Commands that read the command line themselves: module and help.
+_PROGRAMS = {
+  "train": ("playground.cli.run", "Train a policy, or sweep with -m; the same as playground-run."),
+  "bench": ("playground.cli.bench", "Measure speed and memory; the same as playground-bench."),
+}
 _RUN = "run directory, checkpoint, or a task, which stands for its pretrained policy"
+_CAMERA = "camera of --video (default: one that shows the whole scene)"
 
 
 def main() -> None:
   """Runs a command and exits with its code; 2 for what the user can act on."""
+  if len(sys.argv) > 1 and sys.argv[1] in _PROGRAMS:
+    importlib.import_module(_PROGRAMS[sys.argv.pop(1)][0]).main()
   withhold_gl()
   args = _arguments()
   try:
@@ -64,55 +73,66 @@ def _check_numbers(args: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-  parser = argparse.ArgumentParser(prog="playground", description="Robot learning tasks; train with playground-run.")
-  parser.add_argument("--version", action="version", version=f"playground-run {__version__}")
+  parser = argparse.ArgumentParser(prog="playground", description="Robot learning on GPU-batched MuJoCo.")
+  version = {"action": "version", "version": f"playground-run {__version__}"}
+  parser.add_argument("--version", help="print the version", **version)
   commands = parser.add_subparsers(required=True, metavar="command")
 
   def add(name: str, command: Any, what: str) -> argparse.ArgumentParser:
     sub = commands.add_parser(name, help=what, description=what)
+    sub.add_argument("--version", help=argparse.SUPPRESS, **version)
     sub.set_defaults(command=command, trust=[])
     return sub
+
+  for name, (_, what) in _PROGRAMS.items():
+    commands.add_parser(name, help=what)
 
   add("list", _list, "List tasks.").add_argument("word", nargs="?", help="only tasks whose name contains it")
   show = add("show", _show, "Show what a task observes, does, is paid for and is trained with.")
   show.add_argument("task", help="a task, or randomization=<name> for what that draws")
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
   show.add_argument("--views", metavar="FILE", help="instead, a picture of what its camera sees on randomised models")
-  show.add_argument("--num-views", type=int, default=16)
+  show.add_argument("--num-views", type=int, default=16, help="randomised models of --views (default: %(default)s)")
   add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
   evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
   evaluate.add_argument("run", help=_RUN)
-  evaluate.add_argument("--episodes", type=int, help="by default the run's num_eval_envs")
-  evaluate.add_argument("--seed", type=int, default=0)
-  evaluate.add_argument("--deterministic", action="store_true", help="act on the distribution's mode")
-  evaluate.add_argument("--video", metavar="FILE", help="also render an episode")
-  evaluate.add_argument("--camera", metavar="NAME", help="of --video: one of the model's; by default one that looks on")
+  evaluate.add_argument("--episodes", type=int, help="episodes to run (default: the run's agent.num_eval_envs)")
+  evaluate.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
+  evaluate.add_argument(
+    "--deterministic", action="store_true", help="act on the distribution's mode (default: sample actions)"
+  )
+  evaluate.add_argument("--video", metavar="FILE", help="also render an episode to this .mp4")
+  evaluate.add_argument("--camera", metavar="NAME", help=_CAMERA)
   export = add("export", _export, "Write a run's policy as ONNX, with the contract that a controller needs.")
   export.add_argument("run", help=_RUN)
-  export.add_argument("--out", metavar="FOLDER", help="by default export/ in the run's")
+  export.add_argument("--out", metavar="FOLDER", help="folder to write to (default: <run>/export)")
   play = add("play", _play, "Run a policy in plain C MuJoCo: measure it, film it or watch it.")
   play.add_argument("policy", help=f"{_RUN}, or a policy.onnx beside its policy.yaml")
-  play.add_argument("--episodes", type=int, default=10)
-  play.add_argument("--seed", type=int, default=0)
+  play.add_argument("--episodes", type=int, default=10, help="episodes to measure (default: %(default)s)")
+  play.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
   shown = play.add_mutually_exclusive_group()
-  shown.add_argument("--video", metavar="FILE", help="also render an episode")
+  shown.add_argument("--video", metavar="FILE", help="also render an episode to this .mp4")
   shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
   shown.add_argument("--web", action="store_true", help="show it in the browser instead")
-  play.add_argument("--camera", metavar="NAME", help="of --video: one of the model's; by default one that looks on")
-  play.add_argument("--host", default="127.0.0.1", help="of --web: the address to listen on; by default this machine's")
-  play.add_argument("--port", type=int, default=8080, help="of --web")
+  play.add_argument("--camera", metavar="NAME", help=_CAMERA)
+  play.add_argument("--host", default="127.0.0.1", help="address that --web listens on (default: %(default)s)")
+  play.add_argument("--port", type=int, default=8080, help="port of --web (default: %(default)s)")
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
   pretrained.add_argument("--add", metavar="RUN", help="measure a run's policy in C MuJoCo and put it into the package")
   sweep = add("sweep", _sweep, "Look at a sweep, gather its result, or do what is missing of it.")
-  sweep.add_argument("action", choices=("status", "collect", "retry", "stop"))
-  sweep.add_argument("folder", help="the sweep's")
+  sweep.add_argument(
+    "action",
+    choices=("status", "collect", "retry", "stop"),
+    help="status: show all jobs; collect: write tables and plots; retry: run what is missing; stop: save and end jobs",
+  )
+  sweep.add_argument("folder", help="folder of the sweep")
   sweep.add_argument("overrides", nargs="*", help="for retry, such as launcher=slurm or launcher.slots_per_gpu=2")
   tune = add("tune-buffers", _tune_buffers, "Measure how large Warp's buffers must be for a task.")
-  tune.add_argument("task")
+  tune.add_argument("task", help="a task of `playground list`")
   tune.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or agent.num_envs=4096")
   tune.add_argument("--run", help="a run or checkpoint whose policy acts, beside random actions")
-  tune.add_argument("--envs", type=int, default=256)
-  tune.add_argument("--steps", type=int, default=500, help="policy steps in each environment")
+  tune.add_argument("--envs", type=int, default=256, help="environments (default: %(default)s)")
+  tune.add_argument("--steps", type=int, default=500, help="policy steps in each environment (default: %(default)s)")
   replay = add("replay", _replay, "Replay the step that was not finite.")
   replay.add_argument("dump", help="a run's nan_dump/step_*.npz")
   for builds_tasks in (show, evaluate, export, play, sweep, tune, replay):

@@ -18,6 +18,7 @@ from hydra._internal.utils import get_args_parser  # Hydra has no public name fo
 from hydra.errors import HydraException
 
 from playground import __version__
+from playground.cli.header import header
 from playground.collector import uncollected
 from playground.config import (
   RunConfig,
@@ -65,6 +66,7 @@ def _main(argv: Sequence[str]) -> int:
   if "--version" in argv:  # Hydra's option of this name prints Hydra's version
     print(f"playground-run {__version__}")
     return 0
+  verbose, argv = "--verbose" in argv, [arg for arg in argv if arg != "--verbose"]
   parser = get_args_parser()
   parser.error = _refuse
   args, others = parser.parse_known_args(argv)
@@ -87,18 +89,20 @@ def _main(argv: Sequence[str]) -> int:
     return 0
   hydras = [text for text in overrides if is_hydras(text)]
   if args.cfg or hydras:
-    return _hydra_app(flags, [*config.overrides, *hydras], config)
-  return _train(config)
+    return _hydra_app(flags, [*config.overrides, *hydras], config, verbose)
+  return _train(config, verbose)
 
 
-def _hydra_app(flags: Sequence[str], overrides: Sequence[str], config: RunConfig | None = None) -> int:
+def _hydra_app(
+  flags: Sequence[str], overrides: Sequence[str], config: RunConfig | None = None, verbose: bool = False
+) -> int:
   """Lets Hydra show what only it has, such as its own configuration, or train with settings of its own."""
   codes = []
 
   def job(_: object) -> None:
     assert config is not None, "composed unless Hydra only shows something"
     try:
-      codes.append(_train(config))
+      codes.append(_train(config, verbose))
     except PlaygroundError as error:  # Hydra would say a line of its own about it
       codes.append(_report(error))
 
@@ -136,13 +140,15 @@ def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
     _refuse("--shell-completion takes install=<shell>, uninstall=<shell> or query=<shell>, of bash, fish and zsh")
 
 
-def _train(config: RunConfig) -> int:
+def _train(config: RunConfig, verbose: bool) -> int:
   from rich.console import Console
 
   from playground.envs.warp_kernels import stand_by
 
   stand_by(config.env, config.hardware.platform)
-  Console().print(tree(config))
+  print("\n".join(header(config)), flush=True)
+  if verbose:
+    Console().print(tree(config))
   with uncollected(stays=True):
     from playground.runs.train import train  # imports JAX
 

@@ -139,6 +139,6 @@ def _check_option(group: str, option: Any, roots: Sequence[Path]) -> None:
   shown = listed_options(group, roots)
   command = "playground list" if group == "env" else "playground-run --help"
   allowed = ", ".join(shown) if len(shown) <= 12 else f"the {len(shown)} that `{command}` shows"
-  raise UnknownNameError(
-    f"{group}={format_value(option)} does not exist: choose from {allowed}.{nearest(str(option), shown)}"
-  )
+  elsewhere = [f"{other}={option}" for other in ("experiment", "env", "robot") if option in options(other, roots)]
+  near = f" Did you mean {elsewhere[0]}?" if elsewhere else nearest(str(option), shown)
+  raise UnknownNameError(f"{group}={format_value(option)} does not exist: choose from {allowed}.{near}")

@@ -26,6 +26,7 @@ from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
 from playground.runs.chain_result import write_result
 from playground.runs.interrupts import Interrupts, exit_code
+from playground.runs.progress import format_return
 from playground.runs.provenance import process_age_s
 from playground.runs.restore_plan import RestorePlan, weights_of
 from playground.runs.run_dir import RunDirectory
@@ -155,7 +156,8 @@ def _say_where(chain: RunDirectory) -> None:
   summary = chain.summary
   print(f"\n{summary['status']}: {summary['steps']:,} steps in all")
   for stage in summary["stages"]:
-    result = f"return {stage['final_return']}, {stage['steps']:,} steps" if stage["steps"] is not None else ""
+    score = format_return(stage["final_return"])
+    result = f"return {score}, {stage['steps']:,} steps" if stage["steps"] is not None else ""
     print(f"  {stage['folder']:20}{stage['status']:12}{result}")
   for name, path in {"metrics": chain.metrics_csv, "plots": chain.plots}.items():
     print(f"  {name:20}{path}")

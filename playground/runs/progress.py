@@ -124,6 +124,11 @@ class _Terminal:
         raise
 
 
+def format_return(value: float | None) -> str:
+  """Returns a return to four figures (998.8, 0.4512), `none` where there is none."""
+  return "none" if value is None else f"{value:.1f}" if abs(value) >= 1000 else f"{value:.4g}"
+
+
 def _short(number: float) -> str:
   for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
     if number >= size:

@@ -25,7 +25,7 @@ from playground.rendering.visuals import drawn_model
 from playground.runs.callbacks import NonMainCallbacks, RunCallbacks
 from playground.runs.chain import train_chain
 from playground.runs.interrupts import Interrupted, Interrupts, exit_code
-from playground.runs.progress import Progress
+from playground.runs.progress import Progress, format_return
 from playground.runs.provenance import process_age_s
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
@@ -182,10 +182,10 @@ def model_sampler(
 def _say_where(run_dir: RunDirectory) -> None:
   """The last lines of a run: what lies where."""
   summary = run_dir.summary
-  print(f"{summary['status']}: return {summary['final_return']}, {summary['steps']:,} steps")
+  print(f"{summary['status']}: return {format_return(summary['final_return'])}, {summary['steps']:,} steps")
   places: dict[str, Any] = {"metrics": run_dir.metrics_csv, "plots": run_dir.plots, "checkpoints": run_dir.checkpoints}
   if (best := run_dir.checkpoints / BEST).is_dir():
-    places["best"] = f"{best} (return {summary['best_return']} after {summary['best_step']:,} steps)"
+    places["best"] = f"{best} (return {format_return(summary['best_return'])} after {summary['best_step']:,} steps)"
   for name, path in places.items():
     print(f"  {name:12}{path}")
   videos = sorted(run_dir.videos.glob("*.mp4"))

@@ -60,7 +60,8 @@ class Job:
     varies = {key: _value(config, key) for key in varying}
     own = {text.partition("=")[0].lstrip("+~") for text in overrides}  # a listed job says less than others
     named = {key: value for key, value in varies.items() if key in own}
-    words = [str(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={v}" for k, v in named.items()]
+    short = lambda v: f"{v:.4g}" if isinstance(v, float) else str(v)
+    words = [short(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={short(v)}" for k, v in named.items()]
     text = re.sub(r"[^A-Za-z0-9._=+-]+", "-", "_".join(words or [config.name]))[:80].strip("-.")
     if config.hardware.distributed.enable:
       raise ConfigError("hardware=multi_node cannot be given with -m: a job of a sweep runs on one machine.")

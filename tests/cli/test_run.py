@@ -43,13 +43,19 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
   return caller(monkeypatch, "playground-run", main)
 
 
-def test_trains_the_default_run_and_prints_it(
+def test_trains_the_default_run_and_describes_it_in_ten_lines(
   command: Command, trained: list[RunConfig], capsys: pytest.CaptureFixture[str]
 ):
   assert command() == 0
   (config,) = trained
   assert config.resolved == compose().resolved
-  assert "num_timesteps: 6000000" in capsys.readouterr().out
+  out = capsys.readouterr().out
+  assert out.count("\n") <= 10 and "Training CartpoleBalance with ppo" in out and "6,000,000 steps" in out
+  assert command("--verbose", "agent.num_envs=128") == 0
+  out = capsys.readouterr().out
+  assert "num_timesteps: 6000000" in out and "changed    agent.num_envs=128" in out
+  assert command("experiment=go1_joystick_chain") == 0
+  assert "slow_turns (100,000,000 steps), fast_turns" in capsys.readouterr().out
 
 
 def test_has_warps_compiler_stand_by_for_the_task(

@@ -21,3 +21,11 @@ def test_prints_the_version_of_this_package(
 ) -> None:
   assert caller(monkeypatch, program, command)("--version") == 0
   assert capsys.readouterr().out == f"playground-run {__version__}\n"
+
+
+@pytest.mark.parametrize("name", ["train", "bench", "list", "play"])
+def test_every_subcommand_prints_it(
+  name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  assert caller(monkeypatch, "playground", main.main)(name, "--version") == 0
+  assert capsys.readouterr().out == f"playground-run {__version__}\n"

@@ -1,0 +1,43 @@
+"""The first lines of a run: what is trained, with what, where it lies, and what differs from the defaults."""
+
+from collections.abc import Iterator
+
+from playground.config import RunConfig, is_hydras
+
+_SHOWN = 6  # values of the command line; config.yaml has all
+
+
+def header(config: RunConfig) -> list[str]:
+  """Returns at most ten lines that describe a run, or a chain of runs."""
+  title, *rows = _rows(config)
+  return [title[1], *(f"  {name:<10} {text}" for name, text in rows)]
+
+
+def _rows(config: RunConfig) -> Iterator[tuple[str, str]]:
+  choices, agent, env = config.choices, config.agent, config.env
+  yield "", f"Training {choices['env']} with {agent.name}"
+  origin = {"experiment": choices.get("experiment"), "robot": choices.get("robot")}
+  origin["randomization"] = choices.get("randomization")
+  if named := [f"{group}={option}" for group, option in origin.items() if option]:
+    yield "from", " ".join(named)
+  if config.stages:
+    yield "stages", ", ".join(f"{stage.name.split('/')[-1]} ({_steps(stage)})" for stage in config.stages)
+  else:
+    yield "budget", f"{_steps(config)} in {agent.num_envs:,} environments, {agent.num_evals} evaluations"
+  tuned = choices.get("tuned")
+  yield "agent", f"tuned set {tuned}" if tuned else "default hyperparameters: no tuned set for this task"
+  backend = "jax, or warp on a GPU" if (env.impl, env.cuda_impl) == ("auto", "warp") else env.impl
+  yield "hardware", f"{choices.get('hardware')}; physics backend {backend.replace('auto', 'jax')}; seed {config.seed}"
+  if set_here := [text for text in config.overrides if "." in text.partition("=")[0] and not is_hydras(text)]:
+    more = f" and {len(set_here) - _SHOWN} more" if len(set_here) > _SHOWN else ""
+    yield "changed", " ".join(set_here[:_SHOWN]) + more
+  for key in ("resume", "init_from"):
+    if getattr(config, key):
+      yield key, str(getattr(config, key))
+  if not config.resume:
+    yield "folder", str(config.run_dir)
+  yield "config", "config.yaml in this folder; --verbose prints it"
+
+
+def _steps(config: RunConfig) -> str:
+  return f"{config.agent.num_timesteps:,} steps"
