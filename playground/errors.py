@@ -2,7 +2,6 @@
 
 import difflib
 import errno
-import os
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
@@ -47,13 +46,13 @@ def one_sentence(error: Exception) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-  """Returns ' Did you mean X?' for a name that begins so, else for the closest or those that begin alike; '' if none."""
+  """Returns ' Did you mean X?' for a name that begins so, else for the closest, else those that begin alike."""
   lowered = {k.lower(): k for k in known}
   begun = [k for k in lowered if len(name) > 3 and k.startswith(name.lower())]
   match = begun or difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
   if match:
     return f" Did you mean {lowered[match[0]]!r}?"
-  alike = [lowered[k] for k in lowered if len(os.path.commonprefix([k, name.lower()])) >= _ALIKE]
+  alike = [lowered[k] for k in lowered if len(name) > _ALIKE and k.startswith(name[:_ALIKE].lower())]
   return f" These begin alike: {', '.join(sorted(alike)[:_LISTED])}." if alike else ""
 
 

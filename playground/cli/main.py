@@ -74,13 +74,13 @@ def _check_numbers(args: argparse.Namespace) -> None:
 
 def _parser() -> argparse.ArgumentParser:
   parser = argparse.ArgumentParser(prog="playground", description="Robot learning on GPU-batched MuJoCo.")
-  version = {"action": "version", "version": f"playground-run {__version__}"}
-  parser.add_argument("--version", help="print the version", **version)
+  version = f"playground-run {__version__}"
+  parser.add_argument("--version", action="version", version=version, help="print the version")
   commands = parser.add_subparsers(required=True, metavar="command")
 
   def add(name: str, command: Any, what: str) -> argparse.ArgumentParser:
     sub = commands.add_parser(name, help=what, description=what)
-    sub.add_argument("--version", help=argparse.SUPPRESS, **version)
+    sub.add_argument("--version", action="version", version=version, help=argparse.SUPPRESS)
     sub.set_defaults(command=command, trust=[])
     return sub
 
