@@ -4,13 +4,13 @@ import dataclasses
 import inspect
 import itertools
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
+from playground.config.comments import flow, keys_and_comments
 from playground.config.definitions import RunSettings, defined
 from playground.config.files import task_experiments
 from playground.envs.options import TermsConfig
@@ -94,11 +94,10 @@ def _group_page(group: str) -> str:
     head = list(itertools.takewhile(lambda line: line.startswith("#"), lines))
     said = " ".join(line[1:].strip() for line in head if not line.startswith("# @package"))
     parts.append(f"## {path.stem}\n\n{_text(said)}\n")
-    lines[: len(head)] = [""] * len(head)  # it belongs to no key
-    keys = list(_keys(yaml.compose("\n".join(lines)), lines))
+    keys = list(keys_and_comments("\n".join(lines)))
     bases = [base for key, value, _ in keys if key == "defaults" for base in yaml.safe_load(value) if base != "_self_"]
     if bases:
-      parts.append("On top of " + ", ".join(_code(_flow(base)) for base in bases) + ".\n")
+      parts.append("On top of " + ", ".join(_code(flow(base)) for base in bases) + ".\n")
     rows = [f"| {_code(key)} | {_code(value)} | {_text(said)} |" for key, value, said in keys if key != "defaults"]
     if rows:
       parts.append("\n".join(["| key | value | |", "|---|---|---|", *rows]) + "\n")
@@ -124,47 +123,7 @@ def _setting_row(setting: Setting) -> str:
     return ""
   allowed = ", ".join(map(_code, setting.choices)) if setting.choices else str(setting.limit or "")
   allowed += " or null" if setting.nullable and allowed else ""
-  return f"| {_code(setting.name)} | {_code(_flow(setting.default))} | {allowed} | {_text(setting.help)} |"
-
-
-def _keys(node: yaml.Node | None, lines: list[str], prefix: str = "") -> Iterator[tuple[str, str, str]]:
-  """Dotted key, value and comments of each entry; a section has no value, and is left out if nothing is said of it."""
-  if not isinstance(node, yaml.MappingNode):
-    return
-  for key, value in node.value:
-    name = f"{prefix}{key.value}"
-    section = isinstance(value, yaml.MappingNode) and not value.flow_style
-    in_block = not section and not value.end_mark.column  # a list over several lines ends where the next key begins
-    beside = _beside(lines, key.end_mark if section or in_block else value.end_mark)
-    said = " ".join([*_above(lines, key.start_mark), *beside])
-    if section:
-      yield from [(name, "", said)] if said else []
-      yield from _keys(value, lines, f"{name}.")
-    else:
-      yield name, _flow(yaml.safe_load(yaml.serialize(value))), said
-
-
-def _above(lines: list[str], key: yaml.Mark) -> list[str]:
-  """The lines of comment directly above a key, which are indented as it is."""
-  begin = " " * key.column + "#"
-  above = list(itertools.takewhile(lambda line: line.startswith(begin), reversed(lines[: key.line])))
-  return [line[len(begin) :].strip() for line in reversed(above)]
-
-
-def _beside(lines: list[str], end: yaml.Mark) -> list[str]:
-  """The comment behind a place in a line, with the lines below that continue it."""
-  before, mark, comment = lines[end.line][end.column :].partition("#")
-  if not mark or before.strip(" :"):
-    return []
-  column = len(lines[end.line]) - len(comment) - 1
-  below = itertools.takewhile(lambda line: line[:column].isspace() and line[column] == "#", lines[end.line + 1 :])
-  return [comment.strip(), *(line[column + 1 :].strip() for line in below)]
-
-
-def _flow(value: object) -> str:
-  """A value on one line, as it could stand on a command line."""
-  text = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False).strip()
-  return text.removesuffix("...").strip()
+  return f"| {_code(setting.name)} | {_code(flow(setting.default))} | {allowed} | {_text(setting.help)} |"
 
 
 def _code(text: str) -> str:

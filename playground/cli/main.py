@@ -93,6 +93,9 @@ def _parser() -> argparse.ArgumentParser:
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
   show.add_argument("--views", metavar="FILE", help="instead, a picture of what its camera sees on randomised models")
   show.add_argument("--num-views", type=int, default=16, help="randomised models of --views (default: %(default)s)")
+  keys = add("keys", _keys, "Explain a section's or group's keys: value, allowed values and meaning.")
+  keys.add_argument("prefix", help="such as agent, env.rewards, hardware.platform or tracking")
+  keys.add_argument("overrides", nargs="*", help="as for playground-run, such as env=Go1Getup or agent=sac")
   add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
   evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
   evaluate.add_argument("run", help=_RUN)
@@ -135,7 +138,7 @@ def _parser() -> argparse.ArgumentParser:
   tune.add_argument("--steps", type=int, default=500, help="policy steps in each environment (default: %(default)s)")
   replay = add("replay", _replay, "Replay the step that was not finite.")
   replay.add_argument("dump", help="a run's nan_dump/step_*.npz")
-  for builds_tasks in (show, evaluate, export, play, sweep, tune, replay):
+  for builds_tasks in (show, keys, evaluate, export, play, sweep, tune, replay):
     builds_tasks.add_argument(
       "--trust", action="append", metavar="PACKAGE", help="let the configuration name task classes of this package, too"
     )
@@ -218,6 +221,12 @@ def _replay(args: argparse.Namespace) -> int:
   from playground.cli.replay import replay
 
   return replay(args.dump)
+
+
+def _keys(args: argparse.Namespace) -> int:
+  from playground.cli.keys import show_keys
+
+  return show_keys(args.prefix, args.overrides)
 
 
 def _show(args: argparse.Namespace) -> int:

@@ -1,7 +1,8 @@
 """`playground-run`: composes a run's configuration, checks it, trains.
 
-The flags are Hydra's. `--cfg job` and training take the one composition; `--help`, `--info`, `--shell-completion` and
-`hydra.` keys go to Hydra's app. `-m` is ours: a sweep of jobs, each a process of its own (`playground.sweep`).
+The flags are Hydra's, but for `--help`, `--verbose` and `--version`. `--cfg job` and training take the one composition;
+`--hydra-help`, `--info`, `--shell-completion` and `hydra.` keys go to Hydra's app. `-m` is ours: a sweep of jobs, each
+a process of its own (`playground.sweep`).
 """
 
 import argparse
@@ -19,6 +20,7 @@ from hydra.errors import HydraException
 
 from playground import __version__
 from playground.cli.header import header
+from playground.cli.help import print_help
 from playground.collector import uncollected
 from playground.config import (
   RunConfig,
@@ -32,7 +34,6 @@ from playground.config import (
   to_yaml,
   tree,
   values_to_yaml,
-  with_default_experiment,
 )
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, one_sentence
 from playground.rendering.gl import withhold_gl
@@ -75,12 +76,13 @@ def _main(argv: Sequence[str]) -> int:
   overrides = [*args.overrides, *others]
   flags = [arg for arg in argv if arg not in overrides]
   _check_flags(args, overrides)
-  overrides, trusted = _trusted(overrides)
+  words = [text for text in overrides if args.help and "=" not in text]
+  overrides, trusted = _trusted([text for text in overrides if text not in words])
   trust(*trusted)
   if args.hydra_help or args.info or args.shell_completion:
     return _hydra_app(flags, overrides)
   if args.help:
-    return _hydra_app(flags, with_default_experiment(overrides))
+    return _help(words, overrides)
   if args.multirun:
     return _sweep(overrides, args.cfg, trusted)
   config = compose(overrides)
@@ -91,6 +93,18 @@ def _main(argv: Sequence[str]) -> int:
   if args.cfg or hydras:
     return _hydra_app(flags, [*config.overrides, *hydras], config, verbose)
   return _train(config, verbose)
+
+
+def _help(keys: Sequence[str], overrides: Sequence[str]) -> int:
+  """Prints our page, or what a key means."""
+  if not keys:
+    print_help()
+    return 0
+  if len(keys) > 1:
+    raise ConfigError(f"--help {' '.join(keys)}: one key at a time.")
+  from playground.cli.keys import show_keys
+
+  return show_keys(keys[0], overrides)
 
 
 def _hydra_app(
@@ -134,7 +148,7 @@ def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
   for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
     if getattr(args, name) is not None:
       _refuse(f"--{name.replace('_', '-')} is no option")
-  if (args.resolve or args.package) and not (args.cfg or args.help):
+  if (args.resolve or args.package) and not args.cfg:
     _refuse(f"--{'resolve' if args.resolve else 'package'} goes with --cfg job")
   if args.shell_completion and not (len(overrides) == 1 and _COMPLETION.fullmatch(overrides[0])):
     _refuse("--shell-completion takes install=<shell>, uninstall=<shell> or query=<shell>, of bash, fish and zsh")

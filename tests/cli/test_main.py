@@ -121,6 +121,32 @@ def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   assert "Did you mean 'go1'?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+  ("args", "shown"),
+  [
+    (["agent", "agent=sac"], ["one of fast_td3, ppo,", "agent.num_envs 128 a whole number from 1"]),
+    (["robot", "env=Go1Getup"], ["env.robot.root trunk body that is pushed", "env.robot.mjcf"]),
+    (["env.action_scale", "env=Go1Getup"], ["env.action_scale 0.5 rad", "Values are those of Go1Getup"]),
+    (["env.rewards", "env=Go1Getup"], ["factor on the function's value", "env.rewards.upright_exp"]),
+    (["env.observations.privileged_state", "env=Go1JoystickFlatTerrain"], ["privileged_state.gyro"]),
+    (["launcher", "launcher=slurm"], ["one of local, ray, slurm", "launcher.partition"]),
+    (["debug"], ["debug=<option>: one of fast, profile"]),
+  ],
+)
+def test_keys(command: Command, capsys: pytest.CaptureFixture[str], args: list[str], shown: list[str]):
+  assert command("keys", *args) == 0
+  out = " ".join(capsys.readouterr().out.split())
+  for text in shown:
+    assert text in out
+
+
+def test_keys_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
+  assert command("keys", "agnt") == 2
+  assert "Did you mean 'agent'?" in capsys.readouterr().err
+  assert command("keys", "env.rewards.foo") == 2
+  assert "env.rewards.foo does not exist" in capsys.readouterr().err
+
+
 def test_doctor(command: Command, monkeypatch: pytest.MonkeyPatch):
   assert _stub(monkeypatch, "playground.cli.doctor", "doctor", 1) == []
   assert command("doctor") == 1

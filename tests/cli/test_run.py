@@ -93,7 +93,9 @@ def test_resumes(command: Command, trained: list[RunConfig], tmp_path: Path, cap
     (["agent.num_timesteps=2e6", "--cfg", "job", "agent.num_envs=64"], ["num_envs: 64\n", "num_timesteps: 2000000\n"]),
     (["env=CartpoleBalance", "--cfg", "job", "--package", "agent"], ["num_envs: 2048\n"]),
     (["experiment=go1_joystick_chain", "--cfg", "job"], ["stages:\n    slow_turns:\n", "    rough:\n"]),
-    (["--help"], ["hardware: a100_x1, ", "num_envs: 256\n"]),
+    (["--help"], ["experiment=go1_joystick", "ppo, ppo_paper", "init_from", "--cfg job", "56, such as "]),
+    (["--help", "agent.learning_rate"], ["agent.learning_rate", "a number above 0"]),
+    (["--help", "video", "env=CheetahRun"], ["video.visuals", "whether videos are recorded"]),
     (["--info", "searchpath"], ["configs"]),
   ],
 )

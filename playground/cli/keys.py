@@ -1,0 +1,145 @@
+"""`playground keys <prefix>`: value, allowed values and meaning of every key below a dotted prefix."""
+
+import inspect
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from playground.config import RunConfig, compose, compose_settings, config_roots, format_value, is_of_sweep
+from playground.config.comments import keys_and_comments
+from playground.config.definitions import chosen_names, definition
+from playground.config.files import find_file, groups, lineage, listed_options
+from playground.config.schema import check_key
+from playground.config.text import join
+from playground.errors import UnknownNameError
+from playground.mdp.options import OPTIONS
+from playground.settings import Setting
+
+_WIDE = 160  # columns, where no terminal says how many there are
+_SECTIONS = {"robot": "env.robot", "randomization": "env.events"}  # of groups that set a part of env
+_FILES = ("env", "robot", "curriculum")  # groups whose files explain keys in comments
+
+
+def show_keys(prefix: str, overrides: Sequence[str]) -> int:
+  """Prints the options of a group and a table of keys.
+
+  Args:
+    prefix: a section (agent), a key (agent.learning_rate), a term (env.rewards.action_rate_l2) or a group.
+    overrides: what the configuration is composed from, as for playground-run.
+
+  Returns:
+    The exit code, 0.
+
+  Raises:
+    PlaygroundError: no such key, or overrides that do not compose.
+  """
+  config = compose([text for text in overrides if not is_of_sweep(text.partition("=")[0])])
+  sweeps = compose_settings([text for text in overrides if is_of_sweep(text.partition("=")[0])])
+  values = {**config.resolved, **sweeps.to_dict()}
+  roots = config_roots()
+  console = Console()
+  console = console if console.is_terminal else Console(width=_WIDE)
+  prefix = prefix.strip(".")
+  if prefix in groups(roots):
+    names = [name for name in listed_options(prefix, roots) if not name.split("/")[-1].startswith("_")]
+    console.print(Text(f"{prefix}=<option>", style="bold"), Text(f"one of {', '.join(names)}"), sep=": ")
+    if prefix not in values and prefix not in _SECTIONS:
+      return 0
+  prefix = _SECTIONS.get(prefix, prefix)
+  _print_terms_help(prefix, console)
+  console.print(_table(_rows(prefix, _at(prefix, values), config, chosen_names(values))))
+  if prefix.startswith("env"):
+    console.print(f"Values are those of {config.choices['env']}; env=<task> behind the prefix shows another's.")
+  return 0
+
+
+def _at(prefix: str, values: Mapping[str, Any]) -> Any:
+  """The part of the configuration at a dotted key; raises UnknownNameError if there is none."""
+  node: Any = values
+  for part in prefix.split("."):
+    if not isinstance(node, Mapping) or part not in node:
+      check_key(prefix, values)
+      raise UnknownNameError(f"{prefix} does not exist in this configuration: its term is not one of the task's.")
+    node = node[part]
+  return node
+
+
+def _rows(prefix: str, node: Any, config: RunConfig, names: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]:
+  """Yields key, value, allowed values and help."""
+  comments = _comments(config)
+
+  def walk(key: str, value: Any) -> Iterator[tuple[str, str, str, str]]:
+    setting = definition(key, names)
+    said = (setting and setting.help) or comments.get(key, "")
+    if _is_term(key, value):
+      what, said = _term(key, value)
+      yield key, what, "", said
+      if key != prefix:
+        return
+    if not isinstance(value, Mapping) or not value:
+      yield key, format_value(value), _allowed(setting), said
+    for name, inner in value.items() if isinstance(value, Mapping) else ():
+      yield from walk(join(key, name), inner)
+
+  return walk(prefix, node)
+
+
+def _is_term(key: str, value: Any) -> bool:
+  section, kind, *names = [*key.split("."), "", ""]
+  names = [name for name in names if name]
+  return (
+    isinstance(value, Mapping)
+    and section == "env"
+    and kind in OPTIONS
+    and len(names) == (2 if kind == "observations" else 1)
+    and names[-1] != "state"  # of an observation group: the group state as a whole
+  )
+
+
+def _term(key: str, entry: Mapping[str, Any]) -> tuple[str, str]:
+  """The fields of a term, and the first line of its function's docstring."""
+  from playground.mdp.terms import bind_one  # imports JAX, which keys other than terms do without
+
+  term = bind_one(key.split(".")[1], key, key.split(".")[-1], entry)
+  func = "" if term.func.__name__ == term.name else f"{term.func.__name__} "
+  fields = {name: value for name, value in entry.items() if name != "func" and value not in (None, {})}
+  return f"{func}{format_value(fields)}", next(iter((inspect.getdoc(term.func) or "").splitlines()), "")
+
+
+def _print_terms_help(prefix: str, console: Console) -> None:
+  """Prints what fields a term has, for a prefix such as env.rewards."""
+  kind = prefix.removeprefix("env.")
+  if prefix != kind and kind in OPTIONS:
+    console.print(Text(inspect.getdoc(OPTIONS[kind]) or ""))
+    console.print(f"Set a field with {prefix}.<term>.<field>=<value>; a term that is null is removed.\n", markup=False)
+
+
+def _allowed(setting: Setting | None) -> str:
+  if setting is None:
+    return ""
+  allowed = ", ".join(setting.choices) if setting.choices else str(setting.limit or "")
+  return allowed + (" or null" if setting.nullable and allowed else "")
+
+
+def _comments(config: RunConfig) -> dict[str, str]:
+  """Comments of the chosen files by dotted key; those of a file that another is built on come last."""
+  roots, found = config_roots(), {}
+  for group in _FILES:
+    option = config.choices.get(group)
+    for name in lineage(group, option, roots) if option else ():
+      if (file := find_file(group, name, roots)) is not None:
+        for key, _, comment in keys_and_comments(file.read_text(encoding="utf-8")):
+          found.setdefault(join(_SECTIONS.get(group, group), key), comment)
+  return found
+
+
+def _table(rows: Iterator[tuple[str, str, str, str]]) -> Table:
+  table = Table(box=None, padding=(0, 2, 0, 0))
+  for name, ratio in (("key", 4), ("value", 4), ("allowed", 3), ("meaning", 5)):
+    table.add_column(name, overflow="fold", ratio=ratio, style="cyan" if name == "key" else None)
+  for row in rows:
+    table.add_row(*map(Text, row))
+  return table

@@ -1,0 +1,55 @@
+"""Comments of YAML files: the help of keys that no settings class defines."""
+
+import itertools
+from collections.abc import Iterator
+
+import yaml
+
+
+def keys_and_comments(text: str) -> Iterator[tuple[str, str, str]]:
+  """Yields dotted key, value and comment of each entry of a YAML file.
+
+  A section has no value, and is left out if it has no comment. Comments at the head of the file belong to no key.
+  """
+  lines = text.splitlines()
+  head = len(list(itertools.takewhile(lambda line: line.startswith("#"), lines)))
+  return _keys(yaml.compose(text), [""] * head + lines[head:])
+
+
+def flow(value: object) -> str:
+  """A value on one line, as it could stand on a command line."""
+  text = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False).strip()
+  return text.removesuffix("...").strip()
+
+
+def _keys(node: yaml.Node | None, lines: list[str], prefix: str = "") -> Iterator[tuple[str, str, str]]:
+  if not isinstance(node, yaml.MappingNode):
+    return
+  for key, value in node.value:
+    name = f"{prefix}{key.value}"
+    section = isinstance(value, yaml.MappingNode) and not value.flow_style
+    in_block = not section and not value.end_mark.column  # a list over several lines ends where the next key begins
+    beside = _beside(lines, key.end_mark if section or in_block else value.end_mark)
+    said = " ".join([*_above(lines, key.start_mark), *beside])
+    if section:
+      yield from [(name, "", said)] if said else []
+      yield from _keys(value, lines, f"{name}.")
+    else:
+      yield name, flow(yaml.safe_load(yaml.serialize(value))), said
+
+
+def _above(lines: list[str], key: yaml.Mark) -> list[str]:
+  """The lines of comment directly above a key, which are indented as it is."""
+  begin = " " * key.column + "#"
+  above = list(itertools.takewhile(lambda line: line.startswith(begin), reversed(lines[: key.line])))
+  return [line[len(begin) :].strip() for line in reversed(above)]
+
+
+def _beside(lines: list[str], end: yaml.Mark) -> list[str]:
+  """The comment behind a place in a line, with the lines below that continue it."""
+  before, mark, comment = lines[end.line][end.column :].partition("#")
+  if not mark or before.strip(" :"):
+    return []
+  column = len(lines[end.line]) - len(comment) - 1
+  below = itertools.takewhile(lambda line: line[:column].isspace() and line[column] == "#", lines[end.line + 1 :])
+  return [comment.strip(), *(line[column + 1 :].strip() for line in below)]
