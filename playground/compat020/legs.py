@@ -53,7 +53,7 @@ def is_terminated_early(c: LeggedContext) -> jax.Array:
 
 def action_smoothness_l2_lagged(c: StepContext) -> jax.Array:
   """|a1 - a2|² + |a1 - 2 a2 + a|² (H1): the order of the actions is mixed up."""
-  last, before = c.last_action, c.action_before_last
+  last, before = c.last_act, c.action_before_last
   return jnp.square(last - before).sum() + jnp.square(last - 2 * before + c.action).sum()
 
 

@@ -135,33 +135,33 @@ class StepContext:
     return self.env.terminations.any(self)
 
   @property
-  def last_action(self) -> jax.Array:
-    """The action of the step before, shape [action_size]; 0 at the start of an episode."""
+  def last_act(self) -> jax.Array:
+    """The action of the step before, 0 at the start of an episode [action_size]."""
     return self.info["last_act"]
 
   @property
   def action_before_last(self) -> jax.Array:
-    """The action two steps before, shape [action_size]."""
+    """The action two steps before [action_size]."""
     return self.info["last_last_act"]
 
   @property
   def joint_pos(self) -> jax.Array:
-    """Positions of the robot's joints, rad, shape [joints]."""
+    """Joint positions, rad [joints]."""
     return self.data.qpos[self.robot.qpos]
 
   @property
   def joint_vel(self) -> jax.Array:
-    """Velocities of the robot's joints, rad/s, shape [joints]."""
+    """Joint velocities, rad/s [joints]."""
     return self.data.qvel[self.robot.qvel]
 
   @property
   def joint_pos_rel(self) -> jax.Array:
-    """Positions of the robot's joints relative to the default pose, rad, shape [joints]."""
+    """Joint positions relative to the default pose, rad [joints]."""
     return self.joint_pos - self.robot.default_pose
 
   @property
   def command(self) -> jax.Array:
-    """The command, shape [3]: forward m/s, left m/s, turn rad/s."""
+    """Velocity command: forward m/s, left m/s, turn rad/s [3]."""
     return self.carried("command")
 
   def carried(self, name: str) -> jax.Array:

@@ -170,22 +170,22 @@ class LeggedContext(StepContext):
 
   @functools.cached_property
   def contact(self) -> jax.Array:
-    """Which feet touch the floor, bool, shape [feet]."""
+    """Which feet touch the floor, bool [feet]."""
     return self.robot.contact(self.data)
 
   @functools.cached_property
   def feet_air_time(self) -> jax.Array:
-    """How long each foot has been in the air, this step included, s, shape [feet]."""
+    """How long each foot has been in the air, this step included, s [feet]."""
     return self.carried("feet_air_time") + self.dt
 
   @functools.cached_property
   def swing_peak(self) -> jax.Array:
-    """Highest z of each foot since it last touched, m, shape [feet]."""
+    """Highest z of each foot since it last touched, m [feet]."""
     return jnp.maximum(self.carried("swing_peak"), self.feet_height)
 
   @property
   def first_contact(self) -> jax.Array:
-    """Which feet have landed, bool, shape [feet]; one that touched in the step before but left since has, too."""
+    """Which feet have landed, bool [feet]: one that touched in the step before but left since has, too."""
     return (self.carried("feet_air_time") > 0) & (self.contact | self.carried("last_contact"))
 
   @property
@@ -195,30 +195,30 @@ class LeggedContext(StepContext):
 
   @property
   def phase(self) -> jax.Array:
-    """Phases of the feet in the gait, rad, shape [feet]."""
+    """Phases of the feet in the gait, rad [feet]."""
     return self.carried("phase")
 
   @property
   def gravity(self) -> jax.Array:
-    """Direction of gravity in the frame of the base site, shape [3]."""
+    """Direction of gravity in the base frame [3]."""
     return -self.data.site_xmat[self.robot.base_site][2]
 
   @property
   def base_height(self) -> jax.Array:
-    """World z of the base site, m."""
+    """World z of the base site, m [1]."""
     return self.data.site_xpos[self.robot.base_site, 2]
 
   @property
   def forward(self) -> jax.Array:
-    """The base site's forward axis in the world frame, shape [3]."""
+    """The base site's forward axis in the world frame [3]."""
     return self.data.site_xmat[self.robot.base_site][:, 0]
 
   @property
   def feet_height(self) -> jax.Array:
-    """World z of the foot sites, m, shape [feet]."""
+    """World z of the foot sites, m [feet]."""
     return self.data.site_xpos[self.robot.feet, 2]
 
   @property
   def feet_velocity(self) -> jax.Array:
-    """World velocities of the foot sites, m/s, shape [feet, 3]."""
+    """World velocities of the feet, m/s [feet, 3]."""
     return self.robot.foot_sensors(self.data, "foot_linvel")

@@ -148,7 +148,7 @@ class ObservationManager:
     return obs if len(obs) > 1 else obs[ACTOR], past
 
   def _read(self, term: Term, c: StepContext, key: jax.Array, drawn: dict[str, jax.Array]) -> jax.Array:
-    value, options = term(c), term.options
+    value, options = jnp.asarray(term(c), float).ravel(), term.options
     kind, size = next(iter(options.noise.items())) if options.noise else (None, 0.0)
     if kind == "same_as":
       value = value + drawn[str(size)]

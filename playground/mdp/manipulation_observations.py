@@ -42,11 +42,6 @@ def servo_error(c: ArmContext) -> jax.Array:
   return c.data.ctrl[actuators] - c.data.qpos[joints]
 
 
-def site_pos(c: ArmContext, site: str) -> jax.Array:
-  """Position of a site, world frame, m [3]."""
-  return c.site_pos(site)
-
-
 def site_axes(c: ArmContext, site: str, turn_noise: AtLeast0 = 0.0) -> jax.Array:
   """Orientation of a site: last two rows of its rotation matrix in the world frame [6].
 
@@ -56,11 +51,6 @@ def site_axes(c: ArmContext, site: str, turn_noise: AtLeast0 = 0.0) -> jax.Array
     turn_noise: rad, times `env.noise_level`: the largest turn about an axis in any direction.
   """
   return _turned(c, c.site_axes(site), turn_noise, site)
-
-
-def body_pos(c: ArmContext, body: str) -> jax.Array:
-  """Position of a body, world frame, m [3]."""
-  return c.body_pos(body)
 
 
 def body_axes(c: ArmContext, body: str, turn_noise: AtLeast0 = 0.0) -> jax.Array:
@@ -78,21 +68,6 @@ def gripper_to_object(c: ArmContext) -> jax.Array:
   return c.object_pos - c.gripper_pos
 
 
-def object_to_goal(c: ArmContext) -> jax.Array:
-  """From the object to the goal, world frame, m [3]."""
-  return c.to_goal
-
-
-def goal_axes_error(c: ArmContext) -> jax.Array:
-  """First two rows of the goal's rotation matrix minus those of the object, world frame [6]."""
-  return c.goal_axes_error
-
-
-def goal_pos(c: ArmContext) -> jax.Array:
-  """Position of the goal, world frame, m [3]."""
-  return c.goal_pos
-
-
 def goal_axes(c: ArmContext) -> jax.Array:
   """Orientation of the goal: last two rows of its rotation matrix in the world frame [6]."""
   return two_rows(c.data.mocap_quat[0])
@@ -100,7 +75,7 @@ def goal_axes(c: ArmContext) -> jax.Array:
 
 def goal_to_object(c: ArmContext) -> jax.Array:
   """From the goal to the object, world frame, m [3]."""
-  return -c.to_goal
+  return -c.object_to_goal
 
 
 def no_ik_solution(c: ArmContext) -> jax.Array:

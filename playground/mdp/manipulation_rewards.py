@@ -28,7 +28,7 @@ def object_goal_distance_tanh(c: ArmContext, std: Positive, turn_weight: Share =
 
   d = (1 - turn_weight) * distance from object to goal, m, + turn_weight * |first two rows of R_goal - R_object|.
   """
-  distance = (1 - turn_weight) * jnp.linalg.norm(c.to_goal)
+  distance = (1 - turn_weight) * jnp.linalg.norm(c.object_to_goal)
   if turn_weight:
     distance += turn_weight * jnp.linalg.norm(c.goal_axes_error)
   return (1 - jnp.tanh(distance / std)) * c.reached
@@ -36,7 +36,7 @@ def object_goal_distance_tanh(c: ArmContext, std: Positive, turn_weight: Share =
 
 def object_goal_distance_xy_tolerance(c: ArmContext, bound: AtLeast0, margin: AtLeast0, sigmoid: str) -> jax.Array:
   """Tolerance of the horizontal distance from object to goal, m."""
-  return tolerance(jnp.linalg.norm(c.to_goal[:2]), (0.0, bound), margin, sigmoid)
+  return tolerance(jnp.linalg.norm(c.object_to_goal[:2]), (0.0, bound), margin, sigmoid)
 
 
 def object_goal_angle_tolerance(c: ArmContext, bound: AtLeast0, margin: AtLeast0, sigmoid: str) -> jax.Array:
@@ -48,7 +48,7 @@ def gripper_behind_object_tolerance(
   c: ArmContext, behind: float, bound: AtLeast0, margin: AtLeast0, sigmoid: str
 ) -> jax.Array:
   """Tolerance of the gripper's distance, m, from a point `behind` m behind the object as seen from the goal."""
-  away = -c.to_goal
+  away = -c.object_to_goal
   place = c.object_pos + behind * normalize(away) * (jnp.linalg.norm(away) > 1e-3)
   return tolerance(jnp.linalg.norm(place - c.gripper_pos), (0.0, bound), margin, sigmoid)
 
@@ -126,7 +126,7 @@ def action_norm(c: StepContext) -> jax.Array:
 
 def action_rate_norm(c: StepContext) -> jax.Array:
   """|action - last action|."""
-  return jnp.linalg.norm(c.action - c.last_action)
+  return jnp.linalg.norm(c.action - c.last_act)
 
 
 def no_ik_solution(c: ArmContext) -> jax.Array:

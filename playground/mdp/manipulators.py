@@ -145,7 +145,7 @@ class ArmContext(StepContext):
   robot: ArmRobot
 
   def body_pos(self, body: str) -> jax.Array:
-    """Position of a body, m [3]."""
+    """Position of a body, world frame, m [3]."""
     return self.data.xpos[self.robot.find("body", body, "a term")]
 
   def body_axes(self, body: str) -> jax.Array:
@@ -153,7 +153,7 @@ class ArmContext(StepContext):
     return self.data.xmat[self.robot.find("body", body, "a term")]
 
   def site_pos(self, site: str) -> jax.Array:
-    """Position of a site, m [3]."""
+    """Position of a site, world frame, m [3]."""
     return self.data.site_xpos[self.robot.find("site", site, "a term")]
 
   def site_axes(self, site: str) -> jax.Array:
@@ -172,12 +172,12 @@ class ArmContext(StepContext):
 
   @property
   def goal_pos(self) -> jax.Array:
-    """Position of the goal, m [3]."""
+    """Position of the goal, world frame, m [3]."""
     return self.data.mocap_pos[0]
 
   @property
-  def to_goal(self) -> jax.Array:
-    """From the object to the goal, m [3]."""
+  def object_to_goal(self) -> jax.Array:
+    """From the object to the goal, world frame, m [3]."""
     return self.goal_pos - self.object_pos
 
   @property
@@ -187,7 +187,7 @@ class ArmContext(StepContext):
 
   @property
   def goal_axes_error(self) -> jax.Array:
-    """First two rows of the goal's axes minus those of the object's [6]."""
+    """First two rows of the goal's rotation matrix minus those of the object, world frame [6]."""
     return (quat_to_mat(self.data.mocap_quat[0]) - self.body_axes(self.env.object))[:2].ravel()
 
   @functools.cached_property

@@ -21,44 +21,14 @@ def gyro_yaw(c: LeggedContext) -> jax.Array:
   return c.sensor("gyro")[2:]
 
 
-def gravity(c: LeggedContext) -> jax.Array:
-  """Direction of gravity in the base frame [3]."""
-  return c.gravity
-
-
-def joint_pos_rel(c: StepContext) -> jax.Array:
-  """Joint positions relative to the default pose, rad [joints]."""
-  return c.joint_pos_rel
-
-
-def joint_pos(c: StepContext) -> jax.Array:
-  """Joint positions, rad [joints]."""
-  return c.joint_pos
-
-
 def target_error(c: StepContext) -> jax.Array:
   """Joint positions relative to their targets, rad [joints]."""
   return c.joint_pos - c.data.ctrl
 
 
-def joint_vel(c: StepContext) -> jax.Array:
-  """Joint velocities, rad/s [joints]."""
-  return c.joint_vel
-
-
 def linvel(c: LeggedContext) -> jax.Array:
   """Linear velocity of the base in its own frame, m/s [3]."""
   return c.sensor("linvel")
-
-
-def last_act(c: StepContext) -> jax.Array:
-  """The action before the one just applied [action_size]."""
-  return c.last_action
-
-
-def command(c: StepContext) -> jax.Array:
-  """Velocity command: forward m/s, left m/s, turn rad/s [3]."""
-  return c.command
 
 
 def accelerometer(c: LeggedContext) -> jax.Array:
@@ -74,11 +44,6 @@ def global_angvel(c: LeggedContext) -> jax.Array:
 def upvector(c: LeggedContext) -> jax.Array:
   """The base's upward axis in the world frame [3]: unlike `gravity`, it turns with the heading."""
   return c.sensor("upvector")
-
-
-def base_height(c: LeggedContext) -> jax.Array:
-  """World z of the base site, m [1]."""
-  return c.base_height[None]
 
 
 def root_height(c: LeggedContext) -> jax.Array:
@@ -106,24 +71,9 @@ def last_contact(c: LeggedContext) -> jax.Array:
   return c.carried("last_contact").astype(jnp.float32)
 
 
-def contact(c: LeggedContext) -> jax.Array:
-  """Which feet touch the floor, 0 or 1 [feet]."""
-  return c.contact.astype(jnp.float32)
-
-
-def feet_velocity(c: LeggedContext) -> jax.Array:
-  """World velocities of the feet, m/s [3 * feet]."""
-  return c.feet_velocity.ravel()
-
-
 def feet_pos(c: LeggedContext) -> jax.Array:
   """Positions of the feet in the base frame, m [3 * feet]."""
   return c.robot.foot_sensors(c.data, "foot_pos").ravel()
-
-
-def feet_air_time(c: LeggedContext) -> jax.Array:
-  """How long each foot has been in the air, s [feet]."""
-  return c.feet_air_time
 
 
 def phase(c: LeggedContext) -> jax.Array:

@@ -43,12 +43,12 @@ def action_l2(c: StepContext) -> jax.Array:
 
 def action_rate_l2(c: StepContext) -> jax.Array:
   """|action - last action|²."""
-  return jnp.square(c.action - c.last_action).sum()
+  return jnp.square(c.action - c.last_act).sum()
 
 
 def action_smoothness_l2(c: StepContext) -> jax.Array:
   """|a - a1|² + |a - 2 a1 + a2|², a1 and a2 the last action and the one before: first and second difference."""
-  second = c.action - 2 * c.last_action + c.action_before_last
+  second = c.action - 2 * c.last_act + c.action_before_last
   return action_rate_l2(c) + jnp.square(second).sum()
 
 

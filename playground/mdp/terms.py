@@ -11,7 +11,8 @@ rewards:
 ```
 
 Every public function or class of the modules in `MODULES` is registered under its name (a class under its name in
-snake_case). Its keyword arguments are the term's `params`, its docstring is the term's help.
+snake_case). Its keyword arguments are the term's `params`, its docstring is the term's help. An observation term may
+also name what a step context has (`CONTEXTS`): `gravity`, or `site_pos` with `params: {site: gripper}`.
 """
 
 import functools
@@ -22,6 +23,8 @@ import types
 import typing
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
+
+import jax
 
 from playground.config.moved import renamed_function
 from playground.config.text import format_value
@@ -37,6 +40,12 @@ MODULES = {
   "terminations": ("playground.mdp.terminations", "playground.mdp.manipulation_terminations"),
   "commands": ("playground.mdp.commands",),
   "events": ("playground.mdp.events", "playground.mdp.manipulation_events"),
+}
+# Classes whose properties and methods that return an array are registered observation terms, too.
+CONTEXTS = {
+  "playground.mdp.context": ("StepContext",),
+  "playground.mdp.legged": ("LeggedContext",),
+  "playground.mdp.manipulators": ("ArmContext", "HandContext"),
 }
 # How many leading arguments of a function are no parameters: the context; key, task and state of reset events.
 _LEADING = {"rewards": 1, "observations": 1, "terminations": 1, "commands": 0, "events": 3}
@@ -78,7 +87,27 @@ def registered(kind: str) -> dict[str, Callable[..., Any]]:
     for key, value in vars(module).items():
       if not key.startswith("_") and callable(value) and getattr(value, "__module__", None) == name:
         found[_snake_case(key) if isinstance(value, type) else key] = value
+  return _of_contexts() | found if kind == "observations" else found
+
+
+def _of_contexts() -> dict[str, Callable[..., Any]]:
+  """Functions that read the properties and methods of `CONTEXTS`, as a subclass may define them, by name."""
+  found: dict[str, Callable[..., Any]] = {}
+  for module, classes in CONTEXTS.items():
+    for member in (m for cls in classes for m in vars(getattr(importlib.import_module(module), cls)).values()):
+      getter = getattr(member, "fget", None) or getattr(member, "func", member)
+      if inspect.isfunction(getter) and inspect.signature(getter).return_annotation is jax.Array:
+        found[getter.__name__] = _reader(getter, is_method=getter is member)
   return found
+
+
+def _reader(getter: Callable[..., Any], is_method: bool) -> Callable[..., Any]:
+  @functools.wraps(getter)
+  def read(c: Any, **params: Any) -> Any:
+    value = getattr(c, getter.__name__)
+    return value(**params) if is_method else value
+
+  return read
 
 
 def bind(kind: str, section: Mapping[str, Any] | None) -> list[Term]:

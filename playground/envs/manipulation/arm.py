@@ -60,7 +60,7 @@ class TabletopTask(Task):
 
   def goal_distance(self, c: ArmContext) -> jax.Array:
     """Returns how far the object is from the goal as success counts it, m."""
-    return jnp.linalg.norm(c.to_goal)
+    return jnp.linalg.norm(c.object_to_goal)
 
   def at_goal(self, c: ArmContext) -> jax.Array:
     """Returns whether the object is where it should be, bool."""
@@ -68,7 +68,7 @@ class TabletopTask(Task):
     return near if angle is None else near & (c.goal_angle < angle)
 
   def measure(self, c: ArmContext) -> dict[str, jax.Array]:
-    return {"success": c.at_goal.astype(jnp.float32), "position_error_cm": 100 * jnp.linalg.norm(c.to_goal)}
+    return {"success": c.at_goal.astype(jnp.float32), "position_error_cm": 100 * jnp.linalg.norm(c.object_to_goal)}
 
   def total(self, rewards: Mapping[str, jax.Array]) -> jax.Array:
     return super().total(rewards) / self.dt

@@ -119,4 +119,4 @@ class PickCubeCartesianVision(PickCubeCartesian):
   """Lifts a cube to the goal's height (paper, section IV-C and appendix C.6); `env.vision` says what is seen."""
 
   def goal_distance(self, c: ArmContext) -> jax.Array:
-    return jnp.abs(c.to_goal[2])
+    return jnp.abs(c.object_to_goal[2])

@@ -139,7 +139,7 @@ class PushCube(ArmTask):
     reached = self.goal_reached(c)
     return super().measure(c) | {
       "success": reached.astype(jnp.float32),
-      "success_1": (jnp.linalg.norm(c.to_goal) < self.config.success_distance).astype(jnp.float32),
+      "success_1": (jnp.linalg.norm(c.object_to_goal) < self.config.success_distance).astype(jnp.float32),
       "success_2": (c.goal_angle < self.config.success_angle).astype(jnp.float32),
       "goals_reached": c.info["goals_reached"] + reached,
       "curriculum_level": self._next_level(c).astype(jnp.float32),
