@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -37,3 +38,15 @@ def bounded_memory(allowed: list[float]) -> Iterator[None]:
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)  # the heap's free pages go back
     allowed[0] = max(EMPTY, resident_bytes()) + GROWTH  # above what stays, else every test would empty it
+
+
+@pytest.fixture(autouse=True)
+def logging_as_before() -> Iterator[None]:
+  """Hydra's `--info` and hydra.verbose=true give the root logger a level, and a handler on what pytest closes."""
+  root = logging.getLogger()
+  level, handlers = root.level, list(root.handlers)
+  yield
+  root.setLevel(level)
+  for handler in root.handlers[:]:
+    if handler not in handlers:
+      root.removeHandler(handler)
