@@ -13,7 +13,7 @@ FAST_COMPILE := XLA_FLAGS="--xla_backend_optimization_level=0 --xla_llvm_disable
   --xla_cpu_use_fusion_emitters=false $$XLA_FLAGS"
 
 .DEFAULT_GOAL := setup
-.PHONY: setup run test test-slow test-rsl-rl test-slurm lint docs wheel
+.PHONY: setup run test test-slow test-rsl-rl test-slurm lint catalog docs wheel
 
 setup: $(INSTALLED)
 
@@ -49,6 +49,10 @@ lint: setup
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+
+# What `playground list` shows; after a change of a task, a tuned set or a reference result.
+catalog: setup
+	JAX_PLATFORMS=cpu $(BIN)/python -m playground.catalog
 
 # The site is site/index.html. Strict: a link or a reference that leads nowhere is an error (mkdocs.yml).
 docs: setup

@@ -277,8 +277,12 @@ def test_composing_needs_no_jax():
 
 ERRORS = {
   "env=Go1Joystic": ["env=Go1Joystic does not exist", "that `playground list` shows", "'Go1JoystickFlatTerrain'?"],
-  "experiment=quickstar": ["experiment=quickstar", "that `playground-run --help` shows", "Did you mean 'quickstart'?"],
-  "hardware=tpu": ["hardware=tpu does not exist: choose from the ", "`playground-run --help` shows"],
+  "experiment=quickstar": [
+    "experiment=quickstar",
+    "that `playground keys experiment` shows",
+    "Did you mean 'quickstart'?",
+  ],
+  "hardware=tpu": ["hardware=tpu does not exist: choose from the ", "`playground keys hardware` shows"],
   "env=go1_joystick": ["Did you mean experiment=go1_joystick?"],
   "experiment=CartpoleBalance": ["Did you mean env=CartpoleBalance?"],
   "robot=spotty_the_dog_123": ["These begin alike: spot."],

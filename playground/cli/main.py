@@ -87,7 +87,11 @@ def _parser() -> argparse.ArgumentParser:
   for name, (_, what) in _PROGRAMS.items():
     commands.add_parser(name, help=what)
 
-  add("list", _list, "List tasks.").add_argument("word", nargs="?", help="only tasks whose name contains it")
+  tasks = add("list", _list, "List tasks: sizes, budget, and how far the reference run got.")
+  tasks.add_argument("word", nargs="?", help="only tasks whose name contains it")
+  for name in ("suite", "robot", "status", "backend"):
+    tasks.add_argument(f"--{name}", metavar="NAME", help=f"only tasks of this {name}")
+  tasks.add_argument("--json", action="store_true", help="print JSON instead of a table")
   show = add("show", _show, "Show what a task observes, does, is paid for and is trained with.")
   show.add_argument("task", help="a task, or randomization=<name> for what that draws")
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
@@ -111,6 +115,7 @@ def _parser() -> argparse.ArgumentParser:
   export.add_argument("--out", metavar="FOLDER", help="folder to write to (default: <run>/export)")
   play = add("play", _play, "Run a policy in plain C MuJoCo: measure it, film it or watch it.")
   play.add_argument("policy", help=f"{_RUN}, or a policy.onnx beside its policy.yaml")
+  play.add_argument("--agent", choices=("zero", "random"), help="act so on a task instead of with a policy")
   play.add_argument("--episodes", type=int, default=10, help="episodes to measure (default: %(default)s)")
   play.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
   shown = play.add_mutually_exclusive_group()
@@ -120,6 +125,21 @@ def _parser() -> argparse.ArgumentParser:
   play.add_argument("--camera", metavar="NAME", help=_CAMERA)
   play.add_argument("--host", default="127.0.0.1", help="address that --web listens on (default: %(default)s)")
   play.add_argument("--port", type=int, default=8080, help="port of --web (default: %(default)s)")
+  view = add("view", _view, "Look at a task without a policy, in the browser.")
+  view.add_argument("task", help="a task of `playground list`")
+  view.add_argument("overrides", nargs="*", help="as for playground-run, such as terrain=stairs")
+  view.add_argument(
+    "--agent", choices=("zero", "random"), default="zero", help="what the actions are (default: %(default)s)"
+  )
+  view.add_argument("--randomize", action="store_true", help="draw the model by the task's startup events")
+  view.add_argument("--no-events", action="store_true", help="switch pushes and other interval events off")
+  view.add_argument("--seed", type=int, default=0, help="seed of episodes and model (default: %(default)s)")
+  shown = view.add_mutually_exclusive_group()
+  shown.add_argument("--video", metavar="FILE", help="render an episode to this .mp4 instead")
+  shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
+  view.add_argument("--camera", metavar="NAME", help=_CAMERA)
+  view.add_argument("--host", default="127.0.0.1", help="address of the page (default: %(default)s)")
+  view.add_argument("--port", type=int, default=8080, help="port of the page (default: %(default)s)")
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
   pretrained.add_argument("--add", metavar="RUN", help="measure a run's policy in C MuJoCo and put it into the package")
   sweep = add("sweep", _sweep, "Look at a sweep, gather its result, or do what is missing of it.")
@@ -138,7 +158,7 @@ def _parser() -> argparse.ArgumentParser:
   tune.add_argument("--steps", type=int, default=500, help="policy steps in each environment (default: %(default)s)")
   replay = add("replay", _replay, "Replay the step that was not finite.")
   replay.add_argument("dump", help="a run's nan_dump/step_*.npz")
-  for builds_tasks in (show, keys, evaluate, export, play, sweep, tune, replay):
+  for builds_tasks in (show, keys, evaluate, export, play, view, sweep, tune, replay):
     builds_tasks.add_argument(
       "--trust", action="append", metavar="PACKAGE", help="let the configuration name task classes of this package, too"
     )
@@ -146,12 +166,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(args: argparse.Namespace) -> int:
+  from playground.cli.list_tasks import FILTERS, list_tasks
+
   found = registry.names(args.word)
   if not found:
     near = nearest(args.word, registry.names())
     raise UnknownNameError(f"No task's name contains {args.word!r}: `playground list` shows all.{near}")
-  print("\n".join(found))
-  return 0
+  return list_tasks(found, {name: getattr(args, name) for name in FILTERS}, args.json)
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -182,14 +203,38 @@ def _export(args: argparse.Namespace) -> int:
 def _play(args: argparse.Namespace) -> int:
   from playground.deploy.play import play
 
+  if args.agent and args.policy not in registry.names():
+    near = nearest(args.policy, registry.names())
+    raise UnknownNameError(f"--agent={args.agent} acts on a task, and {args.policy} is none.{near}")
   return play(
-    working_copy(args.policy, registry.names()),
+    args.policy if args.agent else working_copy(args.policy, registry.names()),
+    agent=args.agent,
     episodes=args.episodes,
     seed=args.seed,
     video=args.video,
     camera=args.camera,
     viewer=args.viewer,
     web=args.web,
+    host=args.host,
+    port=args.port,
+  )
+
+
+def _view(args: argparse.Namespace) -> int:
+  from playground.deploy.play import play
+
+  return play(
+    args.task,
+    agent=args.agent,
+    overrides=args.overrides,
+    randomize=args.randomize,
+    interval_events=not args.no_events,
+    episodes=1,
+    seed=args.seed,
+    video=args.video,
+    camera=args.camera,
+    viewer=args.viewer,
+    web=not (args.video or args.viewer),
     host=args.host,
     port=args.port,
   )

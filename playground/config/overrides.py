@@ -137,7 +137,7 @@ def _check_option(group: str, option: Any, roots: Sequence[Path]) -> None:
   if option in known:
     return
   shown = listed_options(group, roots)
-  command = "playground list" if group == "env" else "playground-run --help"
+  command = "playground list" if group == "env" else f"playground keys {group}"
   allowed = ", ".join(shown) if len(shown) <= 12 else f"the {len(shown)} that `{command}` shows"
   elsewhere = [f"{other}={option}" for other in ("experiment", "env", "robot") if option in options(other, roots)]
   near = f" Did you mean {elsewhere[0]}?" if elsewhere else nearest(str(option), shown)

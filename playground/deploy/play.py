@@ -1,7 +1,7 @@
 """`playground play <run|policy.onnx>`: the exported policy in plain C MuJoCo, measured, filmed or watched."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,8 @@ from playground import config as configs
 from playground import registry
 from playground.config.text import first_line
 from playground.deploy.menu import Menu
-from playground.deploy.policy import ExportedPolicy
+from playground.deploy.policy import ActingPolicy, ExportedPolicy
+from playground.deploy.scripted import ScriptedPolicy, build_task
 from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
@@ -33,6 +34,10 @@ _BACKENDS = {"jax": "MJX ", "warp": "MJX-Warp "}  # by the manifest's `impl`; a 
 def play(
   path: str,
   *,
+  agent: str | None = None,
+  overrides: Sequence[str] = (),
+  randomize: bool = False,
+  interval_events: bool = True,
   episodes: int = 10,
   seed: int = 0,
   video: str | None = None,
@@ -46,7 +51,12 @@ def play(
   """Runs a policy, in ONNX Runtime, in C MuJoCo: at its rate, with its noise, pushes and delays, the model as it is.
 
   Args:
-    path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it.
+    path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it; with `agent` a
+      task.
+    agent: zero or random actions in place of a policy; None is the policy of `path`.
+    overrides: with `agent`: as for playground-run.
+    randomize: with `agent`: whether the task's startup events change the model once.
+    interval_events: with `agent`: whether pushes and other interval events act.
     episodes: how many to measure.
     seed: of the episodes.
     video: where to render the first episode to (.mp4).
@@ -79,7 +89,11 @@ def play(
     from playground.deploy.web.gate import need_port
 
     need_port(host, port)
-  opened = open_policy(path)
+  if agent is None:
+    opened = open_policy(path)
+  else:
+    env = build_task(path, overrides, seed, randomize=randomize, interval_events=interval_events)
+    opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
   exported, env = opened.exported, opened.env
   need_camera(env.mj_model, camera, "--camera")
   if viewer:
@@ -95,15 +109,17 @@ def play(
     following = None if given.parent.name == "checkpoints" else LATEST
     watch(Session(env, exported, seed, menu, following), host, port, console)
     return 0
-  need_folder(opened.folder, str(opened.folder))
+  if opened.folder is not None:
+    need_folder(opened.folder, str(opened.folder))
   evaluate = make_evaluator(env, exported.act, episodes, make_mesh(1), 1 if film else 0)
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
   origin = exported.contract["origin"]
   console.print(_table(exported.contract, episodes, scores))
-  out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}.json"
-  write_json(out, {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "scores": scores, "origin": origin})
-  console.print(f"written to {out}", soft_wrap=True)
+  if opened.folder is not None:
+    out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}.json"
+    write_json(out, {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "scores": scores, "origin": origin})
+    console.print(f"written to {out}", soft_wrap=True)
   if film:
     render_video(
       env.mj_model,
@@ -121,15 +137,15 @@ class Opened:
   """A policy to play.
 
   Attributes:
-    exported: the policy.
+    exported: the policy, or a script.
     env: its task on C MuJoCo.
-    folder: where results go.
+    folder: where results go; None keeps them nowhere.
     trained: the checkpoint, if it came from a run.
   """
 
-  exported: ExportedPolicy
+  exported: ActingPolicy
   env: Env
-  folder: Path
+  folder: Path | None = None
   trained: LoadedPolicy | None = None
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from playground.deploy.policy import ExportedPolicy
+from playground.deploy.policy import ActingPolicy
 from playground.envs.base import Env, State
 
 STEP = 0.1  # m/s and rad/s of the command, for each press of a key
@@ -32,7 +32,7 @@ class Player:
     term_sums: the same of each weighted term of the reward, by name.
   """
 
-  def __init__(self, env: Env, exported: ExportedPolicy, seed: int = 0):
+  def __init__(self, env: Env, exported: ActingPolicy, seed: int = 0):
     """Starts an episode."""
     self.env = env
     self.exported = exported

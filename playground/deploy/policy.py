@@ -4,7 +4,7 @@ import hashlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -14,6 +14,20 @@ from playground.deploy.contract import FORMAT, check_contract
 from playground.envs.base import Observation
 from playground.errors import CheckpointError
 from playground.extras import need
+
+
+class ActingPolicy(Protocol):
+  """What acts in a player or an evaluation: an exported policy, or a script."""
+
+  contract: Mapping[str, Any]
+
+  def actions(self, obs: Any) -> np.ndarray:
+    """Actions in [-1, 1], [..., action_size], for a task's observations with any leading axes."""
+    ...
+
+  def act(self, policy: Any, obs: Observation, key: jax.Array) -> jax.Array:
+    """The same from within jitted code, as evaluations call a policy."""
+    ...
 
 
 class ExportedPolicy:

@@ -11,7 +11,7 @@ import numpy as np
 from playground.config import config_dict
 from playground.deploy.menu import Menu
 from playground.deploy.player import Player
-from playground.deploy.policy import ExportedPolicy
+from playground.deploy.policy import ActingPolicy
 from playground.deploy.trained import export_policy, load_on_c_physics
 from playground.envs.base import Env
 from playground.learning.checkpoints import BEST
@@ -35,7 +35,7 @@ class Session:
   """
 
   def __init__(
-    self, env: Env, exported: ExportedPolicy, seed: int, menu: Menu | None = None, following: str | None = LATEST
+    self, env: Env, exported: ActingPolicy, seed: int, menu: Menu | None = None, following: str | None = LATEST
   ):
     """Starts an episode of a policy; `menu` holds the checkpoint that it is from, if a run is at hand."""
     self._seed = seed

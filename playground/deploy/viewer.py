@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from playground.deploy.player import STEP, Player
-from playground.deploy.policy import ExportedPolicy
+from playground.deploy.policy import ActingPolicy
 from playground.envs.base import Env
 from playground.errors import HardwareError
 from playground.rendering.video import follow
@@ -50,7 +50,7 @@ def _opens_a_window() -> bool:
       glfw.terminate()
 
 
-def view(env: Env, exported: ExportedPolicy, seed: int, console: Console) -> None:
+def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
   """Shows a policy in real time until its window is closed, or ctrl+c."""
   import mujoco.viewer
 

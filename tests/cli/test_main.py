@@ -1,5 +1,6 @@
 """`playground`: list, show, and what the other commands hand over."""
 
+import json
 import sys
 import types
 from subprocess import run
@@ -34,10 +35,15 @@ def _stub(monkeypatch: pytest.MonkeyPatch, module: str, name: str, result: Any) 
 
 def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
   assert command("list") == 0
-  names = capsys.readouterr().out.split()
-  assert {"CartpoleBalance", "Go1JoystickFlatTerrain"} <= set(names)
-  assert command("list", "go1") == 0
-  assert capsys.readouterr().out.split() == [name for name in names if "Go1" in name]
+  lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+  assert lines[0] == "task suite robot observation action backend budget status return experiment"
+  start = "CartpoleBalance dm_control state 5 1 jax 60 M solved 999.3 cartpole_balance"
+  assert start in lines and lines[-1].startswith(f"{len(lines) - 2} tasks.")
+  assert command("list", "go1", "--suite", "locomotion", "--backend", "jax", "--json") == 0
+  rows = json.loads(capsys.readouterr().out)
+  assert all("Go1" in row["task"] and row["robot"] == "go1" for row in rows) and len(rows) >= 4
+  assert command("list", "--suite", "locomotoin") == 2
+  assert "--suite=locomotoin: choose from" in capsys.readouterr().err
   assert command("list", "cartpool") == 2
   assert "error: No task's name contains 'cartpool'" in capsys.readouterr().err
 

@@ -1,0 +1,69 @@
+"""`playground list`: a table of tasks, filtered, or JSON. Imports no JAX."""
+
+import dataclasses
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from playground.catalog import Entry, entries
+from playground.errors import UnknownNameError, nearest
+
+FILTERS = ("suite", "robot", "status", "backend")
+
+
+def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json: bool) -> int:
+  """Prints the tasks of these names that match.
+
+  Args:
+    names: tasks to list; one of another package has only its name.
+    filters: by name of `FILTERS`, the value that a task must have; None takes any.
+    as_json: whether to print JSON instead of a table.
+
+  Returns:
+    The exit code, 0.
+
+  Raises:
+    UnknownNameError: a value that no task has.
+  """
+  known = entries()
+  wanted = {name: value for name, value in filters.items() if value is not None}
+  for name, value in wanted.items():
+    values = sorted({getattr(entry, name) for entry in known.values()} - {""})
+    if value not in values:
+      raise UnknownNameError(f"--{name}={value}: choose from {', '.join(values)}.{nearest(value, values)}")
+  rows = [_row(name, known.get(name)) for name in names]
+  rows = [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
+  if as_json:
+    print(json.dumps(rows, indent=1))
+    return 0
+  console = Console()
+  if not console.is_terminal:  # one line a task, whatever its length
+    console = Console(width=200)
+  console.print(_table(rows))
+  console.print(f"{len(rows)} tasks. Train one with playground train experiment=<experiment>.", soft_wrap=True)
+  return 0
+
+
+def _row(name: str, entry: Entry | None) -> dict[str, Any]:
+  return dataclasses.asdict(entry) if entry else {"task": name}
+
+
+def _table(rows: Iterable[Mapping[str, Any]]) -> Table:
+  table = Table(box=None, padding=(0, 2, 0, 0))
+  table.add_column("task", style="cyan", no_wrap=True)
+  for name in ("suite", "robot", "observation"):
+    table.add_column(name, overflow="fold")
+  for name in ("action", "backend", "budget", "status", "return", "experiment"):
+    table.add_column(name, overflow="fold", justify="right" if name in ("action", "budget", "return") else "left")
+  for row in rows:
+    score = row.get("reference_return")
+    cells = {
+      "budget": f"{row['budget'] / 1e6:g} M" if "budget" in row else "",
+      "return": "" if score is None else f"{score:.4g}",
+    }
+    table.add_row(*(Text(str(cells.get(column.header, row.get(str(column.header), "")))) for column in table.columns))
+  return table

@@ -1,0 +1,46 @@
+"""Zero and random actions on a task: `playground play --agent` and `playground view`."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from playground.cli.main import main
+from playground.deploy.scripted import ScriptedPolicy, build_task
+from playground.deploy.session import Session
+from tests.command import Command, caller
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Command:
+  return caller(monkeypatch, "playground", main)
+
+
+def test_actions_of_a_batch() -> None:
+  env = build_task("CartpoleBalance", [], 0)
+  zero, random = (ScriptedPolicy(agent, "CartpoleBalance", env, 0) for agent in ("zero", "random"))
+  obs = np.zeros((3, 2, 5))
+  assert zero.actions(obs).shape == (3, 2, 1) and not zero.actions(obs).any()
+  assert 0 < np.abs(random.actions(obs)).max() <= 1 and (random.actions(obs) != random.actions(obs)).any()
+
+
+def test_play_measures_a_task(command: Command, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any):
+  monkeypatch.chdir(tmp_path)
+  assert command("play", "CartpoleBalance", "--agent", "zero", "--episodes", "1") == 0
+  assert "CartpoleBalance, 0 steps trained" in capsys.readouterr().out
+  assert list(tmp_path.iterdir()) == []
+  assert command("play", "CartpoleBalanc", "--agent", "zero") == 2
+  assert "acts on a task, and CartpoleBalanc is none. Did you mean 'CartpoleBalance'?" in capsys.readouterr().err
+
+
+def test_view_shows_it_in_the_browser(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+  sessions: list[Session] = []
+  monkeypatch.setattr("playground.deploy.web.server.watch", lambda session, *_: sessions.append(session))
+  assert command("view", "Go1JoystickFlatTerrain", "terrain=rough", "--no-events", "--port", "0") == 0
+  (session,) = sessions
+  assert session.terrain == "rough" and session.acting == "0" and session.choices() == {}
+  assert session.player.exported.contract["command"]["max"] == [1.5, 0.8, 1.2]
+  assert not session.player.env.config.events.push.enabled
+  drawn = build_task("Go1JoystickFlatTerrain", ["terrain=rough"], 1, randomize=True)
+  assert (session.player.env.mj_model.body_mass != drawn.mj_model.body_mass).any()
