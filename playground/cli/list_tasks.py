@@ -65,5 +65,6 @@ def _table(rows: Iterable[Mapping[str, Any]]) -> Table:
       "budget": f"{row['budget'] / 1e6:g} M" if "budget" in row else "",
       "return": "" if score is None else f"{score:.4g}",
     }
-    table.add_row(*(Text(str(cells.get(column.header, row.get(str(column.header), "")))) for column in table.columns))
+    shown = {**row, **cells}
+    table.add_row(*(Text(str(shown.get(str(column.header), ""))) for column in table.columns))
   return table

@@ -100,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
   keys = add("keys", _keys, "Explain a section's or group's keys: value, allowed values and meaning.")
   keys.add_argument("prefix", help="such as agent, env.rewards, hardware.platform or tracking")
   keys.add_argument("overrides", nargs="*", help="as for playground-run, such as env=Go1Getup or agent=sac")
+  completion = add("completion", _completion, "Print a script that completes our commands in a shell.")
+  completion.add_argument("shell", choices=("bash", "zsh", "fish", "query"), help="eval it in the shell's start file")
+  completion.add_argument("line", nargs="?", default="", help=argparse.SUPPRESS)  # of query, which the scripts call
   add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
   evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
   evaluate.add_argument("run", help=_RUN)
@@ -266,6 +269,13 @@ def _replay(args: argparse.Namespace) -> int:
   from playground.cli.replay import replay
 
   return replay(args.dump)
+
+
+def _completion(args: argparse.Namespace) -> int:
+  from playground.cli.completion import candidates, script
+
+  print("\n".join(candidates(args.line, _parser())) if args.shell == "query" else script(args.shell), end="")
+  return 0
 
 
 def _keys(args: argparse.Namespace) -> int:
