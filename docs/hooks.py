@@ -13,15 +13,15 @@ from mkdocs.structure.files import File, Files
 from playground.config.comments import flow, keys_and_comments
 from playground.config.definitions import RunSettings, defined
 from playground.config.files import task_experiments
+from playground.config.sweep_options import SweepConfig
 from playground.envs.options import TermsConfig
 from playground.settings import Setting, settings
-from playground.sweep.options import SweepConfig
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "docs/first_policy.ipynb"
 # Pages of the API's reference: modules, and packages all of whose modules are meant.
 API = {
-  "Tasks": ["registry", "envs.task", "envs.base", "envs.physics", "envs.wrappers", "envs.vision"],
+  "Tasks": ["registry", "envs.task", "envs.base", "physics.backend", "envs.wrappers", "rendering.vision"],
   "Parts of tasks": ["mdp"],
   "Randomisation": ["randomization"],
   "Scenes": ["robots.scene", "robots.terrain", "robots.tabletop", "robots.in_hand"],

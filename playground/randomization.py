@@ -33,11 +33,11 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src.math import quat_mul, rotate
 
-from playground.config.text import format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.events import ModelField
 from playground.mdp.options import MODEL_FIELD, is_model_field
 from playground.mdp.terms import bind_one
+from playground.text import format_value
 
 # Whose rows a field has, by the prefix of its name: object type and number of objects.
 _OBJECTS = {

@@ -84,7 +84,7 @@ def build(env_config: ConfigDict) -> "Env":
   vision: Any = env_config.get("vision")
   if vision is None or not vision.enable:
     return env
-  from playground.envs.vision import Vision
+  from playground.rendering.vision import Vision
 
   return cast("Env", Vision(env))  # it is one in all but class
 

@@ -11,8 +11,9 @@ import importlib.metadata
 from collections.abc import Iterable
 from typing import Any
 
-from playground.config.files import ENTRY_POINTS
 from playground.errors import ConfigError, nearest
+
+ENTRY_POINTS = "playground.tasks"
 
 _named: set[str] = set()  # by the user of this process
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from playground.envs.base import Env, State
-from playground.envs.physics import STATE_FIELDS, PhysicsData, mjx
 from playground.envs.wrappers import MAX_VELOCITY
 from playground.hardware.mesh import make_mesh
 from playground.learning.hyperparameters import (
@@ -23,6 +22,7 @@ from playground.learning.loop import Metrics
 from playground.learning.networks import NetworkConfig, SoftNetworkConfig
 from playground.learning.rollout import Step
 from playground.learning.trainer import Trainer
+from playground.physics.backend import STATE_FIELDS, PhysicsData, mjx
 
 
 class NoPhysics:

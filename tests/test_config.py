@@ -18,9 +18,9 @@ from omegaconf import OmegaConf
 from playground import config
 from playground.config import compose, from_saved
 from playground.config.files import experiment_name
+from playground.config.run_options import ProfileConfig, TrackingConfig, VideoConfig, WandbConfig
 from playground.errors import ConfigError, UnknownNameError
 from playground.learning.hyperparameters import config_class
-from playground.runs.options import ProfileConfig, TrackingConfig, VideoConfig, WandbConfig
 
 TUNED = ["experiment=cartpole_balance"]
 

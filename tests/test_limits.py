@@ -12,12 +12,12 @@ from playground.config import compose, compose_settings, config_roots, override_
 from playground.config.definitions import RunSettings, defined, definition
 from playground.config.limits import _OF_TERMS as OF_TERMS
 from playground.config.limits import limit_of
+from playground.config.sweep_options import SweepConfig
 from playground.envs.options import VisionConfig
 from playground.errors import ConfigError
 from playground.limits import MOST, SEED, Limit, count, positive, span
 from playground.mdp.terms import MODULES, registered
 from playground.settings import defaults, settings
-from playground.sweep.options import SweepConfig
 
 # Folders of configs/ whose files define keys, and the section that they are of; the other keys are classes'.
 SECTIONS = {"env": "env", "robot": "env.robot"}

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from playground import pretrained, registry
+from playground.cli.play import play
 from playground.config import compose
-from playground.deploy.play import play
 from playground.errors import CheckpointError, ConfigError, UnknownNameError
 from playground.pretrained import POLICIES, cards, check_task, locate, working_copy
 from playground.runs.restore_plan import weights_of

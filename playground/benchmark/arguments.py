@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import yaml
 
-from playground.config.text import format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.text import format_value
 
 T = TypeVar("T")
 GROUPS = ("hardware", "debug", "randomization", "robot", "terrain")  # overrides without a dot that may be given, too

@@ -12,8 +12,8 @@ from playground.benchmark.peer import PEERS, check_peer
 from playground.benchmark.schema import Table
 from playground.config import compose
 from playground.errors import ConfigError
+from playground.files import need_folder
 from playground.paper import tasks_of
-from playground.runs.files import need_folder
 
 RESULTS = Path("results/benchmarks")
 

@@ -14,12 +14,12 @@ from typing import Any
 from playground.benchmark.arguments import option
 from playground.benchmark.schema import Table, commit_of
 from playground.benchmark.worker import ROW
+from playground.config.sweep_options import LocalConfig
 from playground.errors import HardwareError
 from playground.interpreter import PYTHON
 from playground.runs.provenance import git_state
 from playground.sweep.folder import FAILED, Job, JobState, SweepDirectory
 from playground.sweep.local import ALL, LocalLauncher, Slot
-from playground.sweep.options import LocalConfig
 from playground.sweep.runner import Runner
 from playground.sweep.view import View
 

@@ -32,7 +32,7 @@ class Facts(dict[str, Any]):
 def main() -> None:
   """Runs a function of `measures`; an error that the user can act on is the reason of the job, others a traceback."""
   from playground.errors import PlaygroundError
-  from playground.runs.files import write_json
+  from playground.files import write_json
 
   job = json.loads(sys.argv[1])
   arguments, folder, facts = job["arguments"], Path(job["folder"]), Facts()
@@ -57,10 +57,11 @@ def main() -> None:
 def _stand_by(task: str, agent: str, overrides: Sequence[str], **_: Any) -> None:
   """Starts the process that compiles Warp's kernels, as `playground-run` does."""
   from playground.config import compose
-  from playground.envs.warp_kernels import stand_by
+  from playground.envs.options import impl_on_gpu
+  from playground.physics.warp_kernels import stand_by
 
   config = compose([f"env={task}", f"agent={agent}", *overrides])
-  stand_by(config.env, config.hardware.platform)
+  stand_by(impl_on_gpu(config.env), config.hardware.platform)
 
 
 if __name__ == "__main__":

@@ -7,12 +7,12 @@ from rich.console import Console
 from rich.table import Table
 
 from playground.errors import ConfigError
+from playground.files import need_folder, write_json
 from playground.learning.evaluation import make_evaluator
 from playground.paper import paper_table
 from playground.rendering.video import need_camera, need_place, render_video
 from playground.rendering.visuals import drawn_model
 from playground.runs.callbacks import episodes_of
-from playground.runs.files import need_folder, write_json
 from playground.runs.loaded_policy import load_policy
 from playground.runs.train import model_sampler
 

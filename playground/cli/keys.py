@@ -13,10 +13,10 @@ from playground.config.comments import keys_and_comments
 from playground.config.definitions import chosen_names, definition
 from playground.config.files import find_file, groups, lineage, listed_options
 from playground.config.schema import check_key
-from playground.config.text import join
 from playground.errors import UnknownNameError
 from playground.mdp.options import OPTIONS
 from playground.settings import Setting
+from playground.text import join
 
 _WIDE = 160  # columns, where no terminal says how many there are
 _SECTIONS = {"robot": "env.robot", "randomization": "env.events"}  # of groups that set a part of env

@@ -204,7 +204,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _play(args: argparse.Namespace) -> int:
-  from playground.deploy.play import play
+  from playground.cli.play import play
 
   if args.agent and args.policy not in registry.names():
     near = nearest(args.policy, registry.names())
@@ -224,7 +224,7 @@ def _play(args: argparse.Namespace) -> int:
 
 
 def _view(args: argparse.Namespace) -> int:
-  from playground.deploy.play import play
+  from playground.cli.play import play
 
   return play(
     args.task,

@@ -5,13 +5,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from playground.cli.play import play
 from playground.deploy.export import export_run
-from playground.deploy.play import play
 from playground.errors import ConfigError
+from playground.files import read_json
 from playground.learning.checkpoints import find_checkpoints
 from playground.pretrained import add, cards
 from playground.runs.csv_tracker import read_metrics
-from playground.runs.files import read_json
 from playground.runs.run_dir import RunDirectory
 
 _EPISODES = 20  # in C MuJoCo

@@ -157,9 +157,10 @@ def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
 def _train(config: RunConfig, verbose: bool) -> int:
   from rich.console import Console
 
-  from playground.envs.warp_kernels import stand_by
+  from playground.envs.options import impl_on_gpu
+  from playground.physics.warp_kernels import stand_by
 
-  stand_by(config.env, config.hardware.platform)
+  stand_by(impl_on_gpu(config.env), config.hardware.platform)
   print("\n".join(header(config)), flush=True)
   if verbose:
     Console().print(tree(config))

@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 from rich.console import Console
 from rich.table import Table
 
-from playground.config import compose, format_value
+from playground import registry
+from playground.config import compose, config_dict, format_value
+from playground.envs.warp_buffer_sizes import ROOM, Act, BufferSizes, measure_buffers
 from playground.errors import ConfigError
-from playground.learning.buffers import ROOM, Act, BufferSizes, measure_buffers
 from playground.runs.loaded_policy import load_policy
 from playground.runs.progress import Progress
 
@@ -46,12 +47,13 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
       raise ConfigError(f"--run={run} is one of {trained.task}, not of {task}.")
     policies["trained"] = trained.act
     config = config if overrides else trained.config.env
+  build = lambda sizes: registry.build(config_dict({**config.to_dict(), **sizes}))
   found = []
   with Progress(envs * steps, activity="rollout", console=Console(stderr=True)) as progress:
     for name, act in policies.items():
       compiles = lambda sizes, name=name: progress.phase(f"{name} policy: compiling with {sizes}")
       done = lambda count: progress.update(envs * count)
-      found.append(measure_buffers(config, act, envs, steps, on_try=compiles, on_steps=done))
+      found.append(measure_buffers(build, config.njmax, act, envs, steps, on_try=compiles, on_steps=done))
   console = Console()
   advice = [sizes.advised() for sizes in found]
   table = Table(title=f"{task} on Warp, {envs} environments, {steps} policy steps")

@@ -9,10 +9,10 @@ from mujoco.mjx._src.math import axis_angle_to_quat, quat_to_mat
 
 from playground.envs.manipulation import arm, handover, peg, pick_cartesian, push
 from playground.envs.manipulation.arm import TabletopTask
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.mdp.manipulators import ArmContext, ArmRobot
+from playground.physics.backend import PhysicsData, mjx
 from playground.robots.panda.kinematics import JOINT_RANGE
 
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from playground.envs.base import State
 from playground.envs.dm_control import ball_in_cup, cartpole, finger, fish, pendulum, reacher, swimmer, walker
 from playground.envs.dm_control.suite import SuiteTask, Terms
-from playground.envs.physics import PhysicsData, mjx
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData, mjx
 
 
 class _LateTarget(SuiteTask):

@@ -11,10 +11,10 @@ from mujoco.mjx._src.math import normalize
 
 from playground.envs.manipulation import reorient, rotate
 from playground.envs.manipulation.in_hand import HandTask
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.mdp import events
 from playground.mdp.poses import Pose, sensed_pose
+from playground.physics.backend import PhysicsData, mjx
 
 
 class _HandTask(HandTask):

@@ -9,13 +9,13 @@ import numpy as np
 
 from playground.envs.locomotion.joystick import Joystick
 from playground.envs.locomotion.stand import Stand
-from playground.envs.physics import mjx
 from playground.envs.task import InitialState
 from playground.mdp import rewards
 from playground.mdp.commands import Gait, is_still
 from playground.mdp.context import StepContext
 from playground.mdp.events import Info, PushByForce, PushByForceRegularly
 from playground.mdp.legged import LeggedContext
+from playground.physics.backend import mjx
 
 _SIDEWAYS = 0.1  # m/s
 

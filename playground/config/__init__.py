@@ -27,7 +27,7 @@ from playground.config.composition import (
   register_options,
   saved_section,
 )
-from playground.config.files import ENTRY_POINTS, config_roots, options, search_path_override, task_names
+from playground.config.files import config_roots, options, search_path_override, task_names
 from playground.config.overrides import (
   DEFAULT_EXPERIMENT,
   is_hydras,
@@ -57,11 +57,10 @@ from playground.config.sweeps import (
   varying,
   with_listed,
 )
-from playground.config.text import format_value
+from playground.text import format_value
 
 __all__ = [
   "DEFAULT_EXPERIMENT",
-  "ENTRY_POINTS",
   "RunConfig",
   "Section",
   "check_saved_job",

@@ -20,11 +20,11 @@ from typing import Any
 
 from playground.config.files import options
 from playground.config.overrides import Override, parse
+from playground.config.run_options import CurriculumConfig
 from playground.config.schema import wrong_type
-from playground.config.text import format_value
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
-from playground.runs.options import CurriculumConfig
 from playground.settings import defaults
+from playground.text import format_value
 
 _FIELDS = ("num_timesteps", "overrides")
 _SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # by a stage: groups and sections

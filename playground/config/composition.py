@@ -59,13 +59,13 @@ from playground.config.overrides import (
 )
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, Section, from_dict, load
 from playground.config.schema import check_key, fit, is_terms
-from playground.config.text import first_line, join
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.learning.hyperparameters import config_class
 from playground.mdp.options import OPTIONS
 from playground.pretrained import locate
 from playground.settings import defaults
+from playground.text import first_line, join
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that say which keys a run has, in this order

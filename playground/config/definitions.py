@@ -12,12 +12,7 @@ from typing import Annotated, Any
 
 from hydra.core.config_store import ConfigStore
 
-from playground.envs.options import EnvConfig, TaskKeys, TermsConfig
-from playground.errors import PlaygroundError
-from playground.hardware.options import HardwareConfig
-from playground.learning.hyperparameters import agent_names, config_class
-from playground.limits import SEED
-from playground.runs.options import (
+from playground.config.run_options import (
   CheckpointConfig,
   CurriculumConfig,
   NonfiniteConfig,
@@ -25,8 +20,13 @@ from playground.runs.options import (
   TrackingConfig,
   VideoConfig,
 )
+from playground.config.sweep_options import LAUNCHERS, SEARCHES, SweepConfig
+from playground.envs.options import EnvConfig, TaskKeys, TermsConfig
+from playground.errors import PlaygroundError
+from playground.hardware.options import HardwareConfig
+from playground.learning.hyperparameters import agent_names, config_class
+from playground.limits import SEED
 from playground.settings import Setting, defaults, settings
-from playground.sweep.options import LAUNCHERS, SEARCHES, SweepConfig
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import yaml
 
 from playground.config.definitions import defined
-from playground.config.text import first_line
+from playground.text import first_line
+from playground.trust import ENTRY_POINTS
 
-ENTRY_POINTS = "playground.tasks"
 DELTAS = ("experiment", "tuned", "debug")  # groups that change what the others define, and define nothing
 _EXPERIMENTS = {  # short names, where the rule's is long
   "AeroCubeRotateZAxis": "aero_rotate",

@@ -8,10 +8,10 @@ from typing import Any
 
 from playground.config.definitions import chosen_names, definition
 from playground.config.schema import wrong_type
-from playground.config.text import format_value, join
 from playground.errors import ConfigError, nearest
 from playground.limits import MOST, SHARE, Limit, at_least_0, count, positive, span
 from playground.mdp.options import OPTIONS
+from playground.text import format_value, join
 
 _XLA_SWITCH = re.compile(r"--xla_\w+(=(true|false|-?\d+(\.\d+)?))?")
 _XLA_PLACES = ("dir", "path", "file", "dump", "load", "cache", "option", "override", "_to", "_from")  # in flags' names

@@ -11,9 +11,9 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from playground.config.files import DELTAS, config_roots, groups, listed_options, options
-from playground.config.text import format_value, quoted
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.options import OPTIONS
+from playground.text import format_value, quoted
 
 DEFAULT_EXPERIMENT = "quickstart"
 # Any of these on the command line, and it is not the default run that is meant.

@@ -10,10 +10,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from playground.config.text import first_line, format_value
+from playground.config.run_options import CheckpointConfig, NonfiniteConfig, ProfileConfig, TrackingConfig, VideoConfig
 from playground.errors import ConfigError
-from playground.runs.options import CheckpointConfig, NonfiniteConfig, ProfileConfig, TrackingConfig, VideoConfig
 from playground.settings import build
+from playground.text import first_line, format_value
 
 if TYPE_CHECKING:
   from rich.tree import Tree

@@ -6,10 +6,10 @@ from typing import Any
 
 from playground.config.definitions import definition
 from playground.config.files import DELTAS
-from playground.config.moved import check_not_moved
-from playground.config.text import format_value, join, nearest_in
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.mdp.moved import check_not_moved
 from playground.mdp.options import OPTIONS, keys
+from playground.text import format_value, join, nearest_in
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", list: "a list"}
 

@@ -13,7 +13,7 @@ from playground.deploy.policy import ExportedPolicy
 from playground.deploy.trained import export_policy, load_exact, record
 from playground.errors import PlaygroundError
 from playground.extras import need
-from playground.runs.files import need_folder, replacing, write_text
+from playground.files import need_folder, replacing, write_text
 
 TOLERANCE = 1e-5  # of an action, against the trained policy's
 _ENVS, _DECISIONS = 8, 125  # 1000 observations

@@ -11,9 +11,9 @@ import mujoco
 from flax import struct
 
 from playground.envs.options import auto_impl, sees
-from playground.envs.physics import DERIVED_FIELDS, Physics, PhysicsData, mjx
-from playground.envs.warp_kernels import quiet_warp
 from playground.errors import ConfigError
+from playground.physics.backend import DERIVED_FIELDS, Physics, PhysicsData, mjx
+from playground.physics.warp_kernels import quiet_warp
 
 Observation = jax.Array | dict[str, jax.Array]
 PIXELS = "pixels/"  # what entries of an observation that are pictures begin with: [height, width, channels] uint8

@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 
 from playground.envs.base import Env
-from playground.envs.physics import STATE_FIELDS, Physics, PhysicsData, mjx
 from playground.errors import ConfigError
+from playground.physics.backend import STATE_FIELDS, Physics, PhysicsData, mjx
 
 
 class CPhysics(Physics):

@@ -91,6 +91,11 @@ def sees(env: Mapping[str, Any]) -> bool:
   return "vision" in env and env["vision"]["enable"]
 
 
+def impl_on_gpu(env: Mapping[str, Any]) -> str:
+  """The backend that an `env` config chooses on an NVIDIA GPU."""
+  return auto_impl(env["cuda_impl"], sees(env), on_gpu=True) if env["impl"] == "auto" else env["impl"]
+
+
 def auto_impl(cuda_impl: str, renders: bool, on_gpu: bool) -> str:
   """What `impl: auto` means: the backend that was measured faster, or the one that renders."""
   return "warp" if renders else cuda_impl if on_gpu else "jax"

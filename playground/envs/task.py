@@ -10,7 +10,6 @@ import mujoco
 from flax import struct
 
 from playground.envs.base import Env, State
-from playground.envs.physics import DERIVED_FIELDS, PhysicsData, mjx
 from playground.mdp.context import Robot, StepContext
 from playground.mdp.managers import (
   CommandManager,
@@ -19,6 +18,7 @@ from playground.mdp.managers import (
   RewardManager,
   TerminationManager,
 )
+from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
 from playground.randomization import Randomizer
 
 _MODEL_FIELDS = "model_fields"  # entry of `info`: fields of the model that events of mode reset draw

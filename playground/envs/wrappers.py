@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.base import Env, State
-from playground.envs.physics import STATE_FIELDS, WORLDS, BufferUse, mjx
+from playground.physics.backend import STATE_FIELDS, WORLDS, BufferUse, mjx
 
 ModelFields = Mapping[str, jax.Array]
 # `info` keys that wrappers own; a fresh reset of a task never touches them.

@@ -9,8 +9,8 @@ import jax
 import mujoco
 import numpy as np
 
-from playground.envs.physics import PhysicsData
 from playground.errors import ConfigError, UnknownNameError, lookup, nearest
+from playground.physics.backend import PhysicsData
 
 if TYPE_CHECKING:
   from playground.envs.task import Task

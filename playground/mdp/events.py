@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul
 
-from playground.config.text import format_value
-from playground.envs.physics import PhysicsData, mjx
 from playground.errors import ConfigError
 from playground.limits import MOST, AtLeast0, Share, Span, Vector, count, span
 from playground.mdp.poses import uniform_quat
+from playground.physics.backend import PhysicsData, mjx
+from playground.text import format_value
 
 if TYPE_CHECKING:
   from playground.envs.task import InitialState, Task

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from playground.envs.physics import PhysicsData, mjx
 from playground.errors import ConfigError, lookup
 from playground.mdp.commands import is_still
 from playground.mdp.context import Robot, StepContext
+from playground.physics.backend import PhysicsData, mjx
 
 
 class LeggedRobot(Robot):

@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from playground.config.text import format_value
-from playground.envs.physics import PhysicsData
 from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 from playground.limits import at_least_0
 from playground.mdp import delays
 from playground.mdp.context import StepContext
 from playground.mdp.options import ObservationOptions, is_model_field
 from playground.mdp.terms import Term, bind, bind_one
+from playground.physics.backend import PhysicsData
+from playground.text import format_value
 
 ACTOR = "state"  # the observation group that the policy reads: noisy; the other groups are exact
 Info = dict[str, Any]

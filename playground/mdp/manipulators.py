@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 from mujoco.mjx._src.math import quat_to_mat
 
-from playground.envs.physics import PhysicsData, mjx
 from playground.errors import lookup
 from playground.mdp.context import Robot, StepContext
 from playground.mdp.poses import Pose, angle_between
+from playground.physics.backend import PhysicsData, mjx
 
 if TYPE_CHECKING:
   from playground.envs.manipulation.arm import TabletopTask

@@ -26,11 +26,11 @@ from typing import Any, NamedTuple
 
 import jax
 
-from playground.config.moved import renamed_function
-from playground.config.text import format_value
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.limits import Limit
+from playground.mdp.moved import renamed_function
 from playground.mdp.options import OPTIONS, keys
+from playground.text import format_value
 from playground.trust import trusted_object
 
 # Modules whose public functions and classes are the registered terms of a kind.

@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from playground.envs.physics import Physics, PhysicsData, mjx
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.physics.backend import Physics, PhysicsData, mjx
 from playground.rendering.video import camera_names
 
 Pictures = dict[str, jax.Array]

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
+from playground.files import need_file, replacing
 from playground.interpreter import PYTHON
 from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
-from playground.runs.files import need_file, replacing
 
 MAX_FPS = 50.0
 _TRIES = 100

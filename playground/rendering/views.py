@@ -11,9 +11,9 @@ import numpy as np
 from playground.envs.base import PIXELS, Env, newest_picture
 from playground.envs.wrappers import Vectorize
 from playground.errors import ConfigError
+from playground.files import need_file, replacing
 from playground.randomization import Randomizer
 from playground.rendering.video import camera_names
-from playground.runs.files import need_file, replacing
 
 _GAP = 2  # pixels between two views
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import mujoco
 
-from playground.config.text import first_line
 from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 from playground.robots.terrain import add_terrain
+from playground.text import first_line
 
 ROBOTS = Path(__file__).parent
 _OF_KEYFRAMES = ("qpos", "qvel", "act", "ctrl", "mpos", "mquat")

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from playground.files import write_text
 from playground.runs.csv_tracker import STAGE, read_metrics
-from playground.runs.files import write_text
 from playground.runs.plots import plot_learning_curve
 from playground.runs.run_dir import RunDirectory
 

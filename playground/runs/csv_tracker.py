@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TextIO
 
-from playground.runs.files import keep_copy, write_text
+from playground.files import keep_copy, write_text
 
 if TYPE_CHECKING:
   import pandas as pd

@@ -10,8 +10,8 @@ import numpy as np
 from playground.envs.base import Env, State
 from playground.envs.wrappers import MAX_VALUE, MAX_VELOCITY
 from playground.errors import CheckpointError
+from playground.files import replacing
 from playground.learning.rollout import Step
-from playground.runs.files import replacing
 
 
 def write_dump(folder: Path, step: int, captured: Step | None, config: dict[str, Any]) -> Path | None:

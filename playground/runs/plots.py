@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from playground.files import replacing
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_metrics
-from playground.runs.files import replacing
 
 _AXES = {  # file name -> (column, its label)
   "return_over_steps.png": ("step", "environment steps"),

@@ -14,7 +14,7 @@ import yaml
 from ml_collections import ConfigDict
 
 from playground.errors import CheckpointError, PlaygroundError, nearest
-from playground.runs.files import lock_holder, locking, plain, read_json, write_json, write_text
+from playground.files import lock_holder, locking, plain, read_json, write_json, write_text
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
 

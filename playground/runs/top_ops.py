@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from playground.runs.files import write_text
+from playground.files import write_text
 
 Event = dict[str, Any]
 

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 from ml_collections import ConfigDict
 
+from playground.files import plain
 from playground.runs.csv_tracker import CsvTracker
-from playground.runs.files import plain
 from playground.runs.run_dir import RunDirectory
 from playground.runs.wandb_tracker import WandbTracker
 

@@ -12,7 +12,6 @@ from playground import registry
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import ending_together, is_main, leave, noting_loss, preflight, share, wait_for_all
-from playground.hardware.scaling import describe_division, scale_envs
 from playground.hardware.setup import Hardware, setup
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
@@ -29,6 +28,7 @@ from playground.runs.progress import Progress, format_return
 from playground.runs.provenance import process_age_s
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
+from playground.runs.scaling import describe_division, scale_envs
 
 if TYPE_CHECKING:
   from playground.config import RunConfig

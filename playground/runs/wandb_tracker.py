@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from playground.runs.files import write_text
+from playground.files import write_text
 
 # wandb 0.31 renamed its public server, and still takes a netrc entry under the old name.
 _PUBLIC_HOSTS = {"api.wandb.ai", "api.forge.coreweave.com"}

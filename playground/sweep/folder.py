@@ -13,11 +13,11 @@ from typing import Any, Literal
 import yaml
 
 from playground.config import RunConfig, format_value, is_of_command
-from playground.config.text import first_line
 from playground.errors import CheckpointError, ConfigError, nearest
+from playground.files import is_locked, lock_holder, locking, read_json, write_json, write_text
 from playground.runs.csv_tracker import RETURN
-from playground.runs.files import is_locked, lock_holder, locking, read_json, write_json, write_text
 from playground.runs.run_dir import RunDirectory
+from playground.text import first_line
 
 Status = Literal["queued", "submitted", "running", "finished", "failed", "timeout", "preempted", "killed"]
 ENDED = ("finished", "failed", "timeout", "preempted", "killed")

@@ -7,12 +7,12 @@ import signal
 import subprocess
 from collections.abc import Sequence
 
+from playground.config.sweep_options import LocalConfig
 from playground.errors import ConfigError, HardwareError
 from playground.hardware.gpus import visible_gpus
 from playground.interpreter import PYTHON
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.mps import MultiProcessService, control_program
-from playground.sweep.options import LocalConfig
 from playground.sweep.worker import COMMAND
 
 ALL = "all"

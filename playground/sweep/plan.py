@@ -8,9 +8,9 @@ from pathlib import Path
 
 from playground import config as configs
 from playground.config import RunConfig, Section
+from playground.config.sweep_options import LAUNCHERS, typed
 from playground.errors import ConfigError
 from playground.sweep.folder import Job, SweepDirectory
-from playground.sweep.options import LAUNCHERS, typed
 from playground.sweep.runner import launcher_class
 
 ROOT = Path("results/sweeps")

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from playground.config.sweep_options import RayConfig
 from playground.errors import ConfigError, HardwareError
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import MEMORY_FRACTION
-from playground.sweep.options import RayConfig
 from playground.sweep.worker import COMMAND, Worker
 
 try:

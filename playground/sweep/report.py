@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table as ConsoleTable
 
+from playground.files import replacing, write_text
 from playground.reporting.page import (
   Block,
   Heading,
@@ -21,7 +22,6 @@ from playground.reporting.page import (
   to_html,
 )
 from playground.runs.csv_tracker import RETURN, read_metrics
-from playground.runs.files import replacing, write_text
 from playground.sweep.folder import FAILED, SweepDirectory
 
 if TYPE_CHECKING:

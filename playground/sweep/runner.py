@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 from rich.console import Console
 
 from playground.config import Section, check_saved_job
+from playground.config.sweep_options import LAUNCHERS, SEARCHES, typed
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
-from playground.sweep.options import LAUNCHERS, SEARCHES, typed
 from playground.sweep.report import write_result
 from playground.sweep.view import View
 from playground.sweep.worker import COMMAND

@@ -11,9 +11,9 @@ from hydra.core.override_parser.types import Override as HydraOverride
 
 from playground import config as configs
 from playground.config.overrides import parse_with_hydra
+from playground.config.sweep_options import OptunaConfig
 from playground.errors import ConfigError, PlaygroundError
 from playground.sweep.folder import Job, JobFolder, SweepDirectory
-from playground.sweep.options import OptunaConfig
 
 try:
   import optuna

@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from playground.config.sweep_options import SlurmConfig
 from playground.errors import ConfigError, HardwareError
 from playground.interpreter import PYTHON
 from playground.sweep.folder import ENDED, STOP_FILE, Job, JobFolder, SweepDirectory
-from playground.sweep.options import SlurmConfig
 from playground.sweep.worker import COMMAND, Worker
 
 try:

@@ -16,10 +16,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from playground.config.text import quoted
 from playground.interpreter import PYTHON
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import STOP_FILE, JobFolder, SweepDirectory, now
+from playground.text import quoted
 
 COMMAND = (*PYTHON, "-m", "playground.cli.run")
 POLL_S = 0.2

@@ -74,7 +74,7 @@ def test_a_table_that_would_let_all_pass_is_refused(tmp_path: Path, table: str, 
 @pytest.mark.slow
 def test_a_slowed_task_fails(monkeypatch: pytest.MonkeyPatch):
   from playground.benchmark.gate.checks import env_step
-  from playground.envs.physics import Physics
+  from playground.physics.backend import Physics
 
   limits = {"env_step": Limit(measure(env_step("CartpoleBalance", 256), 15), 1.5)}
   step = Physics.step

@@ -21,7 +21,7 @@ from playground.benchmark.measures import runs
 from playground.benchmark.schema import Table
 from playground.benchmark.worker import ROW, Facts
 from playground.errors import ConfigError
-from playground.runs.files import write_json
+from playground.files import write_json
 from tests.dummy import Point
 
 PEER = {"name": "some", "python": sys.executable, "path": "", "menagerie": ""}

@@ -8,7 +8,7 @@ import pytest
 
 from playground.benchmark import worker
 from playground.benchmark.measures import runs, training
-from playground.envs import warp_kernels
+from playground.physics import warp_kernels
 
 
 @pytest.mark.parametrize(("measure", "stands_by"), [("training", True), ("runs:startup", False)])
@@ -17,7 +17,7 @@ def test_what_trains_in_it_has_warps_compiler_stand_by(
 ) -> None:
   asked: list[Any] = []
   measured: list[dict[str, Any]] = []
-  monkeypatch.setattr(warp_kernels, "stand_by", lambda env, platform: asked.append((env.impl, env.cuda_impl, platform)))
+  monkeypatch.setattr(warp_kernels, "stand_by", lambda *chosen: asked.append(chosen))
   module, name = (training, "measure") if measure == "training" else (runs, "startup")
   monkeypatch.setattr(module, name, lambda _, **arguments: measured.append(arguments))
   arguments = {"task": "PandaPickCube", "agent": "ppo", "overrides": ["hardware=cpu"], "seeds": [1]}
@@ -26,4 +26,4 @@ def test_what_trains_in_it_has_warps_compiler_stand_by(
   monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
   worker.main()
   assert measured == [arguments]
-  assert asked == [("auto", "warp", "cpu")] * stands_by
+  assert asked == [("warp", "cpu")] * stands_by

@@ -11,8 +11,8 @@ import yaml
 
 from playground.cli.run import main
 from playground.config import RunConfig, compose, to_yaml
-from playground.envs import warp_kernels
 from playground.errors import HardwareError
+from playground.physics import warp_kernels
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.worker import COMMAND
 from tests.command import Command, caller
@@ -62,9 +62,9 @@ def test_has_warps_compiler_stand_by_for_the_task(
   command: Command, trained: list[RunConfig], monkeypatch: pytest.MonkeyPatch
 ):
   asked: list[Any] = []
-  monkeypatch.setattr(warp_kernels, "stand_by", lambda env, platform: asked.append((env, platform, len(trained))))
+  monkeypatch.setattr(warp_kernels, "stand_by", lambda *chosen: asked.append((*chosen, len(trained))))
   assert command("env=PandaPickCube", "hardware=cpu") == 0
-  assert asked == [(trained[0].env, "cpu", 0)]  # before training begins
+  assert asked == [("warp", "cpu", 0)]  # before training begins
 
 
 def test_leaves_nothing_of_hydras_behind(command: Command, trained: list[RunConfig], tmp_path: Path):

@@ -9,7 +9,7 @@ from playground import registry
 from playground.cli import tune_buffers as command_module
 from playground.cli.main import main
 from playground.config import compose
-from playground.learning.buffers import BufferSizes
+from playground.envs.warp_buffer_sizes import BufferSizes
 from tests.command import Command, caller
 
 RUN = "results/somewhere"
@@ -29,10 +29,11 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
   """What would have been measured: a policy needs more than random actions do."""
   asked: list[tuple[Any, ...]] = []
 
-  def measure(config: Any, act: Any, envs: int, steps: int, **watch: Any) -> BufferSizes:
-    asked.append((config.success_distance, act, envs, steps))
+  def measure(build: Any, njmax: int, act: Any, envs: int, steps: int, **watch: Any) -> BufferSizes:
+    asked.append((build({}).success_distance, act, envs, steps))
     return BufferSizes(19, 4.0, 1) if act is None else BufferSizes(49, 6.56, 4)
 
+  monkeypatch.setattr(registry, "build", lambda config: config)
   monkeypatch.setattr(command_module, "measure_buffers", measure)
   monkeypatch.setattr(command_module, "load_policy", lambda path: LoadedPolicy)
   return asked

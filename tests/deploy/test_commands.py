@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import yaml
 
+from playground.cli import play
 from playground.cli.main import main
-from playground.deploy import export, play
+from playground.deploy import export
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.web.server import Watch
 from playground.errors import CheckpointError

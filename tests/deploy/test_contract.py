@@ -10,8 +10,8 @@ import yaml
 from playground import registry
 from playground.deploy.contract import check_contract, describe_policy, first_docstring_line
 from playground.envs.base import State
+from playground.files import plain
 from playground.mdp.terms import registered
-from playground.runs.files import plain
 
 
 def contract(

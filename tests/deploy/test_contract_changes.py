@@ -14,9 +14,9 @@ import pytest
 import yaml
 
 from playground import registry
+from playground.cli import play
 from playground.cli.main import main
 from playground.config import compose
-from playground.deploy import play
 from tests.command import caller
 from tests.deploy.untrained import UntrainedRun
 

@@ -18,8 +18,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from playground.cli.main import main
+from playground.cli.play import open_policy
 from playground.deploy.menu import Menu
-from playground.deploy.play import open_policy
 from playground.deploy.session import Session
 from playground.deploy.web.gamepad import Pad
 from playground.deploy.web.gate import Gate

@@ -20,7 +20,7 @@ from playground.deploy.player import Player
 from playground.deploy.viewer import view
 from playground.envs.base import State
 from playground.envs.c_physics import on_c_physics
-from playground.envs.physics import PhysicsData
+from playground.physics.backend import PhysicsData
 from playground.registry import load
 from tests.dummy import Point
 

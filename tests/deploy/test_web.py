@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from playground.cli.main import main
+from playground.cli.play import open_policy
 from playground.deploy.menu import Menu
-from playground.deploy.play import open_policy
 from playground.deploy.player import Player
 from playground.deploy.session import Session
 from playground.deploy.web.server import Watch

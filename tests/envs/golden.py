@@ -24,8 +24,8 @@ from playground.envs.manipulation.arm import ArmTask, Bimanual
 from playground.envs.manipulation.in_hand import HandTask
 from playground.envs.manipulation.pick_cartesian import PickCubeCartesian
 from playground.envs.manipulation.push import PushCube
-from playground.envs.physics import STATE_FIELDS
 from playground.envs.task import Task
+from playground.physics.backend import STATE_FIELDS
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 TASKS = sorted(path.stem for path in GOLDEN.glob("*.npz"))

@@ -14,7 +14,7 @@ import pytest
 from playground.config import compose
 from playground.errors import ConfigError, HardwareError
 from playground.hardware import distributed
-from playground.hardware.scaling import describe_division, scale_envs
+from playground.runs.scaling import describe_division, scale_envs
 from tests.processes import COMMAND, ended, start, two_processes
 
 LINE = ["env=CartpoleBalance", "tuned=null", "debug=fast", "tracking=csv"]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from playground.envs.base import State
-from playground.envs.physics import PhysicsData, mjx
 from playground.hardware.mesh import make_mesh
 from playground.learning.evaluation import make_evaluator
+from playground.physics.backend import PhysicsData, mjx
 from playground.runs.callbacks import episodes_of
 from tests.dummy import PointTask
 

@@ -14,8 +14,8 @@ import pytest
 
 from playground.config import compose
 from playground.envs.dm_control.cartpole import Cartpole
-from playground.envs.physics import mjx
 from playground.errors import ConfigError, UnknownNameError
+from playground.physics.backend import mjx
 from playground.rendering.batch import BatchRenderer, View
 
 # Cart (m) and pole (rad): in the middle, to the right and leaning, to the left and leaning the other way.

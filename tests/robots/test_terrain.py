@@ -11,8 +11,8 @@ import yaml
 
 from playground import registry
 from playground.config import compose
-from playground.envs.physics import mjx
 from playground.errors import ConfigError
+from playground.physics.backend import mjx
 from playground.robots.scene import ROBOTS, build_scene
 from playground.robots.terrain import HALF_EXTENT, POINTS, START, add_terrain
 

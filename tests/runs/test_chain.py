@@ -16,10 +16,10 @@ import pytest
 
 from playground import registry
 from playground.config import RunConfig, compose, config_roots
-from playground.envs.physics import PhysicsData
 from playground.errors import ConfigError
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
 from playground.learning.loop import Loop
+from playground.physics.backend import PhysicsData
 from playground.runs import chain as chain_module
 from playground.runs import train as train_module
 from playground.runs.callbacks import RunCallbacks

@@ -12,9 +12,9 @@ import pytest
 from playground import registry
 from playground.config import compose
 from playground.envs.base import State
-from playground.envs.physics import BufferUse
 from playground.envs.wrappers import wrap_for_training
 from playground.learning.rollout import episode_sums
+from playground.physics.backend import BufferUse
 from playground.runs.train import train
 from tests.dummy import Point
 from tests.runs.helpers import TASK

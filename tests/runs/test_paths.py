@@ -10,13 +10,13 @@ import pytest
 
 from playground.cli.eval import evaluate_run
 from playground.config import compose, compose_settings
-from playground.config.text import quoted
 from playground.deploy.export import export_run
 from playground.learning.checkpoints import Checkpoint, CheckpointStore, find_checkpoints
 from playground.runs.run_dir import RunDirectory
 from playground.runs.trackers import make_trackers
 from playground.runs.train import train
 from playground.sweep.folder import SweepDirectory
+from playground.text import quoted
 from tests.runs.helpers import TASK
 from tests.sweep.helpers import make_sweep
 from tests.sweep.helpers import run as run_jobs

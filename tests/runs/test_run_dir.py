@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from playground.errors import CheckpointError
-from playground.runs.files import is_locked, lock_holder, replacing
+from playground.files import is_locked, lock_holder, replacing
 from playground.runs.provenance import git_state
 from playground.runs.run_dir import RunDirectory
 

@@ -22,12 +22,12 @@ import pandas as pd
 import pytest
 
 from playground.config import compose
+from playground.files import is_locked
 from playground.hardware.setup import setup
 from playground.learning import checkpoints
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
 from playground.learning.loop import schedule
 from playground.runs import train as train_module
-from playground.runs.files import is_locked
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import cut_short, train

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from playground.runs.files import write_json
+from playground.files import write_json
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.report import collect, group, group_keys, mean_curve, write_result
 

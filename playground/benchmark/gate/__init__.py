@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from playground.benchmark.arguments import check_amounts, option
 from playground.config.files import shipped
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.runs.files import need_folder, write_text
+from playground.files import need_folder, write_text
 
 if TYPE_CHECKING:
   from playground.benchmark.gate.checks import Pair, Timed

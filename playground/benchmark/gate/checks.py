@@ -10,11 +10,11 @@ import numpy as np
 
 from playground import registry
 from playground.config import compose
-from playground.envs.physics import mjx
 from playground.envs.wrappers import wrap_for_training
 from playground.hardware.mesh import make_mesh
 from playground.learning.hyperparameters import read_config
 from playground.learning.trainer import Trainer
+from playground.physics.backend import mjx
 
 jax.config.update("jax_platforms", "cpu")
 

@@ -11,9 +11,9 @@ from playground.benchmark.measures.machine import used_memory
 from playground.benchmark.measures.subject import Subject, alone, emit_peak, num_updates, rate, told
 from playground.benchmark.worker import Facts
 from playground.envs.base import PIXELS
-from playground.envs.physics import WORLDS
 from playground.envs.wrappers import Vectorize, wrap_for_training
 from playground.learning.rollout import Environments, unroll
+from playground.physics.backend import WORLDS
 
 PARTS = {  # in the order they are added
   "physics": "MJX alone under a constant ctrl",

@@ -21,10 +21,10 @@ from playground.benchmark.worker import Facts
 from playground.config import RunConfig, compose
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
-from playground.hardware.scaling import scale_envs
 from playground.hardware.setup import Hardware, setup
 from playground.learning.hyperparameters import read_config
 from playground.learning.trainer import Trainer
+from playground.runs.scaling import scale_envs
 from playground.runs.train import model_sampler
 
 ONE_DEVICE = "hardware.devices=1"

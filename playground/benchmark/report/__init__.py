@@ -8,8 +8,8 @@ from playground.benchmark.report import sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.pixels import pixels
 from playground.errors import ConfigError
+from playground.files import need_folder, write_text
 from playground.reporting.page import Block, Heading, Picture, Text, to_html, to_markdown
-from playground.runs.files import need_folder, write_text
 
 ROWS = ("results/reference", "results/benchmarks")
 PICTURES = "report_pictures"

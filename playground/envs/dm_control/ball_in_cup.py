@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from playground.envs.dm_control.suite import SuiteTask, Terms
-from playground.envs.physics import PhysicsData
+from playground.physics.backend import PhysicsData
 
 _XZ = slice(0, 3, 2)  # the plane of the task
 _LOW, _HIGH = np.array([-0.2, 0.2]), np.array([0.2, 0.5])  # the ball's x and z at the start of an episode, m

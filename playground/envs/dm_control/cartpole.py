@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.dm_control.suite import SuiteTask, Terms
-from playground.envs.physics import PhysicsData
 from playground.errors import ConfigError
 from playground.mdp.context import StepContext
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 _SLIDER, _HINGE = 0, 1
 

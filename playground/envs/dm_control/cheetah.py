@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.dm_control.suite import SuiteTask, Terms, reach_speed
-from playground.envs.physics import PhysicsData, mjx
+from playground.physics.backend import PhysicsData, mjx
 
 _ROOT = 3  # x, z and pitch come before the joints
 _SPEED = 10.0  # m/s that earn the full reward

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 
 from playground.envs.dm_control.suite import SuiteTask, Terms, draw_angle
-from playground.envs.physics import PhysicsData
+from playground.physics.backend import PhysicsData
 
 _XZ = jnp.array([0, 2])  # the plane of the finger
 _SPIN_VELOCITY = -15.0  # rad/s, at least this fast

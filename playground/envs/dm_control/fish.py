@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.dm_control.suite import SuiteTask, Terms
-from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 _ROOT = 7  # entries of qpos before the joints: position and quaternion of the torso
 

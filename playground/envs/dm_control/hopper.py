@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.dm_control.suite import SuiteTask, Terms, reach_speed, small_control
-from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 _STAND_HEIGHT = 0.6  # m, of the torso above the foot
 _MAX_HEIGHT = 2.0  # m: out of the leg's reach, so there is no upper bound in effect

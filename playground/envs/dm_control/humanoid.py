@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.dm_control.suite import SuiteTask, Terms, reach_speed, small_control
-from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 _FREE_QPOS = 7  # position and quaternion of the torso come before the joints
 _HEAD_HEIGHT = 1.4  # m

@@ -5,8 +5,8 @@ import math
 import jax
 
 from playground.envs.dm_control.suite import SuiteTask, Terms, draw_angle
-from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 UPRIGHT = math.cos(math.radians(8))
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.dm_control.suite import SuiteTask, Terms, small_control
-from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 
 class PointMass(SuiteTask):

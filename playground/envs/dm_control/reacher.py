@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import mujoco
 
 from playground.envs.dm_control.suite import SuiteTask, Terms, draw_angle
-from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 
 class Reacher(SuiteTask):

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import mujoco
 
 from playground.envs.base import Env, State
-from playground.envs.physics import DERIVED_FIELDS, PhysicsData, mjx
 from playground.errors import ConfigError
 from playground.mdp.context import StepContext
 from playground.mdp.managers import RewardManager, TerminationManager
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
 
 Terms = dict[str, jax.Array]
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import mujoco
 
 from playground.envs.dm_control.suite import SuiteTask, Terms
-from playground.envs.physics import PhysicsData
 from playground.errors import ConfigError
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 _ROOT = 3  # x, y and heading come before the joints
 _PLANAR = jnp.array([0, 1, 5])  # of a link's velocimeter and gyro: forward, sideways, turning

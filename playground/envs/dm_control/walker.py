@@ -5,8 +5,8 @@ import math
 import jax
 
 from playground.envs.dm_control.suite import SuiteTask, Terms, reach_speed
-from playground.envs.physics import PhysicsData
 from playground.mdp.tolerance import tolerance
+from playground.physics.backend import PhysicsData
 
 _STAND_HEIGHT = 1.2  # m, of the torso
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.locomotion.legged import LeggedTask
-from playground.envs.physics import PhysicsData, mjx
 from playground.mdp.legged import LeggedContext
+from playground.physics.backend import PhysicsData, mjx
 
 
 class Joystick(LeggedTask):

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState, State, Task
 from playground.errors import ConfigError, lookup
 from playground.mdp.context import StepContext
 from playground.mdp.legged import LeggedContext, LeggedRobot
+from playground.physics.backend import PhysicsData, mjx
 from playground.robots.gains import set_gains
 from playground.robots.scene import configured_scene
 

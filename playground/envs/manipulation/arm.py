@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import mujoco
 
 from playground.envs.base import State
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState, Task
 from playground.mdp.manipulators import ArmContext, ArmRobot
+from playground.physics.backend import PhysicsData, mjx
 from playground.robots.tabletop import build_tabletop
 
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from playground.envs.base import State
 from playground.envs.manipulation.arm import Bimanual, ProgressTask
-from playground.envs.physics import PhysicsData, mjx
 from playground.mdp.manipulators import ArmContext
+from playground.physics.backend import PhysicsData, mjx
 
 _MEETING = (0.0, 0.0, 0.24)  # m, where the box changes hands
 _PICK_X, _PASS_X = -0.1, 0.0  # m: the box's x up to which it is the left hand's, and from which the right one's

@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 
 from playground.envs.base import State
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState, Task
 from playground.errors import lookup
 from playground.mdp.manipulators import Hand, HandContext
 from playground.mdp.poses import Pose, sensed_pose
+from playground.physics.backend import PhysicsData, mjx
 from playground.robots.in_hand import build_in_hand_scene
 
 _AWAY = (-100.0, -100.0, -100.0)  # m, where a goal is that the task does not have

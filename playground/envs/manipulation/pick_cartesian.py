@@ -8,10 +8,10 @@ import jax.numpy as jnp
 
 from playground.envs.base import State
 from playground.envs.manipulation.arm import ArmTask, ProgressTask
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.mdp import delays
 from playground.mdp.manipulators import ArmContext
+from playground.physics.backend import PhysicsData, mjx
 from playground.robots.panda.kinematics import forward_kinematics, inverse_kinematics, within_limits
 
 _WORKSPACE = jnp.array([[0.25, -0.32, 0.02], [0.77, 0.32, 0.5]])  # m, where the tip may be sent

@@ -9,13 +9,13 @@ from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul
 
 from playground.envs.base import State
 from playground.envs.manipulation.arm import ArmTask
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.errors import ConfigError
 from playground.mdp import delays
 from playground.mdp.managers import ACTOR, ObservationManager
 from playground.mdp.manipulators import ArmContext
+from playground.physics.backend import PhysicsData, mjx
 
 _ARM, _BOX = slice(0, 7), slice(13, 16)  # joints, and the block's position, in qpos
 # Where the block and its goal may be drawn (m).

@@ -9,10 +9,10 @@ from mujoco.mjx._src.math import quat_integrate
 
 from playground.envs.base import State
 from playground.envs.manipulation.in_hand import HandTask
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.task import InitialState
 from playground.mdp.manipulators import HandContext
 from playground.mdp.poses import uniform_quat
+from playground.physics.backend import PhysicsData, mjx
 
 _BONUS = "success"  # the reward term that is not times dt
 _SPIN = (1.0, 5.0)  # rad/s about each axis: how fast a new goal turns away from the last

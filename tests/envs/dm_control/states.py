@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mujoco
 
 from playground.envs.dm_control.suite import SuiteTask
-from playground.envs.physics import PhysicsData
+from playground.physics.backend import PhysicsData
 
 
 def state_at(env: SuiteTask, **fields: Any) -> PhysicsData:

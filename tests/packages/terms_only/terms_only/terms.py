@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from playground.envs.physics import PhysicsData, mjx
 from playground.limits import Positive, Span
 from playground.mdp.events import horizontal
 from playground.mdp.legged import LeggedContext
+from playground.physics.backend import PhysicsData, mjx
 
 
 def height_tracking_exp(c: LeggedContext, target: float, std: Positive) -> jax.Array:

@@ -6,13 +6,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from playground.config.text import format_value
 from playground.envs.base import PIXELS, Env, State
-from playground.envs.physics import PhysicsData, mjx
 from playground.envs.wrappers import Wrapper
 from playground.errors import ConfigError, nearest
+from playground.physics.backend import PhysicsData, mjx
 from playground.rendering.batch import BatchRenderer, View
 from playground.rendering.video import camera_names
+from playground.text import format_value
 
 _CHANNELS = {"rgb": 3, "gray": 1, "depth": 1, "segmentation": 1}
 _MAX_GEOMS = 255  # that a byte tells apart, beside nothing
@@ -31,7 +31,7 @@ class Vision(Wrapper):
   jitted, observation_size = Env.jitted, Env.observation_size
 
   def __init__(self, env: Env):
-    """`env`: a task whose config has `vision`, see `VisionConfig` in options.py.
+    """`env`: a task whose config has `vision`, see `VisionConfig` in `envs/options.py`.
 
     Raises:
       ConfigError: no camera, one that does not exist, or invalid settings.

@@ -17,7 +17,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from typing import Any
 import mujoco
 
 from playground.collector import uncollected
-from playground.envs.options import auto_impl, sees
 from playground.interpreter import PYTHON
 
 LIMIT_S = 900.0  # for a machine with few cores; a process that takes longer hangs
@@ -35,16 +33,15 @@ _LONGEST = "ccd_kernel"  # in the name of the module that takes NVRTC longest, h
 _standing_by: list[subprocess.Popen[str]] = []  # one at most
 
 
-def stand_by(env: Mapping[str, Any], platform: str) -> None:
+def stand_by(impl: str, platform: str) -> None:
   """Starts the process for the next `Building` if a run may want it; unused, it ends with this one.
 
   Call it before what takes long to import; this module does not.
 
   Args:
-    env: the run's `env` config.
+    impl: the backend that the task has on a GPU.
     platform: `hardware.platform`.
   """
-  impl = auto_impl(env["cuda_impl"], sees(env), on_gpu=True) if env["impl"] == "auto" else env["impl"]
   no_gpu = "cpu" in (platform, os.environ.get("JAX_PLATFORMS")) or not shutil.which("nvidia-smi")
   if impl == "warp" and not (_standing_by or no_gpu):
     _standing_by.append(_start())

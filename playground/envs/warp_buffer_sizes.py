@@ -6,14 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from ml_collections import ConfigDict
 
-from playground import registry
-from playground.config import config_dict
 from playground.envs.base import Env
-from playground.envs.physics import BufferUse
 from playground.envs.wrappers import wrap_for_training
 from playground.errors import ConfigError
+from playground.physics.backend import BufferUse
 
 ROOM = 1.25  # buffers are advised to be so much larger than what was needed
 _TRIES = 12
@@ -46,7 +43,8 @@ class BufferSizes:
 
 
 def measure_buffers(
-  config: ConfigDict,
+  build: Callable[[dict[str, int | str]], Env],
+  njmax: int | None,
   act: Act | None,
   num_envs: int,
   num_steps: int,
@@ -57,7 +55,8 @@ def measure_buffers(
   """Rolls a task out on Warp and returns the most that any step needed.
 
   Args:
-    config: the task's configuration; its own sizes are where the search for sufficient ones begins.
+    build: builds the task with these values in its configuration.
+    njmax: its own size of that buffer, where the search for a sufficient one begins.
     act: the policy; uniformly random actions if None.
     num_envs: environments.
     num_steps: policy steps; episodes that end are reset.
@@ -68,12 +67,11 @@ def measure_buffers(
   Raises:
     ConfigError: Warp is not installed, or some buffer that cannot be set overflowed.
   """
-  configured: int | None = config.njmax  # pyright: ignore[reportAssignmentType]
-  rows, pairs, convex = max(configured or 0, 32), 32, 1
+  rows, pairs, convex = max(njmax or 0, 32), 32, 1
   for _ in range(_TRIES):
-    sizes = {"impl": "warp", "njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": convex}
-    env = registry.build(config_dict({**config.to_dict(), **sizes}))
-    on_try(" ".join(f"{key}={size}" for key, size in sizes.items() if key != "impl"))
+    sizes: dict[str, int | str] = {"njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": convex}
+    env = build({"impl": "warp", **sizes})
+    on_try(" ".join(f"{key}={size}" for key, size in sizes.items()))
     use = _roll(env, act, num_envs, num_steps, seed, on_steps)
     if not use.overflow:
       return BufferSizes(int(use.constraints), int(use.contacts) / num_envs, convex)

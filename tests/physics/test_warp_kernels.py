@@ -10,8 +10,9 @@ import pytest
 
 from playground import registry
 from playground.config import compose
-from playground.envs import warp_kernels
-from playground.envs.physics import Physics
+from playground.envs.options import impl_on_gpu
+from playground.physics import warp_kernels
+from playground.physics.backend import Physics
 from playground.runs.train import train
 from tests.runs.helpers import TASK
 
@@ -22,7 +23,7 @@ SCRIPT = """
 import os, sys
 import jax
 from playground import registry
-from playground.envs.warp_kernels import Building
+from playground.physics.warp_kernels import Building
 env = registry.load(sys.argv[1], overrides={"impl": "warp"})
 building = Building(env.mj_model, env.physics._njmax)
 assert building.wait() is None
@@ -100,8 +101,8 @@ def env_config(**changes):
 
 
 def test_a_building_takes_the_process_that_stands_by(gpu, model):
-  warp_kernels.stand_by(env_config(), "auto")
-  warp_kernels.stand_by(env_config(), "auto")  # once is enough
+  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
+  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")  # once is enough
   (process,) = warp_kernels._standing_by
   stopped = warp_kernels.Building(model, 10)
   stopped.stop()
@@ -115,12 +116,12 @@ def test_kernels_are_compiled_once(gpu, model, monkeypatch, tmp_path):
   warp.init()
   cache = tmp_path / warp.config.version
   monkeypatch.setattr(warp.config, "kernel_cache_dir", str(cache))
-  warp_kernels.stand_by(env_config(), "auto")
+  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
   building = warp_kernels.Building(model, 11)
   assert building.wait() is None
   assert building._marker.exists()
   assert len(list(cache.glob("wp_*"))) > 10
-  warp_kernels.stand_by(env_config(), "auto")
+  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
   (process,) = warp_kernels._standing_by
   again = warp_kernels.Building(model, 11)
   assert again._process is None
@@ -138,7 +139,7 @@ def test_kernels_are_compiled_once(gpu, model, monkeypatch, tmp_path):
   ],
 )
 def test_only_what_runs_on_warp_has_a_process_stand_by(gpu, changes, stands_by):
-  warp_kernels.stand_by(env_config(**changes), "auto")
+  warp_kernels.stand_by(impl_on_gpu(env_config(**changes)), "auto")
   assert bool(warp_kernels._standing_by) == stands_by
 
 
@@ -148,12 +149,12 @@ def test_nothing_stands_by_without_a_gpu(gpu, monkeypatch, tmp_path, without):
     (tmp_path / "nvidia-smi").unlink()
   elif without == "JAX_PLATFORMS":
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-  warp_kernels.stand_by(env_config(), "cpu" if without == "platform" else "auto")
+  warp_kernels.stand_by(impl_on_gpu(env_config()), "cpu" if without == "platform" else "auto")
   assert warp_kernels._standing_by == []
 
 
 def test_it_ends_with_the_process_that_started_it(gpu):
-  warp_kernels.stand_by(env_config(), "auto")
+  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
   (process,) = warp_kernels._standing_by
   assert process.stdin is not None
   process.stdin.close()  # as when that one ends
@@ -175,6 +176,6 @@ def test_the_longest_module_is_compiled_first(model, monkeypatch):
 
 def test_the_cpu_and_mjx_alone_compile_nothing_ahead(gpu):
   for impl in ("jax", "warp"):
-    warp_kernels.stand_by(env_config(), "auto")
+    warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
     assert registry.load("CartpoleBalance", overrides={"impl": impl}).physics.compile_ahead() is None
     assert warp_kernels._standing_by == []

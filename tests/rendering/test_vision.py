@@ -12,10 +12,10 @@ from ml_collections import ConfigDict
 
 from playground import registry
 from playground.config import compose
-from playground.envs import vision
 from playground.envs.base import choose_impl
 from playground.envs.wrappers import wrap_for_evaluation, wrap_for_training
 from playground.errors import ConfigError
+from playground.rendering import vision
 from tests.dummy import Point
 
 LENGTH = 4

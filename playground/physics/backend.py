@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from playground.envs.warp_kernels import Building, dismiss, quiet_warp
+from playground.physics.warp_kernels import Building, dismiss, quiet_warp
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx

@@ -2,6 +2,7 @@
 
 import csv
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -9,12 +10,12 @@ import jax.numpy as jnp
 import pytest
 
 from playground import registry
-from playground.envs.physics import BufferUse, mjx
+from playground.envs import warp_buffer_sizes
+from playground.envs.warp_buffer_sizes import BufferSizes, measure_buffers
 from playground.envs.wrappers import wrap_for_evaluation
 from playground.errors import ConfigError
-from playground.learning import buffers
-from playground.learning.buffers import BufferSizes, measure_buffers
 from playground.learning.rollout import episode_sums
+from playground.physics.backend import BufferUse, mjx
 from tests.dummy import PointTask
 
 
@@ -64,8 +65,7 @@ def simulated(monkeypatch):
       need = {1: rows, 8: pairs, 16: convex}
       return use(rows, pairs, stubborn | sum(bit for bit, size in have.items() if need[bit] > size))
 
-    monkeypatch.setattr(buffers, "_roll", roll)
-    monkeypatch.setattr(registry, "build", lambda config: config)
+    monkeypatch.setattr(warp_buffer_sizes, "_roll", roll)
     return tried
 
   return simulate
@@ -77,8 +77,8 @@ def simulated(monkeypatch):
 )
 def test_buffers_grow_until_they_are_large_enough(simulated, rows, pairs, convex, tries, found):
   tried = simulated(rows, pairs, convex)
-  config = registry.config("Go1Getup")  # njmax: 160
-  assert measure_buffers(config, None, num_envs=2, num_steps=3) == BufferSizes(rows, pairs / 2, found)
+  build: Any = lambda sizes: SimpleNamespace(**sizes)
+  assert measure_buffers(build, 160, None, num_envs=2, num_steps=3) == BufferSizes(rows, pairs / 2, found)
   assert len(tried) == tries and all(have >= need for have, need in zip(tried[-1], (rows, pairs, convex), strict=True))
 
 
@@ -96,7 +96,7 @@ def test_a_rollout_reports_its_steps_and_keeps_the_most():
 
   for num_steps, stride in ((7, 1), (125, 2)):
     reported: list[int] = []
-    found = buffers._roll(Counting(), None, 2, num_steps, 0, reported.append)
+    found = warp_buffer_sizes._roll(Counting(), None, 2, num_steps, 0, reported.append)
     assert (found.constraints, found.contacts, found.overflow) == (num_steps, 3, 1)
     assert reported == [*range(stride, num_steps, stride), num_steps]
 
@@ -105,7 +105,8 @@ def test_other_buffers_are_named(simulated):
   pytest.importorskip("warp")
   simulated(1, 1, stubborn=32)
   with pytest.raises(ConfigError, match=r"\(HFIELD\) still overflow with njmax=160"):
-    measure_buffers(registry.config("Go1Getup"), None, 2, 3)
+    build: Any = lambda sizes: SimpleNamespace(**sizes)
+    measure_buffers(build, 160, None, 2, 3)
 
 
 def test_overflows_are_counted_for_training():
@@ -126,6 +127,7 @@ def test_what_was_measured_fits_into_what_is_configured():
 @pytest.mark.slow  # compiles Warp's kernels for the CPU: a minute
 def test_a_real_task_on_warp():
   pytest.importorskip("warp")
-  found = measure_buffers(registry.config("Go1JoystickFlatTerrain"), None, num_envs=2, num_steps=40)
+  build = lambda sizes: registry.load("Go1JoystickFlatTerrain", overrides=sizes)
+  found = measure_buffers(build, None, None, num_envs=2, num_steps=40)
   assert found.constraints >= 12, "a Go1 that stands on its feet"
   assert 1 <= found.contacts <= 4

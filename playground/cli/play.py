@@ -11,7 +11,6 @@ from rich.table import Table
 
 from playground import config as configs
 from playground import registry
-from playground.config.text import first_line
 from playground.deploy.menu import Menu
 from playground.deploy.policy import ActingPolicy, ExportedPolicy
 from playground.deploy.scripted import ScriptedPolicy, build_task
@@ -20,13 +19,14 @@ from playground.deploy.trained import export_policy, load_exact, load_on_c_physi
 from playground.envs.base import Env
 from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.extras import need
+from playground.files import need_folder, write_json
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
 from playground.rendering.video import need_camera, need_place, render_video
 from playground.runs.callbacks import episodes_of
-from playground.runs.files import need_folder, write_json
 from playground.runs.loaded_policy import LoadedPolicy
+from playground.text import first_line
 
 _BACKENDS = {"jax": "MJX ", "warp": "MJX-Warp "}  # by the manifest's `impl`; a policy exported long ago tells none
 
