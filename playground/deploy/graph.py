@@ -33,6 +33,7 @@ def policy_graph(
   activation: str,
   normalization: tuple[np.ndarray, np.ndarray] | None,
   cnn: CNNConfig | None = None,
+  obs_limit: float | None = None,
 ) -> onnx.ModelProto:
   """Builds the graph of a deterministic policy.
 
@@ -44,6 +45,7 @@ def policy_graph(
     activation: of the hidden layers, as in `agent.network.activation`.
     normalization: mean and deviation of the vector, [n] each; None if the actor sees it as it is.
     cnn: what is done with pictures, if there are any.
+    obs_limit: what the vector is clipped to after that; None without a limit.
 
   Returns:
     The model: `obs` float32 [1, n], and pictures uint8 [1, H, W, C] (`input_names`) -> `continuous_actions` float32
@@ -64,10 +66,13 @@ def policy_graph(
     if entry in pictures:
       assert cnn is not None
       see(graph, params[cnn_name(entry)], cnn, [*shape[:2]])
-    elif normalization is not None:
-      mean, std = normalization
-      graph.apply("Sub", graph.constant(mean))
-      graph.apply("Div", graph.constant(std))
+    else:
+      if normalization is not None:
+        mean, std = normalization
+        graph.apply("Sub", graph.constant(mean))
+        graph.apply("Div", graph.constant(std))
+      if obs_limit is not None:
+        graph.apply("Clip", graph.constant(-obs_limit), graph.constant(obs_limit))
     features.append(graph.value)
   if len(features) > 1:
     graph.value = features[0]

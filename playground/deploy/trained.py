@@ -61,7 +61,7 @@ def export_policy(trained: LoadedPolicy, state: State | None = None) -> Exported
   policy, agent, networks = jax.device_get(trained.policy), trained.config.agent, trained.trainer.networks
   params, seen = networks.mlp(policy.params.policy, policy.normalizer if agent.normalize_observations else None)
   inputs = networks.policy_inputs
-  model = policy_graph(params, inputs, networks.activation_name, seen, networks.cnn)
+  model = policy_graph(params, inputs, networks.activation_name, seen, networks.cnn, networks.obs_limit)
   content = model.SerializeToString()
   origin = {
     "run": trained.run_dir.path.absolute().name,

@@ -111,6 +111,9 @@ class NetworkConfig:
     "state"
   )
   estimated_obs_key: Annotated[str, 'observation group that the actor learns to estimate from images; "" is none'] = ""
+  clip_observations: Annotated[
+    float | None, positive(), "largest input of actor and critic, after normalisation; null: it is not clipped"
+  ] = None
   value_dtype: Annotated[str, "of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere"] = (
     "auto"
   )
@@ -186,6 +189,9 @@ class PPOConfig(AgentConfig):
   ] = False
   init_at_random_ep_len: Annotated[
     bool, "whether a reset gives environments random ages, so that a batch holds all parts of episodes"
+  ] = False
+  mirror_augmentation: Annotated[
+    bool, "whether every step is learned from its left-right mirror image, too (robots on legs)"
   ] = False
   augment_pixels: Annotated[
     int, count(0, 1024), "largest random shift of a trajectory's images in an update, pixels"

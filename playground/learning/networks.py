@@ -37,6 +37,7 @@ class Actor:
 
   Attributes:
     cnn: the layers that pictures go through; None without pictures.
+    obs_limit: what vectors are clipped to before actor and critic read them; None without a limit.
   """
 
   def __init__(
@@ -85,6 +86,7 @@ class Actor:
         f"agent.network.estimated_obs_key={self.estimated_obs_key!r} is what the actor reads: estimate another entry, "
         'or have it read pictures alone (agent.network.policy_obs_key="").'
       )
+    self.obs_limit: float | None = getattr(config, "clip_observations", None)
     self.precision = precision
     self.action_size = action_size
     self.activation, self.activation_name = ACTIVATIONS[config.activation], config.activation
@@ -132,7 +134,7 @@ class Actor:
     with self.at_precision():
       if self.pixel_sizes:
         return self._actor.apply(policy_params, *self._seen(obs, self.policy_obs_key))  # pyright: ignore[reportReturnType]
-      return self.policy_network.apply(None, policy_params, obs[self.policy_obs_key])
+      return self.policy_network.apply(None, policy_params, self._vector(obs, self.policy_obs_key))
 
   def logits_and_estimate(self, policy_params: Any, obs: Mapping[str, jax.Array]) -> tuple[jax.Array, jax.Array | None]:
     """`logits`, and what the actor takes `estimated_obs_key` to be, normalised, [..., D]; None where that is empty."""
@@ -174,7 +176,11 @@ class Actor:
 
   def _seen(self, obs: Mapping[str, jax.Array], key: str) -> tuple[dict[str, jax.Array], jax.Array | None]:
     """What a network on pixels is applied to: pictures, and the vector `key` unless that is empty."""
-    return {name: obs[name] for name in self.pixel_sizes}, obs[key] if key else None
+    return {name: obs[name] for name in self.pixel_sizes}, self._vector(obs, key) if key else None
+
+  def _vector(self, obs: Mapping[str, jax.Array], key: str) -> jax.Array:
+    """The entry `key` of a normalised observation within the limit."""
+    return obs[key] if self.obs_limit is None else jnp.clip(obs[key], -self.obs_limit, self.obs_limit)
 
   def _example(self) -> dict[str, jax.Array]:
     """An observation of zeros, a batch of one."""
@@ -244,7 +250,7 @@ class ActorCritic(Actor):
     with self.at_precision():
       if self.pixel_sizes:
         return self._critic.apply(value_params, *self._seen(obs, self.value_obs_key))[..., 0]  # pyright: ignore
-      return self._critic.apply(value_params, obs[self.value_obs_key])  # pyright: ignore[reportReturnType]
+      return self._critic.apply(value_params, self._vector(obs, self.value_obs_key))  # pyright: ignore[reportReturnType]
 
 
 class SoftActorCriticParams(struct.PyTreeNode):

@@ -22,6 +22,7 @@ from playground.learning.cnn import random_shift
 from playground.learning.hyperparameters import PPOConfig
 from playground.learning.networks import ActorCritic, ActorCriticParams, Normalizer, normalize
 from playground.learning.rollout import Environments, side_by_side, unroll
+from playground.mdp.symmetry import Mirror, mirror_of
 
 LOSSES = ("total_loss", "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")  # what is logged
 ESTIMATION = "estimation_loss"  # with them where something is estimated
@@ -46,6 +47,8 @@ class Batch(struct.PyTreeNode):
     targets: of the critic, [T, B], and
     advantages: [T, B]; only where they are computed once an epoch, else None.
     old_logits: of the policy before the update, [T, B, 2 * action_size]; only where the KL divergence is bounded.
+    mirrored_obs: normalised observations of the mirror images, each [T, B, ...], and
+    mirrored_action: their actions before squashing, [T, B, action_size]; only with `mirror_augmentation`.
   """
 
   obs: dict[str, jax.Array]
@@ -59,6 +62,8 @@ class Batch(struct.PyTreeNode):
   targets: jax.Array | None = None
   advantages: jax.Array | None = None
   old_logits: jax.Array | None = None
+  mirrored_obs: dict[str, jax.Array] | None = None
+  mirrored_action: jax.Array | None = None
 
 
 class PPOState(AlgorithmState):
@@ -77,6 +82,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
         f"agent.augment_pixels={config.augment_pixels} shifts pictures, and the task has none: set it to 0."
       )
     super().__init__(config, networks)
+    self.mirror: Mirror | None = _mirror(env, networks) if config.mirror_augmentation else None
     clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm else optax.identity()
     # With a desired KL divergence the learning rate is part of the optimiser's state.
     adam = optax.adam if config.desired_kl is None else optax.inject_hyperparams(optax.adam)
@@ -118,6 +124,11 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
       batch = batch.replace(value=networks.value(state.params.value, normalize(data.obs, state.normalizer)))
     if data.final_value is not None:
       batch = pay_time_outs(batch, data.final_value, config)
+    if (mirror := self.mirror) is not None:
+      mirrored = {key: mirror.obs[key](value) for key, value in data.obs.items()}
+      batch = batch.replace(
+        mirrored_obs=normalize(mirrored, normalizer), mirrored_action=mirror.action(data.raw_action)
+      )
     if self.bounds_kl:
       batch = batch.replace(old_logits=networks.logits(state.params.policy, batch.obs))
     scale, seen = None, state.targets_seen
@@ -235,22 +246,34 @@ def ppo_loss(
   if (limit := config.clip_advantages) is not None:
     advantages = jnp.clip(advantages, -limit, limit)
 
+  def surrogate_loss(ratio: jax.Array) -> jax.Array:
+    clipped_ratio = jnp.clip(ratio, 1 - config.clipping_epsilon, 1 + config.clipping_epsilon)
+    return -jnp.minimum(ratio * advantages, clipped_ratio * advantages).mean()
+
   log_ratio = networks.distribution.log_prob(logits, batch.raw_action) - batch.log_prob
   ratio = jnp.exp(log_ratio)
-  clipped_ratio = jnp.clip(ratio, 1 - config.clipping_epsilon, 1 + config.clipping_epsilon)
-  policy_loss = -jnp.minimum(ratio * advantages, clipped_ratio * advantages).mean()
+  policy_loss = surrogate_loss(ratio)
 
   def squared(error: jax.Array) -> jax.Array:
     error = error if value_scale is None else error / value_scale
     delta = config.value_huber_delta
     return jnp.square(error) if delta is None else 2 * optax.huber_loss(error, delta=delta)
 
-  value_error = squared(targets - values)
-  if (limit := config.clipping_epsilon_value) is not None:  # beyond it the loss stops paying
-    assert batch.value is not None
-    near = batch.value + jnp.clip(values - batch.value, -limit, limit)
-    value_error = jnp.maximum(value_error, squared(targets - near))
-  value_loss = 0.5 * config.vf_loss_coefficient * value_error.mean()
+  def critic_loss(values: jax.Array) -> jax.Array:
+    value_error = squared(targets - values)
+    if (limit := config.clipping_epsilon_value) is not None:  # beyond it the loss stops paying
+      assert batch.value is not None
+      near = batch.value + jnp.clip(values - batch.value, -limit, limit)
+      value_error = jnp.maximum(value_error, squared(targets - near))
+    return 0.5 * config.vf_loss_coefficient * value_error.mean()
+
+  value_loss = critic_loss(values)
+  if batch.mirrored_obs is not None:  # with the log-probabilities, advantages and targets of what was experienced
+    assert batch.mirrored_action is not None
+    mirrored_logits = networks.logits(params.policy, batch.mirrored_obs)
+    mirrored_log_prob = networks.distribution.log_prob(mirrored_logits, batch.mirrored_action)
+    policy_loss = (policy_loss + surrogate_loss(jnp.exp(mirrored_log_prob - batch.log_prob))) / 2
+    value_loss = (value_loss + critic_loss(networks.value(params.value, batch.mirrored_obs))) / 2
 
   entropy = networks.distribution.entropy(logits, key).mean()
   loss = policy_loss + value_loss - config.entropy_cost * entropy
@@ -264,6 +287,16 @@ def ppo_loss(
   parts = (loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
   bounded = {} if batch.old_logits is None else {KL: networks.kl(batch.old_logits, logits).mean()}
   return loss, dict(zip(LOSSES, parts, strict=True)) | estimation | bounded
+
+
+def _mirror(env: Env, networks: ActorCritic) -> Mirror:
+  """The task's mirror; raises ConfigError if it has none."""
+  try:
+    if networks.pixel_sizes:
+      raise ConfigError("pictures are not mirrored.")
+    return mirror_of(env)
+  except ConfigError as error:
+    raise ConfigError(f"agent.mirror_augmentation=true: {error}") from None
 
 
 def adapted_rate(rate: jax.Array, kl: jax.Array, config: PPOConfig) -> jax.Array:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from playground.errors import ConfigError, UnknownNameError, lookup, nearest
+from playground.mdp.options import mirrors_as
 from playground.physics.backend import PhysicsData
 
 if TYPE_CHECKING:
@@ -135,31 +136,37 @@ class StepContext:
     return self.env.terminations.any(self)
 
   @property
+  @mirrors_as("joints")
   def last_act(self) -> jax.Array:
     """The action of the step before, 0 at the start of an episode [action_size]."""
     return self.info["last_act"]
 
   @property
+  @mirrors_as("joints")
   def action_before_last(self) -> jax.Array:
     """The action two steps before [action_size]."""
     return self.info["last_last_act"]
 
   @property
+  @mirrors_as("joints")
   def joint_pos(self) -> jax.Array:
     """Joint positions, rad [joints]."""
     return self.data.qpos[self.robot.qpos]
 
   @property
+  @mirrors_as("joints")
   def joint_vel(self) -> jax.Array:
     """Joint velocities, rad/s [joints]."""
     return self.data.qvel[self.robot.qvel]
 
   @property
+  @mirrors_as("joints")
   def joint_pos_rel(self) -> jax.Array:
     """Joint positions relative to the default pose, rad [joints]."""
     return self.joint_pos - self.robot.default_pose
 
   @property
+  @mirrors_as("command")
   def command(self) -> jax.Array:
     """Velocity command: forward m/s, left m/s, turn rad/s [3]."""
     return self.carried("command")

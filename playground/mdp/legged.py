@@ -12,6 +12,7 @@ import numpy as np
 from playground.errors import ConfigError, lookup
 from playground.mdp.commands import is_still
 from playground.mdp.context import Robot, StepContext
+from playground.mdp.options import mirrors_as
 from playground.physics.backend import PhysicsData, mjx
 
 
@@ -32,6 +33,7 @@ class LeggedRobot(Robot):
     qpos, qvel: where the joints are in `qpos` and `qvel`.
     pose_weights: how much each joint's distance from the default pose counts, shape [nu].
     contact_groups: addresses of contact sensors' readings, by the name of a group.
+    left_to_right: beginnings or ends of names on the left and their counterparts on the right.
   """
 
   qpos = slice(7, None)
@@ -77,6 +79,7 @@ class LeggedRobot(Robot):
       if mj_model.body_parentid[body] in self._subtree:
         self._subtree.append(body)
     self._gaits = dict(config.get("gaits", {}))
+    self.left_to_right = dict(config.get("mirror") or {})
 
   def keyframe(self, name: str) -> jax.Array:
     """Returns the configuration of a keyframe, shape [nq]; raises UnknownNameError if there is none of that name."""
@@ -169,21 +172,25 @@ class LeggedContext(StepContext):
   robot: "LeggedRobot"
 
   @functools.cached_property
+  @mirrors_as("feet")
   def contact(self) -> jax.Array:
     """Which feet touch the floor, bool [feet]."""
     return self.robot.contact(self.data)
 
   @functools.cached_property
+  @mirrors_as("feet")
   def feet_air_time(self) -> jax.Array:
     """How long each foot has been in the air, this step included, s [feet]."""
     return self.carried("feet_air_time") + self.dt
 
   @functools.cached_property
+  @mirrors_as("feet")
   def swing_peak(self) -> jax.Array:
     """Highest z of each foot since it last touched, m [feet]."""
     return jnp.maximum(self.carried("swing_peak"), self.feet_height)
 
   @property
+  @mirrors_as("feet")
   def first_contact(self) -> jax.Array:
     """Which feet have landed, bool [feet]: one that touched in the step before but left since has, too."""
     return (self.carried("feet_air_time") > 0) & (self.contact | self.carried("last_contact"))
@@ -199,26 +206,31 @@ class LeggedContext(StepContext):
     return self.carried("phase")
 
   @property
+  @mirrors_as("polar")
   def gravity(self) -> jax.Array:
     """Direction of gravity in the base frame [3]."""
     return -self.data.site_xmat[self.robot.base_site][2]
 
   @property
+  @mirrors_as("same")
   def base_height(self) -> jax.Array:
     """World z of the base site, m [1]."""
     return self.data.site_xpos[self.robot.base_site, 2]
 
   @property
+  @mirrors_as("polar")
   def forward(self) -> jax.Array:
     """The base site's forward axis in the world frame [3]."""
     return self.data.site_xmat[self.robot.base_site][:, 0]
 
   @property
+  @mirrors_as("feet")
   def feet_height(self) -> jax.Array:
     """World z of the foot sites, m [feet]."""
     return self.data.site_xpos[self.robot.feet, 2]
 
   @property
+  @mirrors_as("feet_polar")
   def feet_velocity(self) -> jax.Array:
     """World velocities of the feet, m/s [feet, 3]."""
     return self.robot.foot_sensors(self.data, "foot_linvel")

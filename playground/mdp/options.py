@@ -3,12 +3,27 @@
 This module imports no JAX: the composition of a configuration checks keys with it.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from playground.limits import MOST, Limit, count, span
 
+# How an observation term's vector mirrors: each entry keeps its sign (`same`) or changes it (`opposite`); vectors in
+# space (`polar`) or of rotation (`axial`); forward, left and turn (`command`); w, x, y, z (`quaternion`); an entry for
+# each joint (`joints`) or foot (`feet`), or a vector in space for each foot (`feet_polar`). Longer vectors repeat it.
+MirrorKind = Literal["same", "opposite", "polar", "axial", "command", "quaternion", "joints", "feet", "feet_polar"]
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 _STEPS = Limit(0, 1000, whole=True, form="list", length=2, rising=True)
+
+
+def mirrors_as(kind: MirrorKind) -> Callable[[_Function], _Function]:
+  """Declares how the vector of an observation term's function mirrors (`playground.mdp.symmetry`)."""
+
+  def declare(function: _Function) -> _Function:
+    function.mirror = kind  # pyright: ignore[reportFunctionMemberAccess]
+    return function
+
+  return declare
 
 
 class RewardOptions(NamedTuple):

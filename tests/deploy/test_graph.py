@@ -68,6 +68,16 @@ def test_same_actions(activation: str, soft: bool) -> None:
     assert np.abs(ours).max() > 0.1
 
 
+def test_clipped_observations_are_clipped_in_the_graph() -> None:
+  nets = ActorCritic(OBS, ACTIONS, NetworkConfig((16, 8), (4,), "swish", clip_observations=0.7))
+  policy, normalizer = trained(nets)
+  obs = np.random.default_rng(1).normal(scale=3, size=(20, OBS)).astype(np.float32)
+  layers, normalization = nets.mlp(policy, normalizer)
+  model = policy_graph(layers, nets.policy_inputs, "swish", normalization, None, nets.obs_limit)
+  theirs = nets.act(policy, normalizer, obs, jax.random.PRNGKey(0), deterministic=True)  # pyright: ignore[reportArgumentType]
+  np.testing.assert_allclose(exported(model, nets.policy_inputs).actions(obs), theirs, atol=2e-6)
+
+
 def test_what_a_controller_finds() -> None:
   nets = networks("swish", soft=False)
   model = policy_graph(trained(nets)[0]["params"], nets.policy_inputs, "swish", None)

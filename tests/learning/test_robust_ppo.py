@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
 
+from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS, make_mesh
 from playground.learning.networks import ActorCritic
 from playground.learning.ppo import KL, Batch, adapted_rate, count_targets, gae, ppo_loss
@@ -106,6 +107,39 @@ def test_advantages_are_clipped(networks: ActorCritic) -> None:
   )[1]["policy_loss"]  # fmt: skip
   assert float(loss(advantages, clip_advantages=1.0)) == pytest.approx(float(loss(jnp.clip(advantages, -1, 1))))
   assert float(loss(advantages, clip_advantages=1.0)) != pytest.approx(float(loss(advantages)))
+
+
+def test_the_mirror_image_counts_as_much_as_what_was_experienced(networks: ActorCritic) -> None:
+  """The loss on a batch and its mirror image is that on both, one beside the other (RSL-RL's augmentation)."""
+  params, data = networks.init(jax.random.PRNGKey(0)), batch(networks)
+  obs, action = jax.tree.map(lambda x: -x, data.obs), -data.raw_action
+  advantages = jnp.linspace(-3, 3, 24).reshape(6, 4)
+  known = {"targets": advantages + 1, "advantages": advantages}
+  beside = lambda x, y: jnp.concatenate([x, y], axis=1)
+  twice = {name: beside(value, value) for name, value in (*known.items(), ("log_prob", data.log_prob))}
+  both = data.replace(obs=jax.tree.map(beside, data.obs, obs), raw_action=beside(data.raw_action, action), **twice)
+  parts = lambda batch: ppo_loss(params, batch, jax.random.PRNGKey(1), networks, SMALL_PPO)[1]
+  ours, theirs = parts(data.replace(mirrored_obs=obs, mirrored_action=action, **known)), parts(both)
+  alone = parts(data.replace(**known))
+  for name in ("policy_loss", "value_loss"):
+    assert float(ours[name]) == pytest.approx(float(theirs[name]), rel=1e-5)
+    assert float(ours[name]) != pytest.approx(float(alone[name]), rel=1e-3)
+  for name in ("entropy", "approx_kl"):
+    assert float(ours[name]) == float(alone[name]), "of what was experienced"
+
+
+def test_a_task_without_a_mirror_is_refused() -> None:
+  with pytest.raises(ConfigError, match=r"agent\.mirror_augmentation=true: only tasks of robots on legs"):
+    point_trainer(dataclasses.replace(SMALL_PPO, mirror_augmentation=True))
+
+
+def test_observations_are_clipped_as_the_networks_read_them(networks: ActorCritic) -> None:
+  limited = ActorCritic(PointTask().observation_size, 2, dataclasses.replace(SMALL_PPO.network, clip_observations=0.5))
+  params, obs = networks.init(jax.random.PRNGKey(0)), batch(networks).obs
+  clipped = jax.tree.map(lambda x: jnp.clip(x, -0.5, 0.5), obs)
+  np.testing.assert_array_equal(limited.logits(params.policy, obs), networks.logits(params.policy, clipped))
+  np.testing.assert_array_equal(limited.value(params.value, obs), networks.value(params.value, clipped))
+  assert not np.array_equal(limited.logits(params.policy, obs), networks.logits(params.policy, obs))
 
 
 def test_targets_of_the_first_epoch_are_those_of_the_first_minibatch(networks: ActorCritic) -> None:
