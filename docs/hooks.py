@@ -18,6 +18,7 @@ from playground.envs.options import TermsConfig
 from playground.settings import Setting, settings
 
 ROOT = Path(__file__).parents[1]
+REFERENCE = "results/reference"
 NOTEBOOK = ROOT / "docs/first_policy.ipynb"
 # Pages of the API's reference: modules, and packages all of whose modules are meant.
 API = {
@@ -55,7 +56,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
   pages["first_policy.md"] = _notebook_page()
   for uri, content in pages.items():
     files.append(File.generated(config, uri, content=content))
+  for curve in sorted((ROOT / REFERENCE).glob("*.png")):
+    files.append(File.generated(config, f"curves/{curve.name}", abs_src_path=str(curve)))
   return files
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+  """Lets pages of the site show the curves that lie outside of docs/, where the pages of the repository find them."""
+  return markdown.replace(f"](../{REFERENCE}/", "](curves/")
 
 
 def _uri(folder: str, title: str) -> str:

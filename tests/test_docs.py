@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import itertools
 import json
 import re
 import shlex
@@ -15,7 +16,9 @@ import pytest
 import yaml
 
 from playground import registry
-from playground.config import compose
+from playground.catalog import entries
+from playground.cli.main import _parser
+from playground.config import compose, config_dict, override_section
 from playground.errors import UnknownNameError
 from playground.randomization import Randomizer
 from playground.rendering.gl import find_gl
@@ -25,9 +28,13 @@ from tests.packages import PACKAGES, install, run
 
 REPOSITORY = Path(__file__).parents[1]
 DOCS = REPOSITORY / "docs"
-PAGES = (*DOCS.glob("*.md"), REPOSITORY / "README.md")
+README = REPOSITORY / "README.md"
+PAGES = (*DOCS.glob("*.md"), README)
 NOTEBOOK = DOCS / "first_policy.ipynb"
 MISTAKE = "joint_powr_l1"  # which a page misspells
+TOP_LEVEL = ("CONTRIBUTING.md", "CHANGELOG.md", "AGENTS.md", "llms.txt")
+NEW_PAGES = ("command-line", "faq", "results")
+BANNED = ("decisions?", "fresh starts?", "slips?", "deviations?", "passes over the data", "paid for", "afresh", "anew")
 # Names that a page introduces itself.
 OWN = ("SlideToTarget", "go1_worn", "=pup", "PupJoystick", "go1_in_wind", "reinforce", MISTAKE)
 # Pages that write out the files of a package of tests/packages, and the files that only the page has.
@@ -49,9 +56,17 @@ def files(page: str) -> dict[str, str]:
 def run_commands() -> list[tuple[str, ...]]:
   """What follows `playground-run` on the lines to type, in all pages, but for those with a name to fill in."""
   text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES).replace("\\\n", " ")
-  lines = re.findall(r"^playground-run +(.*)$", text, re.M)
+  lines = re.findall(r"^(?:playground-run|playground train) +(.*)$", text, re.M)
   commands = {tuple(shlex.split(line, comments=True)) for line in lines}
   return sorted(words for words in commands if not any(sign in word for word in words for sign in "<…"))
+
+
+def other_commands() -> list[tuple[str, ...]]:
+  """What follows `playground` on the lines to type, in all pages, but for `train` and `bench`."""
+  pages = (re.findall(r"^```\n(.*?)^```$", page.read_text(encoding="utf-8"), re.S | re.M) for page in PAGES)
+  text = "\n".join(itertools.chain(*pages)).replace("\\\n", " ")
+  lines = re.findall(r"^playground ((?!train|bench)[a-z-]+ .*)$", text, re.M)
+  return sorted({tuple(shlex.split(line.partition(" | ")[0], comments=True)) for line in lines})
 
 
 def names(words: tuple[str, ...], *of: str) -> bool:
@@ -65,6 +80,44 @@ def test_a_command_composes(words: tuple[str, ...]):
     assert compose_jobs([word for word in overrides if not word.startswith("seed=")] + ["seed=1"])
   else:
     compose(overrides)
+
+
+@pytest.mark.parametrize("words", other_commands(), ids=" ".join)
+def test_a_command_has_such_options(words: tuple[str, ...]):
+  _, unknown = _parser().parse_known_args(words)  # overrides that stand after options
+  assert not [word for word in unknown if "=" not in word]
+
+
+def test_the_readme_is_short_and_its_pictures_are_there():
+  text = README.read_text(encoding="utf-8")
+  assert len(text.splitlines()) <= 120
+  for page in PAGES:
+    for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+      assert (page.parent / picture).is_file(), f"{page.name}: {picture}"
+
+
+def test_the_readme_counts_as_the_catalogue_does():
+  text = README.read_text(encoding="utf-8")
+  for status in ("solved", "learning", "open"):
+    number = sum(entry.status == status for entry in entries().values())
+    (task,) = re.findall(rf"\| {number} tasks, such as (\w+) ", text)
+    assert entries()[task].status == status
+
+
+def test_the_readmes_configuration_is_one():
+  (block,) = re.findall(r"^```yaml\n(.*?)^```$", README.read_text(encoding="utf-8"), re.S | re.M)
+  values = yaml.safe_load(block)
+  assert values.pop("defaults")[0] == "joystick"
+  env = registry.config("Go1JoystickFlatTerrain")
+  section = override_section("env", env, {f"{k}.{name}": v for k, terms in values.items() for name, v in terms.items()})
+  registry.build(config_dict(section))
+
+
+@pytest.mark.parametrize("name", ["README.md", *(f"docs/{page}.md" for page in NEW_PAGES), *TOP_LEVEL])
+def test_a_page_has_the_fields_words(name: str):
+  """Words of our own that a reader would have to learn."""
+  text = (REPOSITORY / name).read_text(encoding="utf-8").lower()
+  assert [word for word in BANNED if re.search(rf"\b{word}\b", text)] == []
 
 
 def test_every_pip_finds_the_extras_that_are_told():
