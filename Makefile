@@ -6,11 +6,13 @@ ARGS ?=
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-# Compiling is most of what the tests do. Git ignores the folders; nothing is lost with them but time. XLA is told to
-# compile fast rather than fast code; `make test-slow` tests what users run.
-CACHES := JAX_COMPILATION_CACHE_DIR="$(CURDIR)/.pytest_cache/xla" WARP_CACHE_PATH="$(CURDIR)/.pytest_cache/warp"
+# Compiling is most of what the tests do. Git ignores the folders; nothing is lost with them but time. What one worker
+# has compiled, single operations too, the other one reads. XLA is told to compile fast rather than fast code;
+# `make test-slow` tests what users run.
+CACHES := JAX_COMPILATION_CACHE_DIR="$(CURDIR)/.pytest_cache/xla" WARP_CACHE_PATH="$(CURDIR)/.pytest_cache/warp" \
+  JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES=-1
 FAST_COMPILE := XLA_FLAGS="--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true \
-  --xla_cpu_use_fusion_emitters=false $$XLA_FLAGS"
+  --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 $$XLA_FLAGS"
 
 .DEFAULT_GOAL := setup
 .PHONY: setup run test test-slow test-rsl-rl test-slurm lint catalog docs wheel

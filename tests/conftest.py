@@ -1,15 +1,19 @@
 """For all tests: what compiling leaves behind costs neither time nor memory that is not there."""
 
 import ctypes
+import functools
 import gc
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
+
+from playground.config import composition, config_roots
 
 EMPTY = 1e9  # bytes that a worker holds with everything imported
 GROWTH = 1.5e9  # bytes by which it may grow before JAX forgets what it has traced and compiled
@@ -50,3 +54,17 @@ def logging_as_before() -> Iterator[None]:
   for handler in root.handlers[:]:
     if handler not in handlers:
       root.removeHandler(handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def composed_once() -> Iterator[None]:
+  """Hydra reads the shipped files for a choice of groups once a worker: they do not change under the tests."""
+  shipped, compose_files = tuple(config_roots()), composition._compose_files
+  once = functools.cache(compose_files)
+
+  def read(roots: Sequence[Path], *groups: str) -> Any:
+    return once(shipped, *groups) if tuple(roots) == shipped else compose_files(roots, *groups)
+
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(composition, "_compose_files", read)
+    yield

@@ -145,11 +145,11 @@ def test_a_task_has_an_experiment_of_its_name(configs: Path):
   ("line", "times"),
   [("experiment=go1_joystick", 1), ("env=CartpoleBalance agent=sac hardware=gpu", 1), ("debug=fast", 2)],
 )
-def test_a_run_is_composed_once(monkeypatch: pytest.MonkeyPatch, line: str, times: int):
+def test_a_run_is_composed_once(monkeypatch: pytest.MonkeyPatch, configs: Path, line: str, times: int):
   """Twice where a file changes keys that only other files define."""
   calls, composed = [], hydra.compose
   monkeypatch.setattr(hydra, "compose", lambda *args, **kwargs: calls.append(args) or composed(*args, **kwargs))
-  compose(line.split())
+  compose(line.split(), configs)
   assert len(calls) == times
 
 

@@ -102,6 +102,7 @@ def _caches(config: Any) -> str | None:
   os.environ.setdefault("WARP_CACHE_PATH", str(folder / "warp"))
   if not jax.config.jax_compilation_cache_dir:
     jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
-  jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+  least = min(0.5, jax.config.jax_persistent_cache_min_compile_time_secs)  # the environment may ask for less
+  jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
   jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
   return jax.config.jax_compilation_cache_dir

@@ -11,6 +11,7 @@ import pytest
 
 from playground.envs.base import State
 from playground.envs.task import Task
+from tests.envs.dm_control.suite import COSTLY, DOMAIN
 from tests.envs.golden import KEYS, TASKS, Golden, golden
 
 # Ten times what a change of qpos, qvel and qacc_warmstart by one rounding moves one step, relative to max(1, largest
@@ -19,11 +20,18 @@ STEP_BOUNDS = {"data/qpos": 2e-5, "data/qvel": 1e-3, "data/qacc": 1e-2, "data/qa
 OTHER_BOUND = 2e-3
 # The heights of upstream's rough ground are in a file that has no name; but for them these tasks are the flat ones.
 ON_ROUGH_GROUND = {name for name in TASKS if name.endswith("RoughTerrain")}
+# What differs between a rough task and its flat one is not recorded: one is compared always, all by `make test-slow`.
+RECORDED = [
+  pytest.param(name, marks=[pytest.mark.slow] * (name in ON_ROUGH_GROUND - {"Go1JoystickRoughTerrain"}))
+  for name in TASKS
+]
 # Compiling a legged robot's or a gripper's physics takes a minute. One of them is stepped always, the others by `make
-# test-slow`; that their models are right, tests/robots shows without compiling anything.
+# test-slow`, as are the costly ones of the suite; that their models are right, tests/robots and
+# tests/envs/dm_control/test_models.py show without compiling anything.
 LEGGED = ("Apollo", "Barkour", "Berkeley", "G1", "Go1", "H1", "Op3", "Spot", "T1")
 HANDS = ("Aero", "Aloha", "Leap", "Panda")
 SLOW = {name for name in TASKS if name.startswith((*LEGGED, *HANDS))} - {"Go1JoystickFlatTerrain"}
+SLOW |= {name for name in TASKS if DOMAIN.get(name) in COSTLY}
 SIMULATED = [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in TASKS]
 # Corners of boxes that rest on the floor touch or not as roundings have it: here the median step counts.
 RESTING = {"PandaPickCube", "PandaPickCubeOrientation", "PandaPickCubeCartesian"}
@@ -31,7 +39,7 @@ RESTING = {"PandaPickCube", "PandaPickCubeOrientation", "PandaPickCubeCartesian"
 IN_HAND = ("Aero", "Leap")
 
 
-@pytest.fixture(params=TASKS, scope="module")
+@pytest.fixture(params=RECORDED, scope="module")
 def recording(request: pytest.FixtureRequest) -> Golden:
   return golden(request.param)
 

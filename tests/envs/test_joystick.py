@@ -51,7 +51,7 @@ def test_batched_step(pushed: Any, start: State) -> None:
     "privileged_state": (BATCH, 123),
   }
   assert pushed.action_size == 12
-  assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
+  assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
   assert (after.reward >= 0).all()
 
 

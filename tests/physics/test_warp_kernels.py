@@ -110,6 +110,7 @@ def test_a_building_takes_the_process_that_stands_by(gpu, model):
   assert warp_kernels._standing_by == []
 
 
+@pytest.mark.slow  # all kernels
 def test_kernels_are_compiled_once(gpu, model, monkeypatch, tmp_path):
   import warp
 

@@ -33,7 +33,11 @@ def point() -> Iterator[None]:
     yield
 
 
-@pytest.fixture(scope="module", params=["ppo", "sac", "reppo", "fast_td3"])
+# That the others resume bit for bit, tests/learning/test_trainer.py shows without the files of a run.
+AGENTS = ["ppo", "sac", *(pytest.param(name, marks=pytest.mark.slow) for name in ("reppo", "fast_td3"))]
+
+
+@pytest.fixture(scope="module", params=AGENTS)
 def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
   """A run that nothing happens to."""
   run = tmp_path_factory.mktemp(request.param) / "run"

@@ -1,5 +1,6 @@
 """Chains of runs: what they leave behind, and that nothing that ends one early changes what comes out."""
 
+import functools
 import gc
 import os
 import re
@@ -39,6 +40,7 @@ stages:
 FAST = ["env=CartpoleBalance", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv"]
 LINE = [*FAST, "curriculum=mine", "curriculum.scale=1"]
 STAGES = ["1_near", "2_far"]
+slow = functools.partial(pytest.param, marks=pytest.mark.slow)
 
 
 class Wide(Point):
@@ -166,10 +168,10 @@ def kill() -> None:
 @pytest.mark.parametrize(
   ("moment", "finished", "steps"),
   [
-    ("in the first stage", [], [160, None]),
-    ("at the end of the first stage", ["1_near"], [320, None]),
+    slow("in the first stage", [], [160, None]),
+    slow("at the end of the first stage", ["1_near"], [320, None]),
     ("between the stages", ["1_near"], [320, None]),
-    ("while the second stage compiles", ["1_near"], [320, None]),
+    slow("while the second stage compiles", ["1_near"], [320, None]),
     ("in the second stage", ["1_near"], [320, 160]),
   ],
 )

@@ -1,4 +1,7 @@
-"""Whole runs of real tasks over two processes with two devices each, as over two machines."""
+"""Whole runs of real tasks over two processes with two devices each, as over two machines.
+
+All of them take a minute: `make test` has tests/hardware/test_topology.py.
+"""
 
 import os
 import shutil
@@ -14,6 +17,8 @@ from playground.config import config_roots
 from playground.learning.checkpoints import find_checkpoints
 from playground.runs.run_dir import RunDirectory
 from tests.processes import COMMAND, ended, two_processes
+
+pytestmark = pytest.mark.slow
 
 LINE = ["env=CartpoleBalance", "tuned=null", "debug=fast", "tracking=csv", "run_dir=run"]
 LOST_AFTER = "hardware.distributed.lost_after=5"
@@ -51,6 +56,10 @@ def test_the_others_end_with_a_killed_process_and_the_run_goes_on(tmp_path: Path
   table = pd.read_csv(tmp_path / "run/metrics.csv")
   assert table["step"].is_unique and table["step"].is_monotonic_increasing, "no row is there twice"
 
+
+def test_processes_with_different_checkpoints_are_refused(tmp_path: Path) -> None:
+  line = [*LINE, LOST_AFTER, "agent.num_timesteps=8000", "agent.num_evals=11"]
+  kill(two_processes(tmp_path, COMMAND, *line), 1, tmp_path / "run", 1600)
   shutil.copytree(tmp_path / "run", tmp_path / "other/run", symlinks=True)
   shutil.rmtree(find_checkpoints(tmp_path / "other/run")[0])
   processes = two_processes(tmp_path, COMMAND, "resume=run", second=tmp_path / "other")
@@ -97,7 +106,6 @@ def test_a_chain_of_sac_with_videos(tmp_path: Path, monkeypatch: pytest.MonkeyPa
   assert "chain is finished: nothing to resume" in first
 
 
-@pytest.mark.slow
 def test_the_go1_with_randomised_models(tmp_path: Path) -> None:
   """Trained, evaluated and filmed; a signal to the process that writes nothing changes no bit of what comes out."""
   line = ["env=Go1JoystickFlatTerrain", "randomization=go1", "tuned=null", "debug=fast", "tracking=csv", "run_dir=run"]

@@ -56,7 +56,7 @@ def test_nan_is_counted_dumped_and_kept_out(
   assert list((run / "nan_dump").iterdir()) == [dump], "one dump a run, however often it is resumed"
 
 
-@pytest.mark.parametrize("agent", ["ppo", "sac"])
+@pytest.mark.parametrize("agent", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_too_many_rejected_gradient_steps_stop_the_run(tmp_path: Path, cache: Path, agent: str) -> None:
   run = tmp_path / "run"
   config = compose([*TASK, f"agent={agent}", f"run_dir={run}"])

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import functools
 import math
 import os
 import pty
@@ -37,6 +38,7 @@ BATCH = 80  # environment steps of one training step with debug=fast
 STEPS = 400_000  # seconds of training, so that a signal finds the run at work
 LONG = [*TASK, f"agent.num_timesteps={STEPS - 10}", "agent.num_evals=5"]  # a checkpoint every quarter
 COMMAND = [sys.executable, "-c", "from playground.cli.run import main; main()"]
+slow = functools.partial(pytest.param, marks=pytest.mark.slow)
 
 
 def start(run: Path, cache: Path, *overrides: str, resumed: bool = False) -> "subprocess.Popen[str]":
@@ -152,7 +154,7 @@ def test_a_run_leaves_everything_behind(whole: Path) -> None:
   assert all(str(path) in log for path in (run.metrics_csv, run.plots, run.checkpoints))
 
 
-@pytest.mark.parametrize("moment", ["before the first checkpoint", "while one is written", "after one"])
+@pytest.mark.parametrize("moment", [slow("before the first checkpoint"), "while one is written", slow("after one")])
 def test_sigkill_and_resume_change_nothing(
   moment: str, whole: Path, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,7 +176,7 @@ def test_sigkill_and_resume_change_nothing(
   assert len(RunDirectory(run).manifest["earlier_starts"]) == 1
 
 
-@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("signum", [signal.SIGTERM, slow(signal.SIGINT)])
 def test_a_signal_saves_and_leaves(signum: int, whole: Path, cache: Path, tmp_path: Path) -> None:
   run = tmp_path / "run"
   assert stop(start(run, cache), signum, lambda: last_row(run) > 0.3 * STEPS) == 128 + signum
@@ -187,6 +189,7 @@ def test_a_signal_saves_and_leaves(signum: int, whole: Path, cache: Path, tmp_pa
   assert_same_result(run, whole)
 
 
+@pytest.mark.slow
 def test_a_signal_while_compiling(whole: Path, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
   run = tmp_path / "run"
   log = run.with_suffix(".log")
@@ -274,6 +277,7 @@ def test_damaged_metrics_are_rebuilt(whole: Path, copy: Path, capsys: pytest.Cap
 # What the system denies
 
 
+@pytest.mark.slow
 def test_a_terminal_that_is_gone(whole: Path, cache: Path, tmp_path: Path) -> None:
   """A closed window, a lost connection: nothing can be printed any more, and the run is saved."""
   run = tmp_path / "run"
@@ -320,6 +324,7 @@ def test_a_disk_that_is_full(whole: Path, cache: Path, tmp_path: Path) -> None:
   assert_same_result(run, whole)
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_removed_in_the_middle(whole: Path, cache: Path, tmp_path: Path) -> None:
   run = tmp_path / "run"
   process = start(run, cache)

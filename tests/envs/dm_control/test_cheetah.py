@@ -31,6 +31,7 @@ def test_initial_pose(cheetah: CheetahRun) -> None:
   np.testing.assert_allclose(qpos[:, 3:].max(0), high, atol=0.03)
 
 
+@pytest.mark.slow  # compiles the 200 steps in which a cheetah comes to rest
 def test_episodes_start_at_rest(cheetah: CheetahRun) -> None:
   reset = jax.jit(cheetah.reset)
   first, second = (reset(jax.random.PRNGKey(seed)).data for seed in (0, 1))
