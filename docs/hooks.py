@@ -9,6 +9,7 @@ from pathlib import Path
 import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 from playground.config.comments import flow, keys_and_comments
 from playground.config.definitions import RunSettings, defined
@@ -64,6 +65,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, **_: object) -> str:
   """Lets pages of the site show the curves that lie outside of docs/, where the pages of the repository find them."""
   return markdown.replace(f"](../{REFERENCE}/", "](curves/")
+
+
+def on_post_page(output: str, page: Page, **_: object) -> str:
+  """Takes the script that searching in a file needs from the site itself: nothing is fetched when a page is read."""
+  return output.replace("https://unpkg.com/iframe-worker/shim", "../" * page.url.count("/") + "iframe-worker.js")
 
 
 def _uri(folder: str, title: str) -> str:

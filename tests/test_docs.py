@@ -260,6 +260,9 @@ def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   assert done.returncode == 0, done.stdout + done.stderr
   page = (tmp_path / "site/reference/configs/hardware.html").read_text(encoding="utf-8")
   assert "full float32, TF32 ruins some contact-rich tasks" in page  # beside a field of HardwareConfig
+  assert (
+    'src="../../iframe-worker.js"' in page and "unpkg" not in page and (tmp_path / "site/iframe-worker.js").is_file()
+  )
   page = (tmp_path / "site/reference/api/parts-of-tasks.html").read_text(encoding="utf-8")
   assert 'id="playground.mdp.tolerance.tolerance"' in page
 

@@ -89,9 +89,11 @@ class WandbTracker:
     except Exception as error:
       if mode != "online":
         raise
-      self._notify(f"W&B cannot be reached ({_reason(error)}): this run is recorded offline, for `wandb sync`.")
+      self._notify(f"W&B cannot be reached ({_reason(error)}): this run is recorded offline.")
       wandb.teardown()  # its service still holds the id
       self._run = wandb.init(**start, mode="offline")
+    if recorded := sorted(folder.glob("wandb/offline-run-*")):  # the names begin with the time
+      self._notify(f"W&B records this run offline; to upload it: wandb sync {recorded[-1]}")
 
   def _guard(self, call: Callable[[], Any]) -> None:
     try:

@@ -175,7 +175,10 @@ def test_wandb_offline_writes_and_keeps_its_id(tmp_path: Path):
     assert inner._run.config["seed"] == 1 and inner._run.offline and inner._run.name == "run"
     trackers.log(10 if resume_step is None else 20, {"loss": 1.0})
     trackers.close("finished")
-  assert complaints == [] and ids[0] == ids[1]
+  assert [text.partition(str(run.path))[0] for text in complaints] == [
+    "W&B records this run offline; to upload it: wandb sync "
+  ] * 2
+  assert ids[0] == ids[1]
   assert (run.path / "wandb_run_id").read_text() == ids[0]
   files = list(run.path.glob(f"wandb/offline-run-*/run-{ids[0]}.wandb"))
   assert files and all(f.stat().st_size > 0 for f in files)
