@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 from playground.errors import ConfigError
 
 COLUMNS = {
-  "benchmark": "the command: throughput, startup, scaling, breakdown, pixels, topology, chain, compare, learning",
+  "benchmark": "the command, such as throughput, startup, topology, chain, compare, learning or golden",
   "task": "the task's name, of a chain the experiment's",
   "agent": "ppo, ppo_paper or sac",
   "who": "ours, or the peer's name and version",
@@ -44,6 +44,7 @@ QUANTITIES = {
   "best_return": "best mean return of an evaluation, that of the untrained policy apart",
   "final_return": "mean return of the last evaluation",
   "final_mode_return": "the same where the policy acts by its mode",
+  "golden_metric": "last value of the column of metrics.csv that setting names",
   "steps": "control steps trained",
   "wall_clock_s": "of a run without compiling (conditions say where it is in), evaluations included",
 }
@@ -95,6 +96,10 @@ class Table:
     """Whether there is a row with these columns."""
     texts = {name: str(value) for name, value in wanted.items()}
     return any(all(row[name] == text for name, text in texts.items()) for row in self._rows)
+
+  def rows(self, start: int = 0) -> list[dict[str, str]]:
+    """The rows from the `start`-th on, in the order in which they came."""
+    return self._rows[start:]
 
   @contextmanager
   def _to_itself(self) -> Iterator[BinaryIO]:

@@ -10,7 +10,7 @@ from playground.benchmark.arguments import help_of, parse
 from playground.errors import PlaygroundError, UnknownNameError, nearest, one_sentence
 
 # What measures is one module's; the others are a module each, with `Options` and `run(options) -> exit code`.
-OTHERS = {"report": "playground.benchmark.report", "gate": "playground.benchmark.gate"}
+OTHERS = {name: f"playground.benchmark.{name}" for name in ("golden", "report", "gate")}
 
 
 def main() -> None:

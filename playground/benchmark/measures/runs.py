@@ -16,7 +16,7 @@ from playground.benchmark.measures.subject import alone
 from playground.benchmark.schema import commit_of
 from playground.benchmark.worker import Facts
 from playground.config import RunConfig, compose
-from playground.errors import PlaygroundError
+from playground.errors import PlaygroundError, nearest
 from playground.interpreter import PYTHON
 from playground.learning.hyperparameters import read_config
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
@@ -93,6 +93,19 @@ def chain(facts: Facts, experiment: str, overrides: list[str], runs: str, again:
       columns["commit"] = commit_of(git)
     columns["conditions"] = f"task {stage['env']}, evaluations included, compiling not"
     emit_result(facts, stage, ("steps", "final_return", "wall_clock_s"), **columns)
+
+
+def golden(facts: Facts, overrides: list[str], metrics: list[str], settings: list[str]) -> None:
+  """A row for each of a run's metrics: the last value of that column of metrics.csv; `settings` are their `setting`."""
+  with tempfile.TemporaryDirectory() as folder:
+    run = RunDirectory(Path(folder) / "run")
+    run_training([*overrides, "video.enable=false", "tracking=csv", f"run_dir={run.path}"])
+    facts.update(facts_of(run.manifest), conditions=f"{run.summary['steps']:,} steps; {' '.join(overrides)}")
+    table = pd.read_csv(run.metrics_csv)
+    for metric, setting in zip(metrics, settings, strict=True):
+      if metric not in table or table[metric].dropna().empty:
+        raise RunFailedError(f"metrics.csv has no {metric}.{nearest(metric, list(table))}")
+      facts.emit("golden_metric", float(table[metric].dropna().iloc[-1]), "", setting=setting)
 
 
 def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:

@@ -1,0 +1,151 @@
+"""`playground-bench golden`: does what learned still learn? Whole runs, with a window for each metric."""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from playground.benchmark.arguments import check_amounts, option
+from playground.benchmark.jobs import Measurement, Plan, probe, run_jobs
+from playground.benchmark.schema import Table
+from playground.config import compose
+from playground.config.files import shipped
+from playground.errors import ConfigError, lookup
+
+QUANTITY = "golden_metric"
+_KEYS = ("run", "metrics", "from")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(Plan):
+  """Trains the runs of a set and fails (exit code 1) where a metric's last value is outside its window."""
+
+  set: str = option("cpu", "cpu (2 cores, under 15 minutes) or gpu (one H200, under 30 minutes)")
+  only: tuple[str, ...] = option((), "names of runs, all of the set if none")
+  rerun: bool = option(True, "train again what the CSV has already; false goes on where minutes= ended")
+  cache: bool = option(True, "reuse compiled programs")
+  table: str | None = option(None, "YAML of the sets; null is benchmarks/golden.yaml")
+  out: str | None = option(None, "CSV that rows are added to; null is results/benchmarks/golden.csv")
+  overrides: tuple[str, ...] = option((), "of every run's configuration")
+
+
+@dataclasses.dataclass(frozen=True)
+class Golden:
+  """A run and what must come of it.
+
+  Attributes:
+    name: of the run.
+    overrides: of `playground-run`.
+    windows: least and most of the last value of a column of metrics.csv.
+    source: where the windows are from.
+  """
+
+  name: str
+  overrides: tuple[str, ...]
+  windows: Mapping[str, tuple[float, float]]
+  source: str
+
+
+def run(options: Options) -> int:
+  """Trains and judges; returns the exit code: 0, 1 for a failed run or a value outside, 3 where the time was up.
+
+  Raises:
+    PlaygroundError: an invalid option, or a file of sets that is not one.
+  """
+  check_amounts(options)
+  path = Path(options.table) if options.table else shipped("benchmarks") / "golden.yaml"
+  runs = lookup(read(path), options.set, "set")
+  chosen = [lookup(runs, name, "only") for name in options.only] or list(runs.values())
+  jobs = [measurement(each, options) for each in chosen]
+  table = Table(Path(options.out or "results/benchmarks/golden.csv"))
+  facts = probe([text for text in options.overrides if text.startswith("hardware")], options.gpus)
+  print(f"{facts['devices']} x {facts['device']}; {facts['versions']}")
+  earlier = len(table.rows())
+  code = run_jobs(jobs, table, facts, options)
+  rows = table.rows(earlier if options.rerun else 0)
+  outside = [name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job, facts))]
+  if outside:
+    print(f"error: outside of their windows: {', '.join(each.name for each in outside)}.", file=sys.stderr)
+  return code or (1 if outside else 0)
+
+
+def judge(golden: Golden, found: Mapping[str, float]) -> bool:
+  """Prints a line for each metric that was measured; returns whether none of them is outside its window."""
+  good = True
+  for metric, (least, most) in golden.windows.items():
+    if metric in found:
+      inside = least <= found[metric] <= most  # NaN is outside
+      verdict = "ok" if inside else f"OUTSIDE (window from {golden.source})"
+      print(f"{golden.name}: {metric} {found[metric]:.4g}, window {least:g} to {most:g}: {verdict}", flush=True)
+      good &= inside
+  return good
+
+
+def measurement(golden: Golden, options: Options) -> Measurement:
+  """The run as a job; raises ConfigError for overrides that are invalid."""
+  overrides = [*golden.overrides, *options.overrides]
+  agent = compose(overrides).agent.name
+  columns = {"benchmark": "golden", "task": golden.name, "agent": agent, "who": "ours", "setting": ""}
+  metrics = list(golden.windows)
+  last = {"quantity": QUANTITY, "setting": setting(options.overrides, metrics[-1])}
+  arguments = {"overrides": overrides, "metrics": metrics, "settings": [setting(options.overrides, m) for m in metrics]}
+  return Measurement("runs:golden", arguments, columns, last)
+
+
+def setting(overrides: Sequence[str], metric: str) -> str:
+  """The column `setting` of a metric's row."""
+  return " ".join((*overrides, f"metric={metric}"))
+
+
+def values(rows: Sequence[Mapping[str, str]], job: Measurement, facts: Mapping[str, Any]) -> dict[str, float]:
+  """The newest value of each metric of a run on this device."""
+  metrics = dict(zip(job.arguments["settings"], job.arguments["metrics"], strict=True))
+  same = {"benchmark": "golden", "task": job.columns["task"], "quantity": QUANTITY, "device": facts["device"]}
+  own = [row for row in rows if row["setting"] in metrics and all(row[key] == text for key, text in same.items())]
+  return {metrics[row["setting"]]: float(row["value"]) for row in own}
+
+
+def read(path: Path) -> dict[str, dict[str, Golden]]:
+  """The sets of a file, by name.
+
+  Raises:
+    ConfigError: the file cannot be read, or an entry is not of the form of benchmarks/golden.yaml.
+  """
+  try:
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+  except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+    raise ConfigError(f"table={path} cannot be read: {reason}.") from None
+  if (
+    not isinstance(content, dict)
+    or not content
+    or not all(isinstance(runs, dict) and runs for runs in content.values())
+  ):
+    raise ConfigError(f"table={path} must hold sets of runs, as benchmarks/golden.yaml does.")
+  return {
+    name: {run: _golden(f"{path}: {name}.{run}", run, entry) for run, entry in runs.items()}
+    for name, runs in content.items()
+  }
+
+
+def _golden(place: str, name: str, entry: Any) -> Golden:
+  if not isinstance(entry, dict) or set(entry) != set(_KEYS):
+    raise ConfigError(f"{place} must have the keys {', '.join(_KEYS)}.")
+  overrides, metrics = entry["run"], entry["metrics"]
+  if not isinstance(overrides, list) or not all(isinstance(text, str) for text in overrides):
+    raise ConfigError(f"{place}.run must be a list of overrides such as env=CheetahRun.")
+  if not isinstance(metrics, dict) or not metrics:
+    raise ConfigError(f"{place}.metrics must name a column of metrics.csv with its window, [least, most].")
+  windows = {str(metric): _window(f"{place}.metrics.{metric}", window) for metric, window in metrics.items()}
+  return Golden(name, tuple(overrides), windows, str(entry["from"]))
+
+
+def _window(place: str, window: Any) -> tuple[float, float]:
+  numbers = isinstance(window, list) and all(type(x) in (int, float) and math.isfinite(x) for x in window)
+  if not numbers or len(window) != 2 or window[0] > window[1]:
+    raise ConfigError(f"{place}={window} must be two numbers, the least and the most.")
+  return float(window[0]), float(window[1])

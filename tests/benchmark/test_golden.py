@@ -1,0 +1,116 @@
+"""Golden windows: inside is 0, outside is 1, and what is no window is one sentence."""
+
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from playground.benchmark import golden
+from playground.benchmark.golden import Golden, Options, judge, measurement, read, run
+from playground.benchmark.jobs import Measurement
+from playground.benchmark.schema import Table
+from playground.config.files import shipped
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError
+
+FACTS = {"devices": 1, "device": "CPU", "versions": "1"}
+ONE = """
+cpu:
+  pole:
+    run: [env=CartpoleBalance, debug=fast, hardware=cpu, tuned=null]
+    metrics: {eval/episode_reward: [0, 20], eval/episode_length: [20, 20]}
+    from: here
+"""
+
+
+def write(folder: Path, text: str = ONE) -> str:
+  (folder / "golden.yaml").write_text(text)
+  return str(folder / "golden.yaml")
+
+
+def test_the_committed_sets() -> None:
+  sets = read(shipped("benchmarks") / "golden.yaml")
+  assert set(sets) == {"cpu", "gpu"}
+  agents = {text for each in sets["cpu"].values() for text in each.overrides if text.startswith("agent=")}
+  assert agents == {"agent=ppo", "agent=sac", "agent=reppo", "agent=fast_td3"}
+  assert len(sets["gpu"]) == 8
+
+
+@pytest.mark.slow
+def test_the_committed_runs_are_valid() -> None:
+  for runs in read(shipped("benchmarks") / "golden.yaml").values():
+    for each in runs.values():
+      assert measurement(each, Options()).columns["agent"]
+
+
+@pytest.mark.parametrize(
+  ("found", "good"),
+  [({"a": 1.0}, True), ({"a": 2.0}, True), ({"a": 2.1}, False), ({"a": 0.9}, False), ({"a": float("nan")}, False)],
+)
+def test_the_ends_of_a_window_are_in_it(found: Mapping[str, float], good: bool) -> None:
+  assert judge(Golden("x", (), {"a": (1.0, 2.0)}, "here"), found) is good
+
+
+def test_what_was_not_measured_is_not_judged(capsys: pytest.CaptureFixture[str]) -> None:
+  assert judge(Golden("x", (), {"a": (1.0, 2.0)}, "here"), {})
+  assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("value", "ended", "code"), [(10.0, 0, 0), (30.0, 0, 1), (10.0, 3, 3), (None, 1, 1)])
+def test_exit_codes(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: float | None, ended: int, code: int
+) -> None:
+  def measure(jobs: Sequence[Measurement], table: Table, facts: Mapping[str, Any], plan: Options) -> int:
+    (job,) = jobs
+    shared: dict[str, Any] = {**job.columns, "device": facts["device"], "quantity": "golden_metric"}
+    for text in job.arguments["settings"] if value is not None else ():
+      table.add({**shared, "setting": text, "value": 20 if "length" in text else value})
+    return ended
+
+  monkeypatch.setattr(golden, "probe", lambda *_: FACTS)
+  monkeypatch.setattr(golden, "run_jobs", measure)
+  options = Options(table=write(tmp_path), out=str(tmp_path / "rows.csv"))
+  assert run(options) == code
+  monkeypatch.setattr(golden, "run_jobs", lambda *_: 0)
+  assert run(options) == 0, "rows of an earlier start are not judged, where all is trained again"
+
+
+@pytest.mark.parametrize(
+  ("text", "message"),
+  [
+    ("a", "must hold sets of runs"),
+    ("cpu: {}", "must hold sets of runs"),
+    ("cpu: [", "cannot be read"),
+    (ONE.replace("    from: here\n", ""), "cpu.pole must have the keys run, metrics, from"),
+    (ONE.replace("[0, 20]", "[20, 0]"), r"eval/episode_reward=\[20, 0\] must be two numbers"),
+    (ONE.replace("[0, 20]", "[.nan, 0]"), "must be two numbers"),
+    (ONE.replace("[0, 20]", "3"), "must be two numbers"),
+    (ONE.replace("tuned=null", "agent.learning_rat=1"), "learning_rat"),
+  ],
+)
+def test_mistakes_are_said_before_anything_runs(tmp_path: Path, text: str, message: str) -> None:
+  with pytest.raises(PlaygroundError, match=message):
+    run(Options(table=write(tmp_path, text)))
+
+
+def test_unknown_names(tmp_path: Path) -> None:
+  table = write(tmp_path)
+  with pytest.raises(UnknownNameError, match="set: 'gpuu' is unknown"):
+    run(Options(table=table, set="gpuu"))
+  with pytest.raises(UnknownNameError, match="Did you mean 'pole'"):
+    run(Options(table=table, only=("poles",)))
+  with pytest.raises(ConfigError, match="cannot be read"):
+    run(Options(table=str(tmp_path / "none.yaml")))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("window", "code"), [("[0, 20]", 0), ("[0, 1]", 1)])
+def test_a_run(tmp_path: Path, window: str, code: int) -> None:
+  table = write(tmp_path, ONE.replace("[0, 20]", window))
+  command = [sys.executable, "-m", "playground.cli.bench", "golden", f"table={table}", f"out={tmp_path / 'rows.csv'}"]
+  done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+  assert done.returncode == code, done.stdout + done.stderr
+  assert "pole: eval/episode_length 20, window 20 to 20: ok" in done.stdout
+  assert ("OUTSIDE (window from here)" in done.stdout) == bool(code)
