@@ -15,9 +15,9 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from playground.errors import CheckpointError, ConfigError
+from playground.settings import Plain
 
 
 def need_folder(folder: Path, option: str) -> None:
@@ -61,7 +61,7 @@ def write_text(path: Path, text: str) -> None:
     os.fsync(file.fileno())
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
+def write_json(path: Path, content: Mapping[str, object]) -> None:
   """Writes `content` atomically as strict JSON; NaN and infinity, which JSON has not, become null."""
   write_text(path, json.dumps(plain(content, finite=True), indent=2, allow_nan=False) + "\n")
 
@@ -133,7 +133,7 @@ def keep_copy(path: Path, stem: str) -> Path:
   return copy
 
 
-def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Any]:
+def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Plain]:
   """Returns the object in `path`, or {} if there is no such file.
 
   Args:
@@ -159,7 +159,7 @@ def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Any]:
   return content
 
 
-def plain(value: Any, finite: bool = False) -> Any:
+def plain(value: Plain, finite: bool = False) -> Plain:
   """Returns `value` (ConfigDict, tuple, path, array, …) as the dicts, lists and scalars that YAML and JSON know."""
   if hasattr(value, "to_dict"):  # ml_collections.ConfigDict
     value = value.to_dict()

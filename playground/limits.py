@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 MOST = 1e9  # of any number without a limit of its own: its square fits float32
 
@@ -34,7 +34,7 @@ class Limit:
     """The same for a number, or for each number of a list that is not empty."""
     return dataclasses.replace(self, form="either")
 
-  def allows(self, value: Any) -> bool:
+  def allows(self, value: object) -> bool:
     """Whether a value is within the limit."""
     if not isinstance(value, list | tuple):
       return self.form != "list" and self._allows_number(value)
@@ -46,7 +46,7 @@ class Limit:
       and not (self.rising and sorted(value) != list(value))
     )
 
-  def _allows_number(self, value: Any) -> bool:
+  def _allows_number(self, value: object) -> bool:
     if not isinstance(value, int | float) or isinstance(value, bool) or value != value:
       return False
     if not self.low <= value <= self.high or (self.above and value == self.low):

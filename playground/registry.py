@@ -15,22 +15,37 @@ Classes of any other package are refused unless the user trusts it (`playground.
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 from ml_collections import ConfigDict
 
-from playground.config import compose, config_dict, in_order_of, options, override_section, task_names
+from playground.config import (
+  RunConfig,
+  TaskConfig,
+  compose,
+  config_dict,
+  in_order_of,
+  options,
+  override_section,
+  task_names,
+)
+from playground.envs.options import sees
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.settings import Section
 from playground.trust import trusted_object
 
 if TYPE_CHECKING:
+  import jax
+  from mujoco import mjx
+
   from playground.envs.base import Env
 
+DomainRandomizer: TypeAlias = "Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]"
 ALL_ENVS: tuple[str, ...]  # every task's name, read when asked for
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> tuple[str, ...]:
   if name == "ALL_ENVS":
     return tuple(names())
   raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -41,7 +56,7 @@ def names(word: str | None = None) -> list[str]:
   return [name for name in task_names() if word is None or word.lower() in name.lower()]
 
 
-def config(name: str) -> ConfigDict:
+def config(name: str) -> TaskConfig:
   """A task's configuration as its file has it, the robot under `robot`: a fresh copy, yours to change.
 
   Raises:
@@ -55,9 +70,9 @@ get_default_config = config
 
 def load(
   name: str,
-  config: ConfigDict | Mapping[str, Any] | None = None,
-  overrides: Mapping[str, Any] | None = None,
-  config_overrides: Mapping[str, Any] | None = None,
+  config: ConfigDict | Section | None = None,
+  overrides: Section | None = None,
+  config_overrides: Section | None = None,
 ) -> "Env":
   """Builds a task.
 
@@ -78,11 +93,10 @@ def load(
   return build(config_dict(section))
 
 
-def build(env_config: ConfigDict) -> "Env":
+def build(env_config: TaskConfig) -> "Env":
   """Builds the task that a composed env section describes, with a camera if that says so (`env.vision`)."""
   env = task_class(str(env_config.task))(env_config)
-  vision: Any = env_config.get("vision")
-  if vision is None or not vision.enable:
+  if not sees(env_config):
     return env
   from playground.rendering.vision import Vision
 
@@ -103,7 +117,7 @@ def task_class(task: str) -> Callable[[ConfigDict], "Env"]:
   return cast("Callable[[ConfigDict], Env]", found)
 
 
-def get_domain_randomizer(name: str) -> Callable[..., Any] | None:
+def get_domain_randomizer(name: str) -> "DomainRandomizer | None":
   """The task's randomisation as Playground 0.2.0 gave it, or None if it has none.
 
   Returns:
@@ -112,18 +126,18 @@ def get_domain_randomizer(name: str) -> Callable[..., Any] | None:
   """
   from playground.randomization import domain_randomizer, model_fields
 
-  events: Any = config(name).events
+  events = config(name).events
   if not model_fields(events, "startup"):
     return None
 
   @functools.cache
-  def randomizer() -> Callable[..., Any]:
+  def randomizer() -> DomainRandomizer:
     return domain_randomizer(load(name).mj_model, events)
 
   return lambda mjx_model, rng: randomizer()(mjx_model, rng)
 
 
-def _composed(name: str) -> Any:
+def _composed(name: str) -> RunConfig:
   """The composition of a task alone: no tuned set, whose env values belong to an algorithm."""
   if name not in (task_names() if "/" not in name else options("env")):
     raise UnknownNameError(f"Task {name!r} does not exist; `playground list` shows all.{nearest(name, task_names())}")

@@ -17,9 +17,12 @@ import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from playground.errors import UnknownNameError, nearest
 from playground.limits import Limit
 
 T = TypeVar("T")
+Plain = Any  # mappings, lists and scalars inside each other, as YAML has them; they are checked where they are read
+Section = Mapping[str, Plain]  # of a configuration
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +40,7 @@ class Setting:
   """
 
   name: str
-  default: Any
+  default: object
   limit: Limit | None
   choices: tuple[str, ...] | None
   text_depth: int | None
@@ -51,30 +54,41 @@ def settings(cls: type) -> dict[str, Setting]:
   return {setting.name: setting for setting in _settings(cls)}
 
 
-def defaults(cls: type) -> dict[str, Any]:
+def defaults(cls: type) -> dict[str, Plain]:
   """Returns the default values of a settings class as nested plain values; fields without one are left out."""
   hints = get_type_hints(cls, include_extras=True)
   values = {field.name: _default(field, hints[field.name]) for field in dataclasses.fields(cls)}
   return {name: value for name, value in values.items() if value is not dataclasses.MISSING}
 
 
-def build(cls: type[T], values: Mapping[str, Any]) -> T:
-  """Builds a settings class from nested mappings: missing fields get their defaults, unknown keys are ignored."""
-  hints, known = get_type_hints(cls, include_extras=True), {}
-  for field in dataclasses.fields(cls):  # pyright: ignore[reportArgumentType]
-    if field.name in values:
-      value, inner = values[field.name], nested(hints[field.name])
-      known[field.name] = build(inner, value) if inner and isinstance(value, Mapping) else value
-  return cls(**known)
+def build(cls: type[T], values: Section, key: str = "") -> T:
+  """Builds a settings class from nested mappings: missing fields get their defaults.
+
+  Args:
+    cls: the class.
+    values: its fields by name.
+    key: where they are, such as agent; without it, unknown fields are ignored.
+
+  Raises:
+    UnknownNameError: the class, whose values are at `key`, has no such field.
+  """
+  hints, known = get_type_hints(cls, include_extras=True), [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+  if key and (unknown := [name for name in values if name not in known]):
+    raise UnknownNameError(f"{key}.{unknown[0]} does not exist.{nearest(unknown[0], known)}")
+  fields = {name: values[name] for name in known if name in values}
+  for name, value in fields.items():
+    if (inner := nested(hints[name])) and isinstance(value, Mapping):
+      fields[name] = build(inner, value, key and f"{key}.{name}")
+  return cls(**fields)
 
 
-def nested(hint: Any) -> type | None:
+def nested(hint: object) -> type | None:
   """Returns the settings class that an annotation names, None if it names another type."""
   kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
   return kind if dataclasses.is_dataclass(kind) and isinstance(kind, type) else None
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Plain:
   """Returns nested mappings, lists and scalars for a value that may hold dataclasses and tuples."""
   if dataclasses.is_dataclass(value) and not isinstance(value, type):
     return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
@@ -104,12 +118,11 @@ def _settings(cls: type, prefix: str = "") -> Iterator[Setting]:
     if inner is not None:
       yield from _settings(inner, f"{name}.")
     for option in options:
-      if get_origin(option) is Mapping and get_args(option)[1] is not Any:
-        depth = _text_depth(get_args(option)[1])
+      if get_origin(option) is Mapping and (depth := _text_depth(get_args(option)[1])) is not None:
         yield Setting(f"{name}.*", dataclasses.MISSING, None, None, depth, False, "")
 
 
-def _default(field: dataclasses.Field[Any], hint: Any) -> Any:
+def _default(field: "dataclasses.Field[object]", hint: object) -> object:
   inner = nested(hint)
   if inner is not None and field.default_factory is dataclasses.MISSING and field.default is dataclasses.MISSING:
     return defaults(inner)
@@ -117,7 +130,7 @@ def _default(field: dataclasses.Field[Any], hint: Any) -> Any:
   return value if value is dataclasses.MISSING else plain(value)
 
 
-def _text_depth(kind: Any) -> int | None:
+def _text_depth(kind: object) -> int | None:
   """How deep texts are nested in lists; None if the type holds none."""
   if kind is str:
     return 0

@@ -2,12 +2,11 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from playground.errors import nearest
 
 
-def format_value(value: Any) -> str:
+def format_value(value: object) -> str:
   """A value as one would write it on the command line."""
   if value is None or isinstance(value, bool):
     return {None: "null", True: "true", False: "false"}[value]
@@ -35,6 +34,6 @@ def join(parent: str, name: object) -> str:
   return f"{parent}.{name}" if parent else str(name)
 
 
-def nearest_in(parent: str, name: str, known: Iterable[Any]) -> str:
+def nearest_in(parent: str, name: str, known: Iterable[object]) -> str:
   """As `nearest`, with the whole dotted key."""
   return nearest(name, map(str, known)).replace("'", f"'{join(parent, '')}", 1)

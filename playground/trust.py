@@ -9,7 +9,6 @@ or in Python (`trust("my_package")`).
 import importlib
 import importlib.metadata
 from collections.abc import Iterable
-from typing import Any
 
 from playground.errors import ConfigError, nearest
 
@@ -30,7 +29,7 @@ def trust(*packages: str) -> None:
   _named.update(packages)
 
 
-def trusted_object(key: str, spec: Any) -> Any:
+def trusted_object(key: str, spec: object) -> object:
   """Imports the class or function that a configuration names.
 
   Args:
@@ -62,7 +61,7 @@ def trusted_object(key: str, spec: Any) -> Any:
   return found
 
 
-def _untrusted(key: str, spec: Any, module: str) -> ConfigError:
+def _untrusted(key: str, spec: object, module: str) -> ConfigError:
   package = module.partition(".")[0]
   known = ", ".join(sorted(_trusted()))
   return ConfigError(

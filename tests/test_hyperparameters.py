@@ -93,7 +93,7 @@ def test_hyperparameters_are_those_of_the_source(agent: str, task: str):
   of = {key: section for section, keys in sections.items() for key in keys}
   resolved = {**run.resolved, "network": run.resolved["agent"].get("network")}
   assert {key: resolved[of.get(key, "agent")][key] for key in expected} == expected
-  assert run.agent.name == agent.partition("_")[0]  # so that checkpoints of all variants go together
+  assert run.agent_name == agent.partition("_")[0]  # so that checkpoints of all variants go together
   assert run.choices["tuned"] == f"{run.choices['agent']}/{task}"
 
 

@@ -20,6 +20,7 @@ from playground.config import (
   varying,
   with_listed,
 )
+from playground.config.sweep_options import LAUNCHERS, SEARCHES
 from playground.errors import ConfigError, UnknownNameError
 
 
@@ -240,5 +241,5 @@ def test_settings_are_checked(line: str, message: str):
 @pytest.mark.parametrize("search", options("search"))
 def test_settings(launcher: str, search: str):
   settings = compose_settings([f"launcher={launcher}", f"search={search}", "launcher.timeout=90", "sweep_dir=x"])
-  assert (settings.launcher.name, settings.search.name) == (launcher, search)
+  assert (type(settings.launcher), type(settings.search)) == (LAUNCHERS[launcher], SEARCHES[search])
   assert (settings.launcher.timeout, settings.sweep_dir, settings.on_error) == (90, "x", "continue")

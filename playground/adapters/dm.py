@@ -1,7 +1,6 @@
 """Tasks as dm_env environments, for agents written against that interface."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import dm_env
 import numpy as np
@@ -9,12 +8,13 @@ from dm_env import specs
 
 from playground.adapters.episodes import Episodes, Moment
 from playground.envs.base import PIXELS
+from playground.settings import Section
 
 
 class DmEnv(dm_env.Environment):
   """One environment. A dict observation is a dict, an end by the task has discount 0, one by the time limit 1."""
 
-  def __init__(self, task: str, overrides: Mapping[str, Any] | None = None, physics: str = "c", seed: int = 0):
+  def __init__(self, task: str, overrides: Section | None = None, physics: str = "c", seed: int = 0):
     """Builds a task; `physics` is `c` or `mjx`, see `playground.adapters.episodes.load_task`."""
     self._episodes = Episodes(task, overrides, physics)
     self._random = np.random.default_rng(seed)
@@ -31,13 +31,13 @@ class DmEnv(dm_env.Environment):
     self._running = not (moment.terminated or moment.truncated)
     return _time_step(moment)
 
-  def observation_spec(self) -> Any:
+  def observation_spec(self) -> specs.Array | dict[str, specs.Array]:  # pyright: ignore[reportIncompatibleMethodOverride]
     sizes = self._episodes.env.observation_size
     if not isinstance(sizes, Mapping):
       return specs.Array((sizes,), np.float32, "observation")
     return {name: _spec(name, shape) for name, shape in sizes.items()}
 
-  def action_spec(self) -> specs.BoundedArray:
+  def action_spec(self) -> specs.BoundedArray:  # pyright: ignore[reportIncompatibleMethodOverride]
     return specs.BoundedArray((self._episodes.env.action_size,), np.float32, -1.0, 1.0, "action")
 
   def reward_spec(self) -> specs.Array:

@@ -1,7 +1,6 @@
 """One environment of a task, in numpy: what the interfaces of other libraries are made of."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -11,6 +10,8 @@ from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_evaluation
 from playground.errors import lookup
+from playground.pytree import PyTree
+from playground.settings import Section
 
 Arrays = np.ndarray | dict[str, np.ndarray]
 
@@ -41,7 +42,7 @@ class Episodes:
     state: the present state, a batch of one; None before the first reset.
   """
 
-  def __init__(self, task: str, overrides: Mapping[str, Any] | None = None, physics: str = "c"):
+  def __init__(self, task: str, overrides: Section | None = None, physics: str = "c"):
     """Builds a task; see `load_task`."""
     self.env = load_task(task, overrides, physics)
     batch = wrap_for_evaluation(self.env)
@@ -61,13 +62,13 @@ class Episodes:
 
   def _moment(self, state: State) -> Moment:
     state = jax.tree.map(lambda x: np.array(x[0]), state.replace(data=None))
-    obs: Any = state.obs
     truncated = bool(state.info["truncation"])
     ended = bool(state.done) and not truncated
+    obs: PyTree = state.obs
     return Moment(obs, float(state.reward), ended, truncated, {k: float(v) for k, v in state.metrics.items()})
 
 
-def load_task(task: str, overrides: Mapping[str, Any] | None = None, physics: str = "mjx") -> Env:
+def load_task(task: str, overrides: Section | None = None, physics: str = "mjx") -> Env:
   """Builds a task.
 
   Args:

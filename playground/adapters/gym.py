@@ -23,15 +23,19 @@ from playground.adapters.episodes import Arrays, Episodes, load_task
 from playground.envs.base import PIXELS, Env, State
 from playground.envs.wrappers import where_done, wrap_for_evaluation
 from playground.errors import ConfigError, PlaygroundError, lookup
+from playground.pytree import PyTree
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.rendering.video import choose_camera
+from playground.settings import Section
+
+Info = dict[str, Any]  # gymnasium's type
 
 NAMESPACE = "playground"
 _HEIGHT, _WIDTH = 480, 640
 _SEEDS = 2**31 - 1
 
 
-class GymEnv(gymnasium.Env[Any, np.ndarray]):
+class GymEnv(gymnasium.Env[Arrays, np.ndarray]):
   """One environment. Observations, rewards and ends of episodes are the task's, its metrics are the `info`."""
 
   metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # gymnasium's own declaration
@@ -39,7 +43,7 @@ class GymEnv(gymnasium.Env[Any, np.ndarray]):
   def __init__(
     self,
     task: str,
-    overrides: Mapping[str, Any] | None = None,
+    overrides: Section | None = None,
     physics: str = "c",
     entry: str | None = None,
     render_mode: str | None = None,
@@ -66,12 +70,12 @@ class GymEnv(gymnasium.Env[Any, np.ndarray]):
     self.metadata = self.metadata | {"render_fps": round(1 / (env.dt * env.action_repeat))}
     self._renderer: mujoco.Renderer | None = None
 
-  def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+  def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Arrays, Info]:
     super().reset(seed=seed)
     moment = self._episodes.reset(int(self.np_random.integers(_SEEDS)))
     return _entry(moment.obs, self._entry), moment.metrics
 
-  def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+  def step(self, action: np.ndarray) -> tuple[Arrays, float, bool, bool, Info]:
     moment = self._episodes.step(action)
     return _entry(moment.obs, self._entry), moment.reward, moment.terminated, moment.truncated, moment.metrics
 
@@ -126,7 +130,7 @@ def _open_renderer(model: mujoco.MjModel) -> mujoco.Renderer:
     gl_context.GLContext = chosen
 
 
-class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
+class GymVectorEnv(gymnasium.vector.VectorEnv[Arrays, np.ndarray, np.ndarray]):
   """A batch of environments in one program. An episode that has ended begins anew by itself, freshly drawn.
 
   That is in the next step, which takes no action of it, or (`AutoresetMode.SAME_STEP`) in the step that ends it: `info`
@@ -139,7 +143,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     self,
     num_envs: int,
     task: str,
-    overrides: Mapping[str, Any] | None = None,
+    overrides: Section | None = None,
     physics: str = "mjx",
     entry: str | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
@@ -175,12 +179,12 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     self._start, self._advance = jax.jit(start), jax.jit(advance)
     self._state: State | None = None
 
-  def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+  def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Arrays, Info]:
     super().reset(seed=seed)
     state = self._state = self._start(self._key())
     return self._seen(state)
 
-  def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+  def step(self, actions: np.ndarray) -> tuple[Arrays, np.ndarray, np.ndarray, np.ndarray, Info]:
     assert self._state is not None, "reset before the first step"
     state, last = self._advance(self._state, np.asarray(actions, np.float32), self._key())
     self._state, (obs, info) = state, self._seen(state)
@@ -189,7 +193,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
       info |= self._final(last, done)
     return obs, np.array(last.reward), done & ~truncated, truncated, info
 
-  def _final(self, last: State, done: np.ndarray) -> dict[str, Any]:
+  def _final(self, last: State, done: np.ndarray) -> Info:
     """The entries on the episodes that ended: an object each in `final_obs`, and who has one under `_<name>`."""
     obs, metrics = self._seen(last)
     final_obs = np.full(self.num_envs, None, object)
@@ -202,12 +206,12 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
   def _key(self) -> jax.Array:
     return jax.random.PRNGKey(int(self.np_random.integers(_SEEDS)))
 
-  def _seen(self, state: State) -> tuple[Any, dict[str, Any]]:
+  def _seen(self, state: State) -> tuple[Arrays, Info]:
     obs, metrics = jax.tree.map(np.array, (state.obs, state.metrics))
     return _entry(obs, self._entry), metrics
 
 
-def observation_space(env: Env, entry: str | None = None) -> Space[Any]:
+def observation_space(env: Env, entry: str | None = None) -> Space[PyTree]:
   """The space of a task's observation, or of one entry of it: unbounded numbers, pictures in bytes.
 
   Raises:
@@ -216,7 +220,7 @@ def observation_space(env: Env, entry: str | None = None) -> Space[Any]:
   sizes = env.observation_size
   if not isinstance(sizes, Mapping):
     return Box(-np.inf, np.inf, (sizes,))
-  boxes: dict[str, Space[Any]] = {
+  boxes: dict[str, Space[PyTree]] = {
     k: Box(0, 255, v, np.uint8) if k.startswith(PIXELS) else Box(-np.inf, np.inf, v) for k, v in sizes.items()
   }
   return Dict(boxes) if entry is None else lookup(boxes, entry, "entry")

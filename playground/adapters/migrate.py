@@ -3,14 +3,14 @@
 `registry` and `wrapper` are our own modules under 0.2.0's names. docs/migrate.md says what else there is to change.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 from ml_collections import ConfigDict
 
 from playground import registry
 from playground.envs.base import Env
 from playground.paper import tasks_of
+from playground.settings import Section
 
 
 class Suite:
@@ -24,9 +24,7 @@ class Suite:
   def ALL_ENVS(self) -> tuple[str, ...]:  # 0.2.0's name
     return tuple(self._members())
 
-  def load(
-    self, env_name: str, config: ConfigDict | None = None, config_overrides: Mapping[str, Any] | None = None
-  ) -> Env:
+  def load(self, env_name: str, config: ConfigDict | None = None, config_overrides: Section | None = None) -> Env:
     """See `registry.load`."""
     return registry.load(env_name, config=config, config_overrides=config_overrides)
 
@@ -34,7 +32,7 @@ class Suite:
     """See `registry.config`."""
     return registry.config(env_name)
 
-  def get_domain_randomizer(self, env_name: str) -> Callable[..., Any] | None:
+  def get_domain_randomizer(self, env_name: str) -> registry.DomainRandomizer | None:
     """See `registry.get_domain_randomizer`."""
     return registry.get_domain_randomizer(env_name)
 

@@ -9,7 +9,6 @@ reads it is used again by the next step at the earliest, which waits for torch's
 # pyright: reportMissingImports=false
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +21,9 @@ from playground.envs.wrappers import FINAL_OBS, AutoReset, wrap_for_evaluation
 from playground.errors import ConfigError
 from playground.learning.rollout import episode_sums
 from playground.randomization import Randomizer
+from playground.settings import Section
 
+Extra = torch.Tensor | TensorDict | dict[str, float]
 PRIVILEGED = "privileged_state"
 OBS_GROUPS = {"actor": ["policy"], "critic": ["critic"]}  # for RSL-RL's configuration: which model reads which group
 
@@ -91,13 +92,13 @@ class VecEnv(rsl_rl_env.VecEnv):
     return self._grouped(self.state.obs)
 
   def _grouped(self, obs: Observation) -> TensorDict:
-    entries: Any = obs if isinstance(obs, Mapping) else {"state": obs}
+    entries = obs if isinstance(obs, Mapping) else {"state": obs}
     return TensorDict({group: to_torch(entries[entry]) for group, entry in self.groups.items()}, [self.num_envs])
 
-  def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+  def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Extra]]:
     """Applies actions, [num_envs, num_actions], clipped to [-1, 1]; see RSL-RL's `VecEnv.step` for what it returns."""
     state = self.state = self._step(self.state, to_jax(actions.clamp(-1.0, 1.0)))
-    extras: dict[str, Any] = {"time_outs": to_torch(state.info["truncation"])}
+    extras: dict[str, Extra] = {"time_outs": to_torch(state.info["truncation"])}
     if FINAL_OBS in state.info:
       extras[FINAL_OBS] = self._grouped(state.info[FINAL_OBS])
     if self._log:
@@ -114,7 +115,7 @@ def vec_env(
   num_envs: int,
   *,
   seed: int = 0,
-  events: Mapping[str, Any] | None = None,
+  events: Section | None = None,
   groups: Mapping[str, str] | None = None,
 ) -> VecEnv:
   """Makes a batch of environments of a task for RSL-RL.

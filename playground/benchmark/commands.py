@@ -180,7 +180,7 @@ class Chain(Measuring):
       raise ConfigError(f"experiment={self.experiment} is no chain: choose one that ends in _chain.")
 
   def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
-    agent = compose([f"experiment={self.experiment}", *self.overrides]).agent.name
+    agent = compose([f"experiment={self.experiment}", *self.overrides]).agent_name
     arguments = {"experiment": self.experiment, "overrides": list(self.overrides)}
     arguments |= {"runs": self.runs, "again": self.rerun}
     columns = self.columns(self.experiment, agent)

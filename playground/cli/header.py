@@ -15,7 +15,7 @@ def header(config: RunConfig) -> list[str]:
 
 def _rows(config: RunConfig) -> Iterator[tuple[str, str]]:
   choices, agent, env = config.choices, config.agent, config.env
-  yield "", f"Training {choices['env']} with {agent.name}"
+  yield "", f"Training {choices['env']} with {config.agent_name}"
   origin = {"experiment": choices.get("experiment"), "robot": choices.get("robot")}
   origin["randomization"] = choices.get("randomization")
   if named := [f"{group}={option}" for group, option in origin.items() if option]:

@@ -73,7 +73,7 @@ def describe(config: RunConfig, env: "Env") -> Iterator[RenderableType]:
   chosen = choices.get("randomization")
   yield _table(f"events (randomization: {chosen})" if chosen else "events", list(_events(config.env.get("events"))))
   origin = f"tuned/{choices['tuned']}.yaml" if choices.get("tuned") else "defaults, not tuned for this task"
-  yield _facts(f"{config.agent.name} ({origin})", _flat(config.resolved["agent"]))
+  yield _facts(f"{config.agent_name} ({origin})", _flat(config.resolved["agent"]))
 
 
 def _facts_of(env: "Env", section: Mapping[str, Any], choices: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

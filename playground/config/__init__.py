@@ -38,7 +38,7 @@ from playground.config.overrides import (
 )
 from playground.config.run_config import (
   RunConfig,
-  Section,
+  TaskConfig,
   config_dict,
   from_dict,
   in_order_of,
@@ -62,7 +62,7 @@ from playground.text import format_value
 __all__ = [
   "DEFAULT_EXPERIMENT",
   "RunConfig",
-  "Section",
+  "TaskConfig",
   "check_saved_job",
   "combinations",
   "command_lines",

@@ -16,14 +16,13 @@ the command line, which therefore hold for all stages.
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from playground.config.files import options
 from playground.config.overrides import Override, parse
 from playground.config.run_options import CurriculumConfig
 from playground.config.schema import wrong_type
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
-from playground.settings import defaults
+from playground.settings import Section, defaults
 from playground.text import format_value
 
 _FIELDS = ("num_timesteps", "overrides")
@@ -31,14 +30,13 @@ _SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # by a 
 SINGLE_RUN = defaults(CurriculumConfig)  # curriculum=none
 
 
-def stage_folders(curriculum: Mapping[str, Any]) -> dict[str, str]:
+def stage_folders(curriculum: CurriculumConfig) -> dict[str, str]:
   """The stages that a chain runs, from `start_at` on, and each one's folder in the chain's.
 
   Raises:
     UnknownNameError: `start_at` is no stage.
   """
-  names = list(curriculum["stages"])
-  start_at = curriculum.get("start_at")
+  names, start_at = list(curriculum.stages), curriculum.start_at
   _need_stage(start_at, names)
   first = 0 if start_at is None else names.index(start_at)
   return {name: f"{number}_{name}" for number, name in enumerate(names[first:], first + 1)}
@@ -52,7 +50,7 @@ def _need_stage(start_at: str | None, names: list[str]) -> None:
     )
 
 
-def check_chain(resolved: Mapping[str, Any], parsed: Sequence[Override], roots: Sequence[Path]) -> None:
+def check_chain(resolved: Section, parsed: Sequence[Override], roots: Sequence[Path]) -> None:
   """Checks what a configuration says of its chain's stages, and what the command line says of the chain.
 
   Raises:
@@ -83,12 +81,12 @@ def check_chain(resolved: Mapping[str, Any], parsed: Sequence[Override], roots: 
 
 
 def stage_overrides(
-  curriculum: Mapping[str, Any], parsed: Sequence[Override], roots: Sequence[Path]
+  curriculum: CurriculumConfig, parsed: Sequence[Override], roots: Sequence[Path]
 ) -> Iterator[tuple[str, list[Override]]]:
   """Yields the name of each stage that the chain runs, and what it is composed from.
 
   Args:
-    curriculum: the chain's resolved section, checked.
+    curriculum: the chain's section, checked.
     parsed: the command line that chose the chain.
     roots: folders that hold groups.
 
@@ -98,28 +96,28 @@ def stage_overrides(
   groups = [override for override in parsed if override.is_group]
   values = [override for override in parsed if not override.is_group]
   folders, own = stage_folders(curriculum), []
-  for name, stage in curriculum["stages"].items():
+  for name, stage in curriculum.stages.items():
     with in_stage(name):
       own = [*own, *(_parse(text, roots) for text in stage["overrides"])]
     if name in folders:
       yield name, [*groups, *own, *values]
 
 
-def budget(curriculum: Mapping[str, Any], stage: str, default: int) -> int:
+def budget(curriculum: CurriculumConfig, stage: str, default: int) -> int:
   """A stage's `agent.num_timesteps`: its own or, without one or with a scale of 0, the task's; times the scale."""
-  own, scale = curriculum["stages"][stage]["num_timesteps"], curriculum["scale"]
+  own, scale = curriculum.stages[stage]["num_timesteps"], curriculum.scale
   return max(1, round(scale * (default if own is None else own))) if scale else default
 
 
-def fresh_starts(curriculum: Mapping[str, Any], parsed: Sequence[Override], default: int) -> int:
+def fresh_starts(curriculum: CurriculumConfig, parsed: Sequence[Override], default: int) -> int:
   """A stage's `agent.num_resets_per_eval`: fewer in a shortened chain, so that as much of an episode is seen as in it.
 
   Args:
-    curriculum: the chain's resolved section.
+    curriculum: the chain's section.
     parsed: what the stage is composed from; what it sets stays.
     default: the task's.
   """
-  scale = curriculum["scale"]
+  scale = curriculum.scale
   if not 0 < scale < 1 or any(override.key == "agent.num_resets_per_eval" for override in parsed):
     return default
   return min(default, max(1, round(scale * default)))
@@ -134,7 +132,7 @@ def in_stage(name: str) -> Iterator[None]:
     raise type(error)(f"Stage {name} of the chain: {error}") from error
 
 
-def _check_stage(key: str, name: Any, stage: Any) -> None:
+def _check_stage(key: str, name: str, stage: object) -> None:
   if not str(name).replace("_", "").replace("-", "").isalnum():
     raise ConfigError(f"{key}: a stage's name is that of a folder, letters, digits, - and _ only.")
   if not isinstance(stage, Mapping):

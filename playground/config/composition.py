@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -57,14 +57,15 @@ from playground.config.overrides import (
   parse,
   with_default_experiment,
 )
-from playground.config.run_config import SCALARS, SECTIONS, RunConfig, Section, from_dict, load
+from playground.config.run_config import SCALARS, SECTIONS, RunConfig, from_dict, load
 from playground.config.schema import check_key, fit, is_terms
+from playground.config.sweep_options import SweepSettings
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.learning.hyperparameters import config_class
 from playground.mdp.options import OPTIONS
 from playground.pretrained import locate
-from playground.settings import defaults
+from playground.settings import Plain, Section, build, defaults
 from playground.text import first_line, join
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
@@ -105,7 +106,7 @@ def compose_all(runs: Iterable[Sequence[str]], config_dir: Path | None = None) -
   return configs
 
 
-def compose_settings(overrides: Sequence[str], config_dir: Path | None = None) -> Section:
+def compose_settings(overrides: Sequence[str], config_dir: Path | None = None) -> SweepSettings:
   """Composes what a sweep is told of itself: `sweep_dir`, `on_error`, and the sections `launcher` and `search`.
 
   Raises:
@@ -116,7 +117,9 @@ def compose_settings(overrides: Sequence[str], config_dir: Path | None = None) -
   config, _ = _hydra(group_overrides(parsed), roots, "sweep")
   resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], _plain(config))
   check_limits(resolved)
-  return ConfigDict(resolved)
+  chosen = {key: resolved.pop(key) for key in ("launcher", "search")}
+  classes = {key: defined()[key][section.pop("name")] for key, section in chosen.items()}
+  return SweepSettings(**resolved, **{key: build(classes[key], chosen[key]) for key in chosen})
 
 
 def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Sequence[Path]) -> RunConfig:
@@ -124,7 +127,7 @@ def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Se
   if about := [o.text for o in parsed if is_of_sweep(o.key)]:
     what = "stands for many runs" if about[0].startswith("sweep=") else "is about a sweep"
     raise ConfigError(f"{about[0]} {what}: add -m, as in `playground-run -m {about[0]}`.")
-  given = {o.key: o.value for o in parsed}
+  given: dict[str, Plain] = {o.key: o.value for o in parsed}
   for key in ("resume", "init_from"):
     if given.get(key) is not None:
       given[key] = _resolve(given[key])
@@ -132,7 +135,7 @@ def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Se
   if given.get("resume") is not None:
     return _compose_resumed(Path(os.path.expanduser(given["resume"])), parsed, roots)
   config = _compose_new(parsed, files, roots)
-  stages = stage_overrides(config.resolved["curriculum"], parsed, roots)
+  stages = stage_overrides(config.curriculum, parsed, roots)
   composed = tuple(_compose_stage(config, name, theirs, files, roots) for name, theirs in stages)
   run_dir = config.run_dir or f"results/{config.name}/{datetime.now():%Y-%m-%d_%H-%M-%S}"
   return dataclasses.replace(config, run_dir=run_dir, stages=composed)
@@ -147,7 +150,7 @@ def register_options(roots: Sequence[Path] | None = None) -> None:
     register(group, [name for name in classes if find_file(group, name, roots) is None])
 
 
-def override_section(section: str, default: Section, overrides: Mapping[str, Any]) -> dict[str, Any]:
+def override_section(section: str, default: Section | ConfigDict, overrides: Section) -> dict[str, Plain]:
   """Returns a section, e.g. env, with values replaced by dotted key (`action_scale`), checked as in `compose`."""
   schema = {section: _plain(default)}
   parsed = [Override(f"{section}.{key}", value, False, "") for key, value in overrides.items()]
@@ -156,7 +159,7 @@ def override_section(section: str, default: Section, overrides: Mapping[str, Any
   return resolved[section]
 
 
-def from_saved(resolved: Mapping[str, Any], config_dir: Path | None = None) -> RunConfig:
+def from_saved(resolved: Section, config_dir: Path | None = None) -> RunConfig:
   """Rebuilds the configuration of a run that an earlier version may have saved: keys it lacks get today's defaults.
 
   What a task chooses by name (reward terms, observations, noise) stays what it was. What only a command line can say
@@ -184,7 +187,7 @@ def from_saved(resolved: Mapping[str, Any], config_dir: Path | None = None) -> R
   return from_dict({**saved.resolved, **filled}, saved.overrides)
 
 
-def saved_section(section: str, saved: Mapping[str, Any], default: Mapping[str, Any]) -> dict[str, Any]:
+def saved_section(section: str, saved: Section, default: Section) -> dict[str, Plain]:
   """A section that a file has saved, e.g. env: keys that it lacks get today's defaults, those that it has are checked.
 
   Raises:
@@ -195,7 +198,7 @@ def saved_section(section: str, saved: Mapping[str, Any], default: Mapping[str, 
   return fitted
 
 
-def _fit_known(value: Any, default: Any, key: str, names: Mapping[str, Any]) -> Any:
+def _fit_known(value: object, default: object, key: str, names: Mapping[str, object]) -> Plain:
   """As `fit`, but keys that the default lacks are left as they are."""
   if not (isinstance(default, Mapping) and default and isinstance(value, Mapping)) or is_terms(key):
     return fit(value, default, names, key)
@@ -203,7 +206,7 @@ def _fit_known(value: Any, default: Any, key: str, names: Mapping[str, Any]) -> 
   return {**value, **known}
 
 
-def _fill(saved: Mapping[str, Any], default: Mapping[str, Any]) -> dict[str, Any]:
+def _fill(saved: Section, default: Section) -> dict[str, Plain]:
   filled = dict(saved)
   for key, value in default.items():
     if key not in saved:
@@ -218,7 +221,7 @@ class _Files(NamedTuple):
 
   config: DictConfig
   choices: dict[str, str | None]
-  schema: dict[str, Any]
+  schema: dict[str, Plain]
   added: tuple[Override, ...]  # a choice of ours
 
 
@@ -252,7 +255,7 @@ def _changes(groups: Iterable[str], choices: Mapping[str, str | None], roots: Se
 
 def _schema(
   config: DictConfig, choices: Mapping[str, str | None], changes: Delta, roots: Sequence[Path]
-) -> dict[str, Any]:
+) -> dict[str, Plain]:
   """The keys that exist, with the values that fix their types.
 
   Most sections have a class. The others are as composed, or where `DELTAS` change them, as composed without.
@@ -276,7 +279,9 @@ def _compose_new(parsed: Sequence[Override], files: Callable[..., _Files], roots
   check_chain(resolved, parsed, roots)
   head = {"name": choices.get("experiment") or choices["env"], "choices": dict(choices)}
   ordered = {key: resolved[key] for key in (*SCALARS, *SECTIONS) if key in resolved}
-  return from_dict({**head, **ordered, **resolved}, canonical([*parsed, *added], resolved))
+  run = from_dict({**head, **ordered, **resolved}, canonical([*parsed, *added], resolved))
+  run.agent.check(num_devices=1)
+  return run
 
 
 def _compose_stage(
@@ -285,10 +290,9 @@ def _compose_stage(
   """The configuration of a stage, a single run; where it lies and what it starts from is left open."""
   with in_stage(name):
     stage = _compose_new(parsed, files, roots)
-  curriculum = chain.resolved["curriculum"]
   lengths = {
-    "num_timesteps": budget(curriculum, name, stage.agent.num_timesteps),
-    "num_resets_per_eval": fresh_starts(curriculum, parsed, stage.agent.num_resets_per_eval),
+    "num_timesteps": budget(chain.curriculum, name, stage.agent.num_timesteps),
+    "num_resets_per_eval": fresh_starts(chain.curriculum, parsed, stage.agent.num_resets_per_eval),
   }
   own = {"name": f"{chain.name}/{name}", "choices": {**stage.choices, "curriculum": "none"}, "curriculum": SINGLE_RUN}
   own |= {"agent": {**stage.resolved["agent"], **lengths}, "run_dir": None, "init_from": None}
@@ -322,7 +326,7 @@ def _hydra(
   return config, choices
 
 
-def _apply(config: DictConfig, overrides: Iterable[Override], schema: Mapping[str, Any]) -> dict[str, Any]:
+def _apply(config: DictConfig, overrides: Iterable[Override], schema: Section) -> dict[str, Plain]:
   """Sets values, resolves, and checks the whole against the schema."""
   try:
     for override in overrides:
@@ -341,29 +345,30 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Mapping[st
     raise ConfigError(f"{first_line(error)}.") from None
 
 
-def _plain(config: Any) -> Any:
+def _plain(config: object) -> Plain:
   """Plain dicts and lists, the interpolations of our files resolved."""
   return OmegaConf.to_container(config if isinstance(config, DictConfig) else _literal(config), resolve=True)
 
 
-def _literal(values: Any) -> DictConfig:
+def _literal(values: object) -> DictConfig:
   """Values as they are: what a file has saved is resolved, and `${oc.env:HOME}` in it asks for nothing."""
 
-  def escape(node: Any) -> Any:
+  def escape(node: Plain) -> Plain:
     if isinstance(node, Mapping):
       return {key: escape(value) for key, value in node.items()}
     if isinstance(node, list | tuple):
       return [escape(value) for value in node]
     return re.sub(r"(\\*)\$\{", r"\1\1\\${", node) if isinstance(node, str) else node
 
-  plain: dict[str, Any] = escape(values.to_dict() if isinstance(values, ConfigDict) else values)
+  plain: dict[str, Plain] = escape(values.to_dict() if isinstance(values, ConfigDict) else values)
   return OmegaConf.create(plain)
 
 
 def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path]) -> RunConfig:
   """The configuration of a run that goes on: its own, but for the sections that may differ."""
   _check_resumable(run, parsed)
-  saved = from_saved(load(run / "config.yaml").resolved).resolved
+  whole = from_saved(load(run / "config.yaml").resolved)
+  saved = whole.resolved
   fresh, choices = _hydra(group_overrides(parsed), roots)
   schema = _plain(fresh)
   chosen = {o.key for o in parsed if o.is_group}
@@ -373,7 +378,7 @@ def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path
   resolved = {**saved, **changed, "resume": str(run), "run_dir": str(run), "init_from": None}
   resolved["choices"] = {**saved["choices"], **{group: choices[group] for group in chosen}}
   check_limits(resolved)
-  stages = [_compose_resumed(run / folder, parsed, roots) for folder in stage_folders(saved["curriculum"]).values()]
+  stages = [_compose_resumed(run / folder, parsed, roots) for folder in stage_folders(whole.curriculum).values()]
   return dataclasses.replace(from_dict(resolved, canonical(parsed, resolved)), stages=tuple(stages))
 
 
@@ -389,7 +394,7 @@ def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:
       raise ConfigError(f"{override.text} cannot be given with resume, {what}; {instead}.")
 
 
-def _resolve(value: Any) -> Any:
+def _resolve(value: object) -> Plain:
   """A value with its interpolations resolved, such as ${oc.env:SCRATCH}, and those that are escaped as text."""
   try:
     return OmegaConf.create({"value": value}).value
@@ -397,7 +402,7 @@ def _resolve(value: Any) -> Any:
     raise ConfigError(f"{first_line(error)}.") from None
 
 
-def _check_path(key: str, value: Any) -> None:
+def _check_path(key: str, value: object) -> None:
   """What `resume` and `init_from` name must be there."""
   if key == "init_from":
     value = locate(str(value))

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 from hydra.core.config_store import ConfigStore
 
@@ -26,7 +26,7 @@ from playground.errors import PlaygroundError
 from playground.hardware.options import HardwareConfig
 from playground.learning.hyperparameters import agent_names, config_class
 from playground.limits import SEED
-from playground.settings import Setting, defaults, settings
+from playground.settings import Plain, Section, Setting, defaults, settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,12 +86,12 @@ def register_experiments(tasks: Mapping[str, str]) -> None:
   _replace("experiment", {name: functools.partial(choose, tasks[name]) for name in tasks}, package="_global_")
 
 
-def _node(group: str, name: str) -> dict[str, Any]:
+def _node(group: str, name: str) -> dict[str, Plain]:
   named = {"name": name} if group in ("agent", "launcher", "search") else {}
   return {**named, **defaults(defined()[group][name])}
 
 
-def _replace(group: str, nodes: Mapping[str, Callable[[], Any]], package: str) -> None:
+def _replace(group: str, nodes: Mapping[str, Callable[[], Plain]], package: str) -> None:
   """Makes these the options of a group; Hydra refuses an option that has a file, too."""
   store = ConfigStore.instance()
   if set(store.repo.get(group, {})) != {f"{name}.yaml" for name in nodes}:
@@ -100,7 +100,7 @@ def _replace(group: str, nodes: Mapping[str, Callable[[], Any]], package: str) -
       store.store(name, node(), group=group, package=package)
 
 
-def definition(key: str, names: Mapping[str, Any]) -> Setting | None:
+def definition(key: str, names: Mapping[str, object]) -> Setting | None:
   """Returns the definition of a dotted key; None if it is a file's alone, such as a task's own.
 
   Args:
@@ -121,7 +121,7 @@ def definition(key: str, names: Mapping[str, Any]) -> Setting | None:
   return _look_up(RunSettings, key) or _look_up(SweepConfig, key)
 
 
-def chosen_names(resolved: Mapping[str, Any]) -> dict[str, Any]:
+def chosen_names(resolved: Section) -> dict[str, Plain]:
   """Returns the `names` of `definition` for a configuration, which may lack these sections."""
   sections = {section: resolved.get(section) for section in ("agent", "launcher", "search")}
   return {section: value.get("name") for section, value in sections.items() if isinstance(value, Mapping)}

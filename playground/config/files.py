@@ -6,11 +6,12 @@ import re
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import yaml
 
 from playground.config.definitions import defined
+from playground.settings import Plain
 from playground.text import first_line
 from playground.trust import ENTRY_POINTS
 
@@ -127,7 +128,7 @@ def find_file(group: str, option: str, roots: Iterable[Path]) -> Path | None:
   return next((path for root in roots if (path := root / group / f"{option}.yaml").is_file()), None)
 
 
-def _read(group: str, option: str, roots: Iterable[Path]) -> dict[str, Any]:
+def _read(group: str, option: str, roots: Iterable[Path]) -> dict[str, Plain]:
   """The content of an option's file; empty for an option without one."""
   file = find_file(group, option, roots)
   return (yaml.safe_load(file.read_text()) if file else None) or {}

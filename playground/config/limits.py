@@ -4,40 +4,23 @@ import fnmatch
 import operator
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
 
 from playground.config.definitions import chosen_names, definition
 from playground.config.schema import wrong_type
+from playground.envs.options import NUMBERS
 from playground.errors import ConfigError, nearest
-from playground.limits import MOST, SHARE, Limit, at_least_0, count, positive, span
+from playground.limits import Limit
 from playground.mdp.options import OPTIONS
+from playground.settings import Plain, Section
 from playground.text import format_value, join
 
 _XLA_SWITCH = re.compile(r"--xla_\w+(=(true|false|-?\d+(\.\d+)?))?")
 _XLA_PLACES = ("dir", "path", "file", "dump", "load", "cache", "option", "override", "_to", "_from")  # in flags' names
 _OF_TERMS = re.compile(rf"env\.({'|'.join(OPTIONS)})\.")  # checked when a task binds them (playground/mdp/terms.py)
 _NESTED = ("text (put quotes around a number)", "a list of texts", "a list of lists of texts")
-# Numbers of the tasks' own keys, by name: the first that matches.
-_ENV = {
-  "links": count(1, 1000),
-  "success_steps": count(0),
-  "gripper_delay": count(0, 1000),
-  "action_delay observation_delay": Limit(0, 1000, whole=True, form="list", length=2, rising=True),
-  "*probability pose_noise.injection": SHARE,
-  "ema_alpha": positive(1),
-  "ctrl_dt sim_dt": positive(100),
-  "robot.restricted_range.*": span(-MOST),
-  "action_scale": positive().each,
-  "hinge_damping max_torque robot.cube.half_size robot.cube.mass stuck_after target_radius": positive(),
-  "success_angle success_distance success_threshold": positive(),
-  "curriculum.angle curriculum.distance robot.pd.* robot.pose_weights": at_least_0().each,
-  "goal.min_turn margin move_speed pose_noise.* sensor_noise.* settle_s": at_least_0(),
-  "scene.terrain_params.* success_wait success_reward termination_reward": Limit(),
-  "robot.cube.start robot.gaits.* robot.target_range.*": Limit().each,
-}
 
 
-def check_limits(resolved: Mapping[str, Any]) -> None:
+def check_limits(resolved: Section) -> None:
   """Checks the values that are there; a configuration may lack sections, and null is no value.
 
   Raises:
@@ -53,19 +36,18 @@ def check_limits(resolved: Mapping[str, Any]) -> None:
   contacts, convex = env.get("naconmax_per_env"), env.get("naccdmax_per_env")
   if contacts is not None and convex is not None and convex > contacts:
     raise ConfigError(f"env.naccdmax_per_env={convex} must not be above env.naconmax_per_env={contacts}.")
-  _check_batch(*(_get(resolved, f"agent.{key}") for key in ("num_envs", "batch_size", "num_minibatches")))
 
 
-def limit_of(key: str, names: Mapping[str, Any]) -> Limit | None:
+def limit_of(key: str, names: Mapping[str, object]) -> Limit | None:
   """Returns the limit of a dotted key's numbers, None if there is none; `names` as `definition` takes them."""
   if (setting := definition(key, names)) and setting.limit:
     return setting.limit
   name = key.removeprefix("env.")
-  found = (limit for patterns, limit in _ENV.items() if any(fnmatch.fnmatchcase(name, p) for p in patterns.split()))
+  found = (limit for patterns, limit in NUMBERS.items() if any(fnmatch.fnmatchcase(name, p) for p in patterns.split()))
   return next(found, None) if key.startswith("env.") else None
 
 
-def _check(key: str, value: Any, names: Mapping[str, Any]) -> None:
+def _check(key: str, value: object, names: Mapping[str, object]) -> None:
   shown, setting = f"{key}={format_value(value)}", definition(key, names)
   if setting and setting.choices and value not in setting.choices:
     near = nearest(str(value), setting.choices)
@@ -77,7 +59,7 @@ def _check(key: str, value: Any, names: Mapping[str, Any]) -> None:
     raise ConfigError(f"{shown} must be {limit}.")
 
 
-def _check_order(node: Mapping[str, Any], key: str) -> None:
+def _check_order(node: Section, key: str) -> None:
   """Raises ConfigError where a number is above the one whose name has `max` for its `min`, `upper` for `lower`."""
   for name, low in node.items():
     other = str(name).replace("min", "max").replace("lower", "upper")
@@ -88,14 +70,14 @@ def _check_order(node: Mapping[str, Any], key: str) -> None:
       raise ConfigError(f"{key}.{name}={format_value(low)} must not be above {key}.{other}={high}.")
 
 
-def check_vision(said: Iterable[str], resolved: Mapping[str, Any]) -> None:
+def check_vision(said: Iterable[str], resolved: Section) -> None:
   """Raises ConfigError where a command line says how a task sees (its keys are `said`) that sees nothing."""
   unused = [key for key in said if key.startswith("env.vision.") and key != "env.vision.enable"]
   if unused and _get(resolved, "env.vision.enable") is False:
     raise ConfigError(f"{unused[0]}: this task sees nothing. Add env.vision.enable=true env.vision.camera=<name>.")
 
 
-def _check_xla_flags(flags: Any) -> None:
+def _check_xla_flags(flags: object) -> None:
   """Allows switches and numbers alone: some flags write to files, or name a folder of programs that XLA starts."""
   for flag in flags.split() if isinstance(flags, str) else []:
     if not _XLA_SWITCH.fullmatch(flag) or any(word in flag for word in _XLA_PLACES):
@@ -103,31 +85,20 @@ def _check_xla_flags(flags: Any) -> None:
       raise ConfigError(f"hardware.xla_flags={flag} is refused: they {what}; export others in XLA_FLAGS.")
 
 
-def _check_batch(num_envs: int | None, batch_size: int | None, num_minibatches: int | None) -> None:
-  if num_envs is None or batch_size is None or num_minibatches is None:
-    return
-  if batch_size * num_minibatches % num_envs:
-    product = f"agent.batch_size * agent.num_minibatches = {batch_size} * {num_minibatches}"
-    raise ConfigError(
-      f"agent.num_envs={num_envs} does not divide {product} = {batch_size * num_minibatches}: "
-      "choose sizes so that it does."
-    )
-
-
-def _is_text(value: Any, depth: int) -> bool:
+def _is_text(value: object, depth: int) -> bool:
   if depth == 0:
     return isinstance(value, str)
   return isinstance(value, list) and all(_is_text(entry, depth - 1) for entry in value)
 
 
-def _numbers(value: Any) -> list[float]:
+def _numbers(value: object) -> list[float]:
   """The numbers in a value, a number or a list."""
   if isinstance(value, list):
     return [number for entry in value for number in _numbers(entry)]
   return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
-def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
   """Dotted keys and values of everything that is no mapping, or an empty one."""
   for name, value in node.items():
     if isinstance(value, Mapping) and value:
@@ -136,7 +107,7 @@ def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
       yield join(prefix, name), value
 
 
-def _get(node: Any, key: str) -> Any:
+def _get(node: Plain, key: str) -> Plain:
   """The value of a dotted key, None if there is none."""
   for part in key.split("."):
     node = node.get(part) if isinstance(node, Mapping) else None

@@ -1,9 +1,9 @@
 """The command line: one `key=value` at a time, and the groups among them."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override as HydraOverride
@@ -12,7 +12,9 @@ from omegaconf import OmegaConf
 
 from playground.config.files import DELTAS, config_roots, groups, listed_options, options
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.learning.hyperparameters import ELSEWHERE
 from playground.mdp.options import OPTIONS
+from playground.settings import Section
 from playground.text import format_value, quoted
 
 DEFAULT_EXPERIMENT = "quickstart"
@@ -30,7 +32,7 @@ class Override(NamedTuple):
   """One `key=value` of the command line; the value of a group that is switched off is None."""
 
   key: str
-  value: Any
+  value: object
   is_group: bool
   text: str
 
@@ -111,7 +113,7 @@ def group_overrides(overrides: Iterable[Override]) -> list[str]:
   return [f"~{o.key}" if o.value is None else f"{o.key}={format_value(o.value)}" for o in overrides if o.is_group]
 
 
-def canonical(overrides: Iterable[Override], resolved: Mapping[str, Any]) -> list[str]:
+def canonical(overrides: Iterable[Override], resolved: Section) -> list[str]:
   """Overrides for Hydra's own use: as typed, but with groups that are off and numbers in the form that it takes."""
   config = OmegaConf.create(dict(resolved))
   lines = []
@@ -132,7 +134,7 @@ def is_of_terms(key: str) -> bool:
   return len(parts) > 2 and parts[0] == "env" and parts[1] in OPTIONS
 
 
-def _check_option(group: str, option: Any, roots: Sequence[Path]) -> None:
+def _check_option(group: str, option: object, roots: Sequence[Path]) -> None:
   known = options(group, roots)
   if option in known:
     return
@@ -141,4 +143,5 @@ def _check_option(group: str, option: Any, roots: Sequence[Path]) -> None:
   allowed = ", ".join(shown) if len(shown) <= 12 else f"the {len(shown)} that `{command}` shows"
   elsewhere = [f"{other}={option}" for other in ("experiment", "env", "robot") if option in options(other, roots)]
   near = f" Did you mean {elsewhere[0]}?" if elsewhere else nearest(str(option), shown)
+  near = (ELSEWHERE.get(str(option)) if group == "agent" else None) or near
   raise UnknownNameError(f"{group}={format_value(option)} does not exist: choose from {allowed}.{near}")

@@ -3,16 +3,26 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ml_collections import ConfigDict
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from playground.config.run_options import CheckpointConfig, NonfiniteConfig, ProfileConfig, TrackingConfig, VideoConfig
+from playground.config.run_options import (
+  CheckpointConfig,
+  CurriculumConfig,
+  NonfiniteConfig,
+  ProfileConfig,
+  TrackingConfig,
+  VideoConfig,
+)
+from playground.envs.options import EnvConfig
 from playground.errors import ConfigError
-from playground.settings import build
+from playground.hardware.options import HardwareConfig
+from playground.learning.hyperparameters import AgentConfig, read_config
+from playground.settings import Plain, Section, build
 from playground.text import first_line, format_value
 
 if TYPE_CHECKING:
@@ -23,6 +33,8 @@ SECTIONS = (
   *("video", "checkpoint", "on_nonfinite", "profile"),
 )
 TYPED: dict[str, type] = {
+  "curriculum": CurriculumConfig,
+  "hardware": HardwareConfig,
   "tracking": TrackingConfig,
   "video": VideoConfig,
   "checkpoint": CheckpointConfig,
@@ -31,7 +43,13 @@ TYPED: dict[str, type] = {
 }
 SCALARS = ("seed", "run_dir", "resume", "init_from")
 
-Section = Any  # a ConfigDict, of a section whose keys depend on the task, the algorithm or the launcher
+
+if TYPE_CHECKING:
+
+  class TaskConfig(EnvConfig, Mapping[str, Plain], ConfigDict):  # pyright: ignore[reportIncompatibleMethodOverride]
+    """The section of a task: the settings that every task has (`EnvConfig`), and those of its own class."""
+else:
+  TaskConfig = ConfigDict
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +58,8 @@ class RunConfig:
 
   Attributes:
     name: the experiment, or the task if there is none.
+    env: the task's section, whose keys are those of its class.
+    agent: the algorithm's settings, of the class of its name (`PPOConfig`, ...).
     run_dir: where the run lives; without `run_dir` or `resume` a name from the time of composing, which `resolved`
       leaves null, and which the run numbers (`_2`) if another has it by then.
     choices: the option of each group, None where none is chosen.
@@ -49,10 +69,10 @@ class RunConfig:
   """
 
   name: str
-  env: Section
-  agent: Section
-  curriculum: Section
-  hardware: Section
+  env: TaskConfig
+  agent: AgentConfig
+  curriculum: CurriculumConfig
+  hardware: HardwareConfig
   tracking: TrackingConfig
   video: VideoConfig
   checkpoint: CheckpointConfig
@@ -62,21 +82,26 @@ class RunConfig:
   run_dir: str | None
   resume: str | None
   init_from: str | None
-  choices: dict[str, Any]
+  choices: dict[str, Plain]
   overrides: tuple[str, ...]
-  resolved: dict[str, Any]
+  resolved: dict[str, Plain]
   stages: tuple["RunConfig", ...] = ()
 
+  @property
+  def agent_name(self) -> str:
+    """The algorithm's name, `agent.name`; several options of the group `agent` may choose one."""
+    return self.resolved["agent"]["name"]
 
-def config_dict(values: Any) -> ConfigDict:
+
+def config_dict(values: Section | ConfigDict) -> TaskConfig:
   """Returns a ConfigDict whose keys keep their order, in which terms apply; ConfigDict itself sorts them."""
-  config = ConfigDict(sort_keys=False)
+  config: Plain = ConfigDict(sort_keys=False)
   for key, value in values.items():
     config[key] = config_dict(value) if isinstance(value, Mapping | ConfigDict) else value
   return config
 
 
-def in_order_of(first: Any, values: Any) -> Any:
+def in_order_of(first: object, values: object) -> Plain:
   """`values` with the keys of `first` first, in their order there; mappings within likewise."""
   if not isinstance(values, Mapping | ConfigDict) or not isinstance(first, Mapping | ConfigDict):
     return values
@@ -84,7 +109,7 @@ def in_order_of(first: Any, values: Any) -> Any:
   return {name: in_order_of(first.get(name), values[name]) for name in names}
 
 
-def from_dict(resolved: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunConfig:
+def from_dict(resolved: Section, overrides: Sequence[str] = ()) -> RunConfig:
   """Rebuilds a configuration from its `resolved` dict, e.g. a run directory's config.yaml.
 
   Raises:
@@ -100,12 +125,14 @@ def from_dict(resolved: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
     raise ConfigError(f"This is not the configuration of a run: it lacks {', '.join(missing)}.")
   kinds = {"name": str, **dict.fromkeys(("choices", *SECTIONS), Mapping)}
   wrong = [key for key, kind in kinds.items() if not isinstance(resolved[key], kind)]
-  wrong += [] if wrong or isinstance(resolved["choices"].get("env"), str) else ["choices.env"]
+  texts = () if wrong else (("choices", "env"), ("agent", "name"))
+  wrong += [f"{section}.{key}" for section, key in texts if not isinstance(resolved[section].get(key), str)]
   if wrong:
     raise ConfigError(f"This is not the configuration of a run: its {wrong[0]} has the wrong type.")
   return RunConfig(
     name=resolved["name"],
-    **{key: config_dict(resolved[key]) for key in SECTIONS if key not in TYPED},
+    env=config_dict(resolved["env"]),
+    agent=read_config(resolved["agent"]),
     **{key: build(cls, resolved[key]) for key, cls in TYPED.items()},  # pyright: ignore[reportArgumentType]
     **{key: resolved[key] for key in SCALARS},
     choices=dict(resolved["choices"]),
@@ -130,7 +157,7 @@ def to_yaml(config: RunConfig) -> str:
   return values_to_yaml(config.resolved)
 
 
-def values_to_yaml(values: Any) -> str:
+def values_to_yaml(values: object) -> str:
   """A section or a single value of a configuration as YAML."""
   return (
     OmegaConf.to_yaml(OmegaConf.create(dict(values))) if isinstance(values, Mapping) else format_value(values) + "\n"
@@ -142,7 +169,7 @@ def tree(config: RunConfig) -> "Tree":
   from rich.text import Text
   from rich.tree import Tree
 
-  def grow(branch: Tree, node: Mapping[str, Any]) -> Tree:
+  def grow(branch: Tree, node: Section) -> Tree:
     for key, value in node.items():
       if isinstance(value, Mapping) and value:
         grow(branch.add(Text(str(key), style="bold")), value)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, TypedDict
 
 from playground.limits import SHARE, at_least_0, count
 
@@ -69,6 +69,13 @@ class ProfileConfig:
   enable: Annotated[bool, "whether one evaluation's stretch of training is traced (debug=profile)"] = False
 
 
+class StageConfig(TypedDict):
+  """A stage of a chain: its own budget, null for the task's, and what it changes, as on the command line."""
+
+  num_timesteps: int | None
+  overrides: Sequence[str]
+
+
 @dataclasses.dataclass(frozen=True)
 class CurriculumConfig:
   """A single run. A chain adds stages, each a run that starts from the last one's weights (docs/curricula.md)."""
@@ -77,4 +84,6 @@ class CurriculumConfig:
     float, at_least_0(1000), "share of its budget that every stage gets; 0: agent.num_timesteps for each"
   ] = 1.0
   start_at: Annotated[str | None, "a later stage to start at, from the weights that init_from names"] = None
-  stages: Annotated[Mapping[str, Any], "by name: num_timesteps and overrides"] = dataclasses.field(default_factory=dict)
+  stages: Annotated[Mapping[str, StageConfig], "by name: num_timesteps and overrides"] = dataclasses.field(
+    default_factory=dict
+  )

@@ -2,23 +2,23 @@
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 from playground.config.definitions import definition
 from playground.config.files import DELTAS
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.moved import check_not_moved
 from playground.mdp.options import OPTIONS, keys
+from playground.settings import Plain, Section
 from playground.text import format_value, join, nearest_in
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", list: "a list"}
 
 
-def check_key(key: str, schema: Mapping[str, Any]) -> None:
+def check_key(key: str, schema: Section) -> None:
   """Raises UnknownNameError, with what is there instead, if the schema has no such dotted key."""
   if is_open(key.split("."), schema):
     return
-  node: Any = schema
+  node: Plain = schema
   parts = key.split(".")
   for i, part in enumerate(parts):
     if isinstance(node, list) and part.isdigit() and int(part) < len(node):
@@ -30,7 +30,7 @@ def check_key(key: str, schema: Mapping[str, Any]) -> None:
       raise _unknown_key(key, ".".join(parts[:i]), part, node, schema)
 
 
-def is_open(parts: Sequence[str], schema: Mapping[str, Any]) -> bool:
+def is_open(parts: Sequence[str], schema: Section) -> bool:
   """Whether a key is in a mapping of terms (`env.rewards`, ...), which may have entries of any name.
 
   Raises:
@@ -51,7 +51,7 @@ def is_terms(key: str) -> bool:
   return key.startswith("env.") and key[4:] in OPTIONS
 
 
-def fit(value: Any, default: Any, names: Mapping[str, Any], key: str = "") -> Any:
+def fit(value: Plain, default: Plain, names: Mapping[str, object], key: str = "") -> Plain:
   """Returns a value in the type of its default, e.g. 1e6 as the whole number that the default is.
 
   Args:
@@ -80,16 +80,16 @@ def fit(value: Any, default: Any, names: Mapping[str, Any], key: str = "") -> An
   if not _fits(value, default):
     allowed = _KINDS.get(type(default), "a mapping")
     raise wrong_type(key, value, f"{allowed}, as its default {format_value(default)} is")
-  kind: Any = type(default)
-  return kind(value) if isinstance(default, int | float) else value
+  kind = type(default)
+  return kind(value) if isinstance(default, int | float) else value  # pyright: ignore[reportArgumentType]
 
 
-def wrong_type(key: str, value: Any, allowed: str) -> ConfigError:
+def wrong_type(key: str, value: object, allowed: str) -> ConfigError:
   """The error for a value of another type than is allowed."""
   return ConfigError(f"{key}={format_value(value)} has the wrong type: it must be {allowed}.")
 
 
-def _fits(value: Any, default: Any) -> bool:
+def _fits(value: object, default: object) -> bool:
   if isinstance(default, bool) or not isinstance(default, int | float):
     return isinstance(value, type(default))
   if not isinstance(value, int | float) or isinstance(value, bool) or value != value:  # NaN fits nothing
@@ -99,7 +99,7 @@ def _fits(value: Any, default: Any) -> bool:
   return isinstance(default, float) or value.is_integer()
 
 
-def _fit_terms(value: Any, key: str) -> Any:
+def _fit_terms(value: object, key: str) -> Plain:
   """A mapping of terms as it is: what its entries need, the task checks when it binds them."""
   if not isinstance(value, Mapping):
     raise wrong_type(key, value, "a mapping of terms by name")
@@ -114,14 +114,14 @@ def _fit_terms(value: Any, key: str) -> Any:
   return dict(value)
 
 
-def _check_mappings(entry: Mapping[str, Any], key: str) -> None:
+def _check_mappings(entry: Section, key: str) -> None:
   """Raises ConfigError where a field of a term that holds keys is something else."""
   for name in ("params", "when", "noise"):
     if entry.get(name) is not None and not isinstance(entry[name], Mapping):
       raise wrong_type(join(key, name), entry[name], "a mapping or null")
 
 
-def _fit_mapping(value: Any, default: Mapping[str, Any], names: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _fit_mapping(value: object, default: Section, names: Mapping[str, object], key: str) -> dict[str, Plain]:
   if not isinstance(value, Mapping):
     raise wrong_type(key, value, f"a mapping with the keys {', '.join(map(str, default))}")
   for name in value:
@@ -131,7 +131,7 @@ def _fit_mapping(value: Any, default: Mapping[str, Any], names: Mapping[str, Any
   return {name: fit(value[name], default[name], names, join(key, name)) for name in value}
 
 
-def _fit_list(value: list[Any], default: list[Any], names: Mapping[str, Any], key: str) -> list[Any]:
+def _fit_list(value: list[Plain], default: list[Plain], names: Mapping[str, object], key: str) -> list[Plain]:
   """Lists may differ in length; if the default's entries are all of one scalar type, so must the value's be."""
   kinds = {type(entry) for entry in default}
   if float in kinds:
@@ -142,7 +142,7 @@ def _fit_list(value: list[Any], default: list[Any], names: Mapping[str, Any], ke
   return [fit(entry, sample, names, f"{key}[{i}]") for i, entry in enumerate(value)]
 
 
-def _unknown_key(key: str, parent: str, part: str, node: Any, schema: Mapping[str, Any]) -> UnknownNameError:
+def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section) -> UnknownNameError:
   if not isinstance(node, Mapping):
     what = f"a list of {len(node)}" if isinstance(node, list) else "a single value"
     return UnknownNameError(f"{key} does not exist: {parent} is {what}.")
@@ -154,7 +154,7 @@ def _unknown_key(key: str, parent: str, part: str, node: Any, schema: Mapping[st
   return UnknownNameError(f"{key} does not exist: {parent or 'the configuration'} {has}.{near}")
 
 
-def _keys(node: Any, prefix: str = "") -> Iterable[str]:
+def _keys(node: Plain, prefix: str = "") -> Iterable[str]:
   """Dotted names of everything in a nested mapping."""
   if isinstance(node, Mapping):
     for name, value in node.items():

@@ -2,11 +2,9 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal
 
 from playground.limits import SEED, at_least_0, count, positive
-
-T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,7 +64,7 @@ class SlurmConfig(LauncherConfig):
   qos: Annotated[str | None, "quality of service"] = None
   constraint: Annotated[str | None, "features that a node must have"] = None
   setup: Annotated[Sequence[str], "lines of shell before a job, such as `module load cuda`"] = ()
-  parameters: Annotated[Mapping[str, Any], "anything else for sbatch, e.g. {exclusive: true}"] = dataclasses.field(
+  parameters: Annotated[Mapping[str, object], "anything else for sbatch, e.g. {exclusive: true}"] = dataclasses.field(
     default_factory=dict
   )
   wait: Annotated[bool, "false: submit and return; `playground sweep status|collect` look later"] = True
@@ -96,7 +94,7 @@ class OptunaConfig:
 
 
 LAUNCHERS: dict[str, type[LauncherConfig]] = {"local": LocalConfig, "ray": RayConfig, "slurm": SlurmConfig}
-SEARCHES: dict[str, type[Any]] = {"grid": GridConfig, "optuna": OptunaConfig}
+SEARCHES: dict[str, type] = {"grid": GridConfig, "optuna": OptunaConfig}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,6 +105,9 @@ class SweepConfig:
   on_error: Annotated[Literal["continue", "stop"], "stop: the first job that fails stops the others"] = "continue"
 
 
-def typed(classes: Mapping[str, type[T]], section: Mapping[str, Any]) -> T:
-  """Returns a section's settings as an object of the class of its `name`."""
-  return classes[section["name"]](**{key: value for key, value in section.items() if key != "name"})
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SweepSettings(SweepConfig):
+  """All that a sweep is told of itself."""
+
+  launcher: LauncherConfig
+  search: GridConfig | OptunaConfig

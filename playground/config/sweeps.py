@@ -24,7 +24,6 @@ import itertools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from hydra.core.override_parser.types import ChoiceSweep, Glob
 from hydra.core.override_parser.types import Override as HydraOverride
@@ -213,7 +212,7 @@ def _read(name: str) -> tuple[list[str], list[str]]:
   return [_override(name, str(key), value) for key, value in (params or {}).items()], list(jobs or [])
 
 
-def _override(name: str, key: str, value: Any) -> str:
+def _override(name: str, key: str, value: object) -> str:
   values = value if isinstance(value, list) else [value]
   if not values or any(isinstance(entry, Mapping) for entry in values):
     raise ConfigError(f"sweep={name}: params.{key}={format_value(value)} must be a value or a list of values.")

@@ -66,7 +66,7 @@ def export_policy(trained: LoadedPolicy, state: State | None = None) -> Exported
   origin = {
     "run": trained.run_dir.path.absolute().name,
     "experiment": trained.config.name,
-    "agent": agent.name,
+    "agent": trained.config.agent_name,
     "steps": trained.checkpoint.step,
     **(trained.run_dir.manifest.get("git") or {}),
     "impl": trained.run_dir.manifest.get("impl"),

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from playground.limits import at_least_0, count, positive, span
+from playground.limits import MOST, SHARE, Limit, at_least_0, count, positive, span
 
 TERMS = dict[str, Any]
 
@@ -84,6 +84,26 @@ class TaskKeys:
   """Settings of some tasks that are texts or may be null."""
 
   robot: RobotKeys
+
+
+# Limits of the numbers of tasks' own keys, by name: the first that matches.
+NUMBERS = {
+  "links": count(1, 1000),
+  "success_steps": count(0),
+  "gripper_delay": count(0, 1000),
+  "action_delay observation_delay": Limit(0, 1000, whole=True, form="list", length=2, rising=True),
+  "*probability pose_noise.injection": SHARE,
+  "ema_alpha": positive(1),
+  "ctrl_dt sim_dt": positive(100),
+  "robot.restricted_range.*": span(-MOST),
+  "action_scale": positive().each,
+  "hinge_damping max_torque robot.cube.half_size robot.cube.mass stuck_after target_radius": positive(),
+  "success_angle success_distance success_threshold": positive(),
+  "curriculum.angle curriculum.distance robot.pd.* robot.pose_weights": at_least_0().each,
+  "goal.min_turn margin move_speed pose_noise.* sensor_noise.* settle_s": at_least_0(),
+  "scene.terrain_params.* success_wait success_reward termination_reward": Limit(),
+  "robot.cube.start robot.gaits.* robot.target_range.*": Limit().each,
+}
 
 
 def sees(env: Mapping[str, Any]) -> bool:

@@ -2,12 +2,11 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from playground.envs.base import Env
+from playground.envs.base import Env, Observation, State
 from playground.envs.wrappers import wrap_for_training
 from playground.errors import ConfigError
 from playground.physics.backend import BufferUse
@@ -17,7 +16,7 @@ _TRIES = 12
 _REPORTS = 50  # of the progress of a rollout, which takes minutes on a CPU
 _CCD = 1 << 4  # mujoco_warp's OverflowType.CCD
 
-Act = Callable[[Any, jax.Array], jax.Array]  # (observation [N, ...], key) -> actions [N, action_size]
+Act = Callable[[Observation, jax.Array], jax.Array]  # (observation [N, ...], key) -> actions [N, action_size]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +83,7 @@ def measure_buffers(
       convex, grew = 2 * convex, True
     if not grew:
       break
-  bits = _overflow_names(int(use.overflow))
+  bits = _overflow_names(int(use.overflow))  # pyright: ignore[reportPossiblyUnboundVariable]
   raise ConfigError(
     f"env.impl=warp: buffers ({bits}) still overflow with njmax={rows}, naconmax_per_env={pairs} and "
     f"naccdmax_per_env={convex}."
@@ -101,13 +100,13 @@ def _roll(
   keys = jax.random.split(act_key, num_steps)
 
   @jax.jit
-  def start() -> tuple[Any, BufferUse]:
+  def start() -> tuple[State, BufferUse]:
     state = wrapped.reset(jax.random.split(reset_key, num_envs), {})
     return state, jax.tree.map(jnp.zeros_like, state.data.buffers)
 
   @jax.jit
-  def advance(carry: tuple[Any, BufferUse], first: int, end: int) -> tuple[Any, BufferUse]:
-    def step(index: jax.Array, carry: tuple[Any, BufferUse]) -> tuple[Any, BufferUse]:
+  def advance(carry: tuple[State, BufferUse], first: int, end: int) -> tuple[State, BufferUse]:
+    def step(index: jax.Array, carry: tuple[State, BufferUse]) -> tuple[State, BufferUse]:
       state, most = carry
       state = wrapped.step(state, (act or uniform)(state.obs, keys[index]), {})
       assert state.data.buffers is not None, "the task is on Warp"

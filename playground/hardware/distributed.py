@@ -17,13 +17,18 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import numpy as np
 
 from playground.errors import ConfigError, HardwareError, PlaygroundError
+from playground.hardware.options import DistributedConfig, HardwareConfig
+from playground.text import first_line
+
+T = TypeVar("T")
 
 PREFLIGHT = "preflight"  # name of the threads that may hang
 _STORE = "playground"  # our folder in the coordinator's key-value store
@@ -73,7 +78,7 @@ def share(text: str = "") -> str:
   return _within(lambda: client.blocking_key_value_get(key, _WEEK_MS), None, "process 0 did not answer")
 
 
-def join(config: Any) -> None:
+def join(config: HardwareConfig) -> None:
   """Joins the training's other processes, if `hardware.distributed` says that there are any.
 
   They come from Slurm (or whatever else JAX knows), or from the keys coordinator, num_processes and process_id. Call it
@@ -84,8 +89,9 @@ def join(config: Any) -> None:
     HardwareError: they do not come, or cannot be reached.
   """
   keys = ("coordinator", "num_processes", "process_id")
-  given = {key: config.distributed[key] for key in keys}
-  if not config.distributed.enable:
+  settings = config.distributed
+  given = {key: getattr(settings, key) for key in keys}
+  if not settings.enable:
     if named := [key for key in keys if given[key] is not None]:
       raise ConfigError(f"hardware.distributed.{named[0]} needs hardware=multi_node.")
     return
@@ -102,8 +108,8 @@ def join(config: Any) -> None:
     )
   if explicit:
     _check(**given)
-  timeout = config.distributed.timeout
-  coordinator, count, index, local_device_ids = _topology(given, round(timeout))
+  timeout = settings.timeout
+  coordinator, count, index, local_device_ids = _topology(settings, round(timeout))
   if index > 0:
     _reach(coordinator, timeout)
   # Its handler of SIGTERM would replace ours, which saves.
@@ -111,7 +117,7 @@ def join(config: Any) -> None:
   # CPUs only: two programs in flight would exchange in an order of their own in each process.
   jax.config.update("jax_cpu_collectives_implementation", "gloo")
   jax.config.update("jax_cpu_enable_async_dispatch", False)
-  watch = _Watch(index, count, coordinator, config.distributed.lost_after)
+  watch = _Watch(index, count, coordinator, settings.lost_after)
   _within(
     lambda: jax.distributed.initialize(
       coordinator if index == 0 else watch.relay(),
@@ -128,7 +134,7 @@ def join(config: Any) -> None:
     watch.start()
 
 
-def preflight(config: Any, fingerprint: Any, what: str = "configuration") -> None:
+def preflight(config: HardwareConfig, fingerprint: object, what: str = "configuration") -> None:
   """Checks in an exchange between all processes that they train the same.
 
   Args:
@@ -197,7 +203,7 @@ def noting_loss(note: Callable[[str], None]) -> Iterator[None]:
     if not any(word in str(error) for word in ("Gloo", "NCCL")):
       raise
     time.sleep(_watch.lost_after + 5)  # the exchange broke before the watch knows why, and then the watch ends this
-    raise HardwareError(f"hardware=multi_node: an exchange failed, {_first_line(error)}.") from error
+    raise HardwareError(f"hardware=multi_node: an exchange failed, {first_line(error)}.") from error
   finally:
     _watch.notes.remove(note)
 
@@ -218,7 +224,7 @@ class _Watch:
   def __init__(self, index: int, count: int, coordinator: str, lost_after: float):
     self.lost_after = lost_after
     self.notes: list[Callable[[str], None]] = []
-    self.client: Any = None
+    self.client: Any = None  # JAX has no public type for it
     self._index, self._count, self._coordinator = index, count, coordinator
     self._leaving = threading.Event()
     self._lock = threading.Lock()
@@ -336,35 +342,31 @@ def _sign_of(index: int) -> str:
 _watch: _Watch | None = None  # this process's, once it has joined others
 
 
-def _within(call: Callable[[], Any], seconds: float | None, otherwise: str) -> Any:
+def _within(call: Callable[[], T], seconds: float | None, otherwise: str) -> T:
   """Result of a call that may hang, which a signal can interrupt; raises HardwareError if it hangs or fails."""
-  outcome: list[Any] = []
+  outcome: Future[T] = Future()
 
   def run() -> None:
     try:
-      outcome.append((True, call()))
+      outcome.set_result(call())
     except Exception as error:  # whatever the runtime throws
-      outcome.append((False, error))
+      outcome.set_exception(error)
 
   _start_thread(run, PREFLIGHT).join(seconds)
-  if not outcome:
+  if not outcome.done():
     raise HardwareError(f"hardware=multi_node: {otherwise}.")
-  good, result = outcome[0]
-  if good:
-    return result
-  said = _first_line(result)
-  late = "DEADLINE" in said.upper() or "timed out" in said.lower()
-  raise HardwareError(f"hardware=multi_node: {otherwise if late else said}.") from result
+  try:
+    return outcome.result()
+  except Exception as error:
+    said = first_line(error)[:200]
+    late = "DEADLINE" in said.upper() or "timed out" in said.lower()
+    raise HardwareError(f"hardware=multi_node: {otherwise if late else said}.") from error
 
 
 def _start_thread(target: Callable[[], None], name: str = "watch") -> threading.Thread:
   thread = threading.Thread(target=target, name=name, daemon=True)
   thread.start()
   return thread
-
-
-def _first_line(error: Exception) -> str:
-  return str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
 
 
 def _receive(end: socket.socket) -> bytes:
@@ -408,13 +410,13 @@ def _known_cluster() -> bool:
   return any(env.is_env_present() for env in clusters.ClusterEnv._cluster_types if not env.opt_in_only_method)
 
 
-def _topology(given: Mapping[str, Any], timeout: int) -> tuple[str, int, int, list[int] | None]:
+def _topology(settings: DistributedConfig, timeout: int) -> tuple[str, int, int, list[int] | None]:
   """The coordinator's address, how many processes there are, which one this is, and its devices if not all."""
   from jax._src import clusters  # as above
 
-  coordinator, count, index = given.values()
-  detect: Any = clusters.ClusterEnv.auto_detect_unset_distributed_params
-  return detect(coordinator, count, index, _local_device_ids(), None, timeout)
+  given = settings.coordinator, settings.num_processes, settings.process_id
+  detect = clusters.ClusterEnv.auto_detect_unset_distributed_params
+  return detect(*given, _local_device_ids(), None, timeout)  # pyright: ignore[reportReturnType]
 
 
 def _local_device_ids() -> list[int] | None:

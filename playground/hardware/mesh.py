@@ -2,13 +2,15 @@
 
 import os
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
+from jax.stages import Wrapped
+
+from playground.pytree import PyTree
 
 AXIS = "data"  # the mesh's axis; inside a mapped function collectives name it
 
@@ -20,26 +22,25 @@ def make_mesh(num_devices: int) -> Mesh:
   return Mesh(np.array([device for i in range(jax.process_count()) for device in mine(i)]), (AXIS,))
 
 
-def gather_on_mesh(function: Callable[..., Any], mesh: Mesh, spec: Any) -> Any:
+def gather_on_mesh(function: Callable[..., PyTree], mesh: Mesh, spec: PyTree) -> Wrapped:
   """Jits a function of one tree, divided as `spec` says, whose results are then whole on every device."""
-  shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), spec)
-  return jax.jit(function, in_shardings=(shardings,), out_shardings=NamedSharding(mesh, P()))
+  return jax.jit(function, in_shardings=(_shardings(mesh, spec),), out_shardings=NamedSharding(mesh, P()))
 
 
-def divide(tree: Any, mesh: Mesh) -> Any:
+def divide(tree: PyTree, mesh: Mesh) -> PyTree:
   """Arrays that every process has, divided over the devices by their leading axis."""
   if jax.process_count() == 1:  # what is jitted over the mesh takes them as they are
     return tree
   return put(tree, mesh, P(AXIS))
 
 
-def put(tree: Any, mesh: Mesh, spec: Any) -> Any:
+def put(tree: PyTree, mesh: Mesh, spec: PyTree) -> PyTree:
   """Puts host arrays, the same in every process, on the devices as `spec` (a tree prefix) says; shares no buffer."""
-  shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), spec)
+  shardings = _shardings(mesh, spec)
   if jax.process_count() == 1:
     return jax.device_put(tree, shardings, may_alias=False)
 
-  def place(sharding: NamedSharding, part: Any) -> Any:
+  def place(sharding: NamedSharding, part: PyTree) -> PyTree:
     hosts = jax.tree.map(np.asarray, part)  # device_put would compare them between the processes, one by one
     return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, sharding, lambda index: x[index]), hosts)
 
@@ -54,6 +55,10 @@ def own_share(array: jax.Array, axis: int) -> np.ndarray:
   return np.concatenate([np.asarray(shard.data) for shard in shards], axis)
 
 
+def _shardings(mesh: Mesh, specs: PyTree) -> PyTree:
+  return jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs)
+
+
 def device_memory(mesh: Mesh) -> int | None:
   """Bytes that a program may use on the smallest device, of a CPU its share of the host's; None if nobody says."""
   if mesh.devices.flat[0].platform == "cpu":
@@ -63,7 +68,9 @@ def device_memory(mesh: Mesh) -> int | None:
   return min(known) if len(known) == len(limits) else None
 
 
-def jit_on_mesh(function: Callable[..., Any], mesh: Mesh, in_specs: Any, out_specs: Any, **kwargs: Any) -> Any:
+def jit_on_mesh(
+  function: Callable[..., PyTree], mesh: Mesh, in_specs: PyTree, out_specs: PyTree, donate_argnums: int | None = None
+) -> Wrapped:
   """Jits `function` to run once on every device of the mesh, each on its share of the arguments.
 
   Args:
@@ -71,27 +78,27 @@ def jit_on_mesh(function: Callable[..., Any], mesh: Mesh, in_specs: Any, out_spe
     mesh: the devices.
     in_specs: a PartitionSpec for each argument (or a tree prefix of them): P("data") divides the leading axis.
     out_specs: the same for the results; P() promises that all devices return the same.
-    **kwargs: for `jax.jit` (`donate_argnums`).
+    donate_argnums: the argument whose buffers the result takes over.
   """
-  sharding = lambda specs: jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs)
   over_mesh = lambda function: jax.shard_map(
     function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
   )
   mapped = over_mesh(function) if mesh.size == 1 else _without_empty_arrays(function, over_mesh)
-  return jax.jit(mapped, in_shardings=sharding(in_specs), out_shardings=sharding(out_specs), **kwargs)
+  inputs, outputs = _shardings(mesh, in_specs), _shardings(mesh, out_specs)
+  return jax.jit(mapped, in_shardings=inputs, out_shardings=outputs, donate_argnums=donate_argnums)
 
 
-def _without_empty_arrays(function: Callable[..., Any], over_mesh: Callable[..., Any]) -> Callable[..., Any]:
+def _without_empty_arrays(function: Callable[..., PyTree], over_mesh: Callable[..., PyTree]) -> Callable[..., PyTree]:
   """`over_mesh(function)`, but that arrays of no elements have some while they go in and out.
 
   A mocap body's pose in a model without one is such an array. JAX 0.11.2 dies of a segmentation fault compiling
   a shard_map over several devices that takes and returns one (Shardy's ManualComputationUnusedInputsPattern).
   """
 
-  def mapped(*args: Any) -> Any:
-    out_axes: Any = None
+  def mapped(*args: PyTree) -> PyTree:
+    out_axes: PyTree = None
 
-    def body(*filled: Any) -> Any:
+    def body(*filled: PyTree) -> PyTree:
       nonlocal out_axes
       out = function(*_cut(filled, in_axes))
       out_axes = _empty_axes(out)
@@ -103,18 +110,18 @@ def _without_empty_arrays(function: Callable[..., Any], over_mesh: Callable[...,
   return mapped
 
 
-def _empty_axes(tree: Any) -> list[list[int]]:
+def _empty_axes(tree: PyTree) -> list[list[int]]:
   """Of each leaf, the axes of length 0."""
   return [[axis for axis, size in enumerate(jnp.shape(x)) if size == 0] for x in jax.tree.leaves(tree)]
 
 
-def _fill(tree: Any) -> Any:
+def _fill(tree: PyTree) -> PyTree:
   """The tree with axes of length 0 made 1 long."""
   some = lambda x: jnp.zeros([size or 1 for size in x.shape], x.dtype) if 0 in jnp.shape(x) else x
   return jax.tree.map(some, tree)
 
 
-def _cut(tree: Any, axes: list[list[int]]) -> Any:
+def _cut(tree: PyTree, axes: list[list[int]]) -> PyTree:
   """The tree with these axes of its leaves made empty."""
   leaves, structure = jax.tree.flatten(tree)
   for i, empty in enumerate(axes):

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from playground.limits import count, positive
 
+Platform = Literal["auto", "cpu", "gpu"]
 Precision = Literal["default", "high", "highest", "bfloat16", "tensorfloat32", "float32"]
 
 
@@ -30,7 +31,7 @@ class DistributedConfig:
 class HardwareConfig:
   """Settings of the devices of a training."""
 
-  platform: Annotated[Literal["auto", "cpu", "gpu"], "auto is a GPU if JAX sees one"] = "auto"
+  platform: Annotated[Platform, "auto is a GPU if JAX sees one"] = "auto"
   kind: Annotated[str | None, "a word that the device's name must have, such as H100; null takes any"] = None
   devices: Annotated[int | None, count(1, 100_000), "devices of each machine; null is all"] = None
   scale_envs: Annotated[

@@ -3,17 +3,15 @@
 import dataclasses
 import os
 from pathlib import Path
-from typing import Any, get_args
 
 import jax
 from jax.sharding import Mesh
 
-from playground.errors import ConfigError, HardwareError
+from playground.errors import HardwareError
 from playground.hardware.distributed import join
 from playground.hardware.mesh import make_mesh
-from playground.hardware.options import Precision
+from playground.hardware.options import HardwareConfig, Platform
 
-PRECISIONS: tuple[str, ...] = get_args(Precision)
 CACHE = Path("~/.cache/playground")
 
 
@@ -23,23 +21,17 @@ class Hardware:
 
   mesh: Mesh
   network_precision: str | None
-  facts: dict[str, Any]  # for the manifest
+  facts: dict[str, object]  # for the manifest
 
 
-def setup(config: Any) -> Hardware:
+def setup(config: HardwareConfig) -> Hardware:
   """Applies the `hardware` config to this process and returns its devices.
 
   Call it before JAX touches a device: platform, memory and flags cannot change afterwards.
 
   Raises:
-    ConfigError: an unknown platform or precision.
     HardwareError: devices this machine does not have, or other processes of the training that do not come.
   """
-  for key in ("matmul_precision", "network_precision"):
-    if config[key] not in PRECISIONS:
-      raise ConfigError(f"hardware.{key}={config[key]!r} must be one of {', '.join(PRECISIONS)}.")
-  if config.platform not in ("auto", "cpu", "gpu"):
-    raise ConfigError(f"hardware.platform={config.platform!r} must be one of auto, cpu, gpu.")
   _environment(config)
   if config.platform == "cpu":
     jax.config.update("jax_platforms", "cpu")
@@ -71,21 +63,19 @@ def setup(config: Any) -> Hardware:
   return Hardware(mesh, config.network_precision, facts)
 
 
-def this_machine(hardware: Any) -> Any:
-  """A run's `hardware` config for looking at it here: one device of whatever kind there is."""
-  hardware = hardware.copy_and_resolve_references()
-  hardware.devices, hardware.kind, hardware.xla_flags = 1, None, ""
-  hardware.distributed.enable = False
-  hardware.platform = "cpu" if hardware.platform == "cpu" else "auto"
-  return hardware
+def this_machine(hardware: HardwareConfig, platform: Platform | None = None) -> HardwareConfig:
+  """A run's `hardware` config for looking at it here: one device of whatever kind there is, or of a platform."""
+  platform = platform or ("cpu" if hardware.platform == "cpu" else "auto")
+  alone = dataclasses.replace(hardware.distributed, enable=False)
+  return dataclasses.replace(hardware, devices=1, kind=None, xla_flags="", distributed=alone, platform=platform)
 
 
-def cache_dir(config: Any) -> Path:
+def cache_dir(config: HardwareConfig) -> Path:
   """Where compiled programs are kept between runs."""
   return Path(config.cache_dir or CACHE).expanduser()
 
 
-def _environment(config: Any) -> None:
+def _environment(config: HardwareConfig) -> None:
   """Variables that the GPU runtime reads when it starts; what the user exported wins."""
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", str(bool(config.preallocate)).lower())
   if config.memory_fraction is not None:
@@ -94,7 +84,7 @@ def _environment(config: Any) -> None:
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {config.xla_flags}".strip()
 
 
-def _caches(config: Any) -> str | None:
+def _caches(config: HardwareConfig) -> str | None:
   """Turns on JAX's and Warp's persistent caches; a cache the user set up already is left as it is."""
   if not config.compilation_cache:
     return None

@@ -4,7 +4,7 @@ import abc
 import functools
 import importlib
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from playground.learning.hyperparameters import AgentConfig
 from playground.learning.networks import Actor, Normalizer
 from playground.learning.replay import Replay, ReplayBuffer
 from playground.learning.rollout import Environments
+from playground.pytree import PyTree
 
 Metrics = dict[str, jax.Array]
 
@@ -30,7 +31,7 @@ class Policy(struct.PyTreeNode):
     normalizer: running mean and standard deviation of observations.
   """
 
-  params: Any
+  params: PyTree
   normalizer: Normalizer
 
 
@@ -43,8 +44,8 @@ class AlgorithmState(struct.PyTreeNode):
     replay: experience of an algorithm that has a replay buffer, divided over the devices by environments.
   """
 
-  params: Any
-  opt_state: Any
+  params: PyTree
+  opt_state: PyTree
   normalizer: Normalizer
   replay: Replay | None = None
 
@@ -107,20 +108,23 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
     return {"mode" if mode else "sampled": functools.partial(self.act, deterministic=mode)} if self.samples else {}
 
 
-def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None) -> Algorithm[Any, Any, Any]:
+AnyAlgorithm = Algorithm[AgentConfig, Actor, AlgorithmState]
+
+
+def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None) -> AnyAlgorithm:
   """Imports and builds the algorithm that a config is of.
 
   Raises:
     ConfigError: sizes that do not go together, or networks that do not fit the task.
   """
   module, _, name = config.algorithm.partition(":")
-  make: Callable[..., Algorithm[Any, Any, Any]] = getattr(importlib.import_module(module), name)
+  make: Callable[..., AnyAlgorithm] = getattr(importlib.import_module(module), name)
   return make(env, config, network_precision)
 
 
 def gradient_step(
-  optimizer: optax.GradientTransformation, grads: Any, params: jax.Array, opt_state: Any
-) -> tuple[jax.Array, Any, jax.Array, jax.Array]:
+  optimizer: optax.GradientTransformation, grads: PyTree, params: jax.Array, opt_state: PyTree
+) -> tuple[jax.Array, PyTree, jax.Array, jax.Array]:
   """Applies gradients, averaged over the devices; one that is not finite is left out.
 
   Parameters travel as one vector: an array each would cost a GPU a kernel or two each.

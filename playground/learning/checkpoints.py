@@ -24,16 +24,18 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
 from playground.errors import CheckpointError
+from playground.pytree import PyTree
+from playground.settings import Plain, Section
 
 FORMAT = "playground-run/1"
 BEST = "best"
@@ -54,6 +56,8 @@ _NO_BEST = (-math.inf, -1)  # return and step
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)  # what file systems say that have none
 logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax warns of its own defaults, and raises what are errors
 Arrays = list[np.ndarray]
+Leaf = list[Plain]  # name, shape and dtype
+T = TypeVar("T")
 Fetch = Callable[[], np.ndarray | None]
 
 
@@ -129,9 +133,9 @@ class CheckpointStore:
   def save(
     self,
     step: int,
-    policy: Any,
-    state: Any,
-    meta: Mapping[str, Any],
+    policy: PyTree,
+    state: PyTree,
+    meta: Section,
     replay: Fetch | None = None,
     episode_return: float | None = None,
   ) -> None:
@@ -162,7 +166,7 @@ class CheckpointStore:
     self._alias.remove()
     os.close(self._handle)
 
-  def _write(self, step: int, policy: Any, state: Any, meta: dict[str, Any], replay: Fetch | None) -> None:
+  def _write(self, step: int, policy: PyTree, state: PyTree, meta: dict[str, Plain], replay: Fetch | None) -> None:
     trees = {"policy": policy, "state": state}
     if replay and (experience := replay()) is not None:
       trees["replay"] = experience
@@ -197,7 +201,7 @@ class CheckpointStore:
       if other != step and (path / "replay").is_dir():
         shutil.rmtree(path / "replay")
 
-  def _save(self, step: int, items: Any) -> None:
+  def _save(self, step: int, items: ocp.args.CheckpointArgs) -> None:
     self._must_be_there()
     with _quiet_threads():
       self._manager.save(step, args=items, force=True)
@@ -244,7 +248,7 @@ class Checkpoint:
     self.path = Path(folder).absolute()
     if not self.path.is_dir():
       raise CheckpointError(f"No checkpoint at {folder}: there is no such folder.")
-    self.meta: dict[str, Any] = self._read_meta()
+    self.meta: dict[str, Plain] = self._read_meta()
 
   @property
   def step(self) -> int:
@@ -254,7 +258,7 @@ class Checkpoint:
     """Whether it holds an item."""
     return (self.path / item).is_dir()
 
-  def restore(self, item: str, template: Any) -> Any:
+  def restore(self, item: str, template: PyTree) -> PyTree:
     """Returns the tree of item 'policy', 'state' or 'replay' as host arrays.
 
     Args:
@@ -280,7 +284,7 @@ class Checkpoint:
       raise DamagedCheckpointError(f"{self.path} cannot be used: its {item}{broken} holds NaN or infinite values.")
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
-  def _read(self, item: str, read: Callable[[], Any]) -> Any:
+  def _read(self, item: str, read: Callable[[], T]) -> T:
     """Result of reading an item; tells damage from an operating system that does not let us read."""
     for pause in (*_RETRY_AFTER_S, None):
       try:
@@ -292,6 +296,7 @@ class Checkpoint:
         if pause is None:
           raise CheckpointError(f"{self.path} cannot be read now, which need not be damage: {reason}.") from error
         time.sleep(pause)
+    raise AssertionError("unreachable")
 
   def _unreadable(self, item: str) -> str | None:
     """Why the files of an item cannot be read at all; None if all can be."""
@@ -306,7 +311,7 @@ class Checkpoint:
     return None
 
   @_quiet_threads()
-  def _arrays(self, item: str) -> Any:
+  def _arrays(self, item: str) -> dict[str, np.ndarray]:
     options = ocp.CheckpointManagerOptions(
       read_only=True, step_format_fixed_length=12, multiprocessing_options=_alone()
     )
@@ -319,7 +324,7 @@ class Checkpoint:
       manager.close()
       alias.remove()
 
-  def _read_meta(self) -> dict[str, Any]:
+  def _read_meta(self) -> dict[str, Plain]:
     # As Orbax writes it; read without Orbax, whose errors do not say whose fault they are.
     file = self.path / "meta" / "metadata"
     if not file.exists() and not any((self.path / item).is_dir() for item in ("meta", "policy", "state")):
@@ -410,7 +415,7 @@ def _return_of(folder: Path) -> float | None:
     return None
 
 
-def describe(tree: Any) -> list[list[Any]]:
+def describe(tree: PyTree) -> list[Leaf]:
   """Name, shape and dtype of every leaf."""
   flat, _ = jax.tree_util.tree_flatten_with_path(tree)
   return [[jax.tree_util.keystr(path), list(np.shape(leaf)), str(np.dtype(leaf.dtype))] for path, leaf in flat]
@@ -424,7 +429,7 @@ def checksum(leaves: Arrays) -> str:
   return digest.hexdigest()
 
 
-def _first_nonfinite(described: list[list[Any]], leaves: Arrays) -> str | None:
+def _first_nonfinite(described: list[Leaf], leaves: Arrays) -> str | None:
   """The name of the first leaf with a NaN or infinite value, of what learning and acting go on from.
 
   An environment may hold such values (`info["nonfinite_state"]`): the guard keeps them from what learns.
@@ -436,13 +441,13 @@ def _first_nonfinite(described: list[list[Any]], leaves: Arrays) -> str | None:
   return None
 
 
-def _meta_checksum(meta: Mapping[str, Any]) -> str:
+def _meta_checksum(meta: Section) -> str:
   """SHA-256 of the meta data as JSON holds them, but for this checksum itself."""
   rest = {key: value for key, value in meta.items() if key != "meta_sha256"}
   return hashlib.sha256(json.dumps(json.loads(json.dumps(rest)), sort_keys=True).encode()).hexdigest()
 
 
-def _meta_damage(meta: Any) -> str:
+def _meta_damage(meta: Plain) -> str:
   """What is wrong with meta data of our format, '' if nothing is. Earlier versions wrote no checksum of them."""
   if not isinstance(meta, dict):
     return "are no mapping"
@@ -459,7 +464,7 @@ def _meta_damage(meta: Any) -> str:
   return ""
 
 
-def _version(written_as: Any) -> int:
+def _version(written_as: object) -> int:
   """The number of one of our formats, 0 for any other."""
   match = re.fullmatch(r"playground-run/(\d+)", str(written_as))
   return int(match[1]) if match else 0
@@ -521,7 +526,7 @@ def _number(i: int) -> str:
   return f"{i:05d}"
 
 
-def _first_difference(expected: list[list[Any]], found: list[list[Any]]) -> str:
+def _first_difference(expected: list[Leaf], found: list[Leaf]) -> str:
   theirs = {name: (tuple(shape), dtype) for name, shape, dtype in found}
   for name, shape, dtype in expected:
     if name not in theirs:

@@ -1,20 +1,22 @@
 """Convolutional networks for observations that are pictures."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen
+from jax.typing import DTypeLike
 
 from playground.envs.base import PIXELS
 from playground.errors import ConfigError, nearest
 from playground.learning.hyperparameters import CNNConfig
 
+Activation = Callable[[jax.Array], jax.Array]
+
 ESTIMATOR = "estimator"  # a layer beside those that act
 NORM_EPSILON = 1e-6 * 255**2  # added to the variance of a picture's channel
 
-_POOLS: dict[str, Callable[[jax.Array], jax.Array]] = {
+_POOLS: dict[str, Activation] = {
   "none": lambda x: x.reshape(*x.shape[:-3], -1),
   "avg": lambda x: x.mean(axis=(-3, -2)),
   "max": lambda x: x.max(axis=(-3, -2)),
@@ -22,7 +24,7 @@ _POOLS: dict[str, Callable[[jax.Array], jax.Array]] = {
 }
 
 
-def check_cnn(config: CNNConfig, activations: Mapping[str, Any]) -> None:
+def check_cnn(config: CNNConfig, activations: Mapping[str, Activation]) -> None:
   """Raises ConfigError for layers that do not go together, and for names that do not exist."""
   lengths = {len(config.channels), len(config.kernels), len(config.strides)}
   if len(lengths) != 1 or not lengths.isdisjoint({0}):
@@ -38,8 +40,8 @@ class CNN(linen.Module):
   """Features, [..., F], of pictures [..., height, width, channels] uint8."""
 
   config: CNNConfig
-  activation: Callable[[jax.Array], jax.Array]
-  dtype: Any = jnp.float32
+  activation: Activation
+  dtype: DTypeLike = jnp.float32
 
   @linen.compact
   def __call__(self, pixels: jax.Array) -> jax.Array:
@@ -75,12 +77,12 @@ class PixelNetwork(linen.Module):
   """
 
   cnn: CNNConfig
-  cnn_activation: Callable[[jax.Array], jax.Array]
+  cnn_activation: Activation
   hidden_layer_sizes: Sequence[int]
-  activation: Callable[[jax.Array], jax.Array]
+  activation: Activation
   output_size: int
   output_init: Callable[..., jax.Array] = jax.nn.initializers.lecun_uniform()
-  dtype: Any = jnp.float32
+  dtype: DTypeLike = jnp.float32
   estimate_size: int = 0
 
   @linen.compact

@@ -2,21 +2,22 @@
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
+from jax.stages import Wrapped
 
 from playground.envs.base import Env, Observation, State, newest_picture
 from playground.envs.wrappers import ModelFields, wrap_for_evaluation
 from playground.hardware.mesh import AXIS, jit_on_mesh
+from playground.learning.algorithm import Policy
+from playground.pytree import PyTree
 
-Act = Callable[[Any, Any, jax.Array], jax.Array]  # (policy, obs [N, ...], key) -> actions [N, action_size]
-
-
-Evaluate = Callable[..., tuple[dict[str, jax.Array], dict[str, jax.Array]]]
+Act = Callable[[Policy, Observation, jax.Array], jax.Array]  # (policy, obs [N, ...], key) -> actions [N, action_size]
+Recording = dict[str, jax.Array]
+Evaluate = Callable[..., tuple[dict[str, jax.Array], Recording]]
 
 
 def make_evaluator(
@@ -26,7 +27,7 @@ def make_evaluator(
   mesh: Mesh,
   num_recorded: int = 0,
   others: Mapping[str, Act] = MappingProxyType({}),
-) -> Evaluate:
+) -> Wrapped:
   """Builds a jitted evaluation of a policy over `num_envs` episodes, spread over the mesh.
 
   Args:
@@ -52,12 +53,12 @@ def make_evaluator(
   acts = (act, *others.values())
   repeat = lambda tree: jax.tree.map(lambda x: jnp.concatenate([x] * len(acts)) if others else x, tree)
 
-  def act_all(policy: Any, obs: Observation, key: jax.Array) -> jax.Array:
+  def act_all(policy: Policy, obs: Observation, key: jax.Array) -> jax.Array:
     """Each way to act on its own environments, which lie one after the other."""
     share = lambda i: jax.tree.map(lambda x: x[i * per_device : (i + 1) * per_device], obs)
     return jnp.concatenate([each(policy, share(i), key) for i, each in enumerate(acts)])
 
-  def evaluate(policy: Any, key: jax.Array, model: ModelFields) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+  def evaluate(policy: Policy, key: jax.Array, model: ModelFields) -> tuple[dict[str, jax.Array], Recording]:
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
     reset_key, act_key = jax.random.split(key)
     model = repeat(model)
@@ -77,12 +78,12 @@ def make_evaluator(
     active = jnp.ones_like(state.done)
     recording = jax.tree.map(lambda x: jnp.zeros((decisions, *x.shape), x.dtype), view(state, active))
 
-    def running(carry: tuple[Any, ...]) -> jax.Array:
+    def running(carry: tuple[PyTree, ...]) -> jax.Array:
       step, _, active, _, _ = carry
       # Devices must leave the loop together: a policy may communicate between them.
       return (step < decisions) & (jax.lax.pmax(active.max(), AXIS) > 0)
 
-    def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+    def step(carry: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
       step, state, active, totals, recording = carry
       recording = jax.tree.map(lambda tape, x: tape.at[step].set(x), recording, view(state, active))
       state = wrapped.step(state, act_all(policy, state.obs, jax.random.fold_in(act_key, step)), model)

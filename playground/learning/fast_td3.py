@@ -10,7 +10,6 @@ rather than at each one's end, so that it follows from the step alone; returns a
 """
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +27,7 @@ from playground.learning.hyperparameters import FastTD3Config
 from playground.learning.networks import Actor, normalize
 from playground.learning.replay import ReplayBuffer
 from playground.learning.rollout import Environments
+from playground.pytree import PyTree
 
 PARTS = ("critic_loss", "policy_loss", "q_mean", "targets_at_edge", "critic_grad_norm", "grad_norm")  # what is logged
 
@@ -35,14 +35,14 @@ PARTS = ("critic_loss", "policy_loss", "q_mean", "targets_at_edge", "critic_grad
 class FastTD3Params(struct.PyTreeNode):
   """What is learned: parameters of the actor, and of the twin critics, each array [2, ...]."""
 
-  policy: Any
-  q: Any
+  policy: PyTree
+  q: PyTree
 
 
 class FastTD3State(AlgorithmState):
   """Also the parameters of the target critics, each array [2, ...]."""
 
-  target_q: Any = None
+  target_q: PyTree = None
 
 
 class Transition(struct.PyTreeNode):
@@ -120,11 +120,11 @@ class FastTD3Networks(Actor):
       policy, jax.vmap(lambda key: self._critic.init(key, jnp.zeros((1, length))))(jax.random.split(q))
     )
 
-  def mode(self, policy: Any, obs: dict[str, jax.Array]) -> jax.Array:
+  def mode(self, policy: PyTree, obs: dict[str, jax.Array]) -> jax.Array:
     """Actions in [-1, 1], [..., action_size], for normalised observations."""
     return self.distribution.mode(self.logits(policy, obs))
 
-  def q(self, q_params: Any, obs: dict[str, jax.Array], action: jax.Array) -> jax.Array:
+  def q(self, q_params: PyTree, obs: dict[str, jax.Array], action: jax.Array) -> jax.Array:
     """Logits of both critics' atoms, [2, ..., K], for normalised observations."""
     inputs = jnp.concatenate([obs[self.value_obs_key], action], axis=-1)
     with self.at_precision():
@@ -186,7 +186,7 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
     seen = normalizer if config.normalize_observations else None
     start = (state.params, state.target_q, state.opt_state)
 
-    def learn(start: Any) -> tuple[Any, jax.Array]:
+    def learn(start: PyTree) -> tuple[PyTree, jax.Array]:
       shape = (config.grad_updates_per_step, config.batch_size // jax.lax.axis_size(AXIS))
       batches = self.buffer.sample(replay, replay_key, shape)
       batches = batches.replace(obs=normalize(batches.obs, seen), next_obs=normalize(batches.next_obs, seen))
@@ -209,15 +209,15 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
     return jax.random.uniform(key, (count,), minval=self.config.min_noise, maxval=self.config.max_noise)
 
   def _learn(
-    self, start: tuple[Any, Any, Any], batches: Transition, step: jax.Array, key: jax.Array
-  ) -> tuple[Any, jax.Array]:
+    self, start: tuple[PyTree, PyTree, PyTree], batches: Transition, step: jax.Array, key: jax.Array
+  ) -> tuple[PyTree, jax.Array]:
     """Gradient steps, one for each batch: of the critics, at times of the actor, then of the target critics."""
     config, networks = self.config, self.networks
     params, target_q, opt_state = start
     (actor, unravel_actor), (critic, unravel_critic) = ravel_pytree(params.policy), ravel_pytree(params.q)
     count = config.grad_updates_per_step
 
-    def update(carry: Any, x: tuple[Transition, jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+    def update(carry: PyTree, x: tuple[Transition, jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
       actor, critic, target, (actor_opt, critic_opt) = carry
       batch, key, i = x
       policy = unravel_actor(actor)
@@ -226,7 +226,7 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
       )
       critic, critic_opt, critic_norm, good = gradient_step(self.optimizer, grads, critic, critic_opt)
 
-      def move(actor: jax.Array, actor_opt: Any) -> Any:
+      def move(actor: jax.Array, actor_opt: PyTree) -> PyTree:
         loss_and_grad = jax.value_and_grad(policy_loss)
         loss, grads = loss_and_grad(unravel_actor(actor), unravel_critic(critic), batch, networks, config)
         return *gradient_step(self.optimizer, grads, actor, actor_opt), loss
@@ -247,9 +247,9 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
 
 
 def critic_loss(
-  params: Any,
-  target_params: Any,
-  policy: Any,
+  params: PyTree,
+  target_params: PyTree,
+  policy: PyTree,
   batch: Transition,
   key: jax.Array,
   networks: FastTD3Networks,
@@ -286,7 +286,7 @@ def critic_loss(
 
 
 def policy_loss(
-  policy: Any, q_params: Any, batch: Transition, networks: FastTD3Networks, config: FastTD3Config
+  policy: PyTree, q_params: PyTree, batch: Transition, networks: FastTD3Networks, config: FastTD3Config
 ) -> jax.Array:
   """Minus the mean value of the actor's actions, by the smaller critic or by both."""
   logits = networks.q(q_params, batch.obs, networks.mode(policy, batch.obs))

@@ -11,12 +11,14 @@ import functools
 import importlib.metadata
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, Self, get_type_hints
+from typing import Annotated, ClassVar, Literal
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.limits import SHARE, SIZES, Limit, at_least_0, count, positive
+from playground.settings import build
 
 ENTRY_POINTS = "playground.agents"
+ELSEWHERE = {"rsl_rl_ppo": " RSL-RL trains through its own runner: docs/rsl-rl.md."}  # agents of earlier versions
 _MOST = 2**31 - 1  # transitions on a device: they are drawn by int32
 
 
@@ -44,15 +46,6 @@ class AgentConfig:
     bool, "whether eval/episode_reward is of the mode of the policy, and eval/sampled/... of samples; else the reverse"
   ] = False
 
-  @classmethod
-  def from_config(cls, config: Any) -> Self:
-    """Builds it from the `agent` config (a mapping), whose `name` is not one of the fields.
-
-    Raises:
-      UnknownNameError: a key that the algorithm does not have, such as one of a run that another version has saved.
-    """
-    return _build(cls, {key: value for key, value in dict(config).items() if key != "name"}, "agent")
-
   @property
   def steps_per_update(self) -> int:
     """Policy steps of one training step, over all environments and devices."""
@@ -74,6 +67,31 @@ class AgentConfig:
       size = getattr(self, name, 0)
       if size % num_devices:
         raise ConfigError(f"agent.{name}={size} must be a multiple of the number of devices, {num_devices}.")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OffPolicyConfig(AgentConfig):
+  """Hyperparameters of algorithms that learn from a replay buffer."""
+
+  min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 8192
+  max_replay_size: Annotated[
+    int, count(1, 2**40), "transitions kept over all devices, the newest; a run prints their memory"
+  ] = 1_048_576
+  checkpoint_replay: Annotated[
+    bool, "whether the newest checkpoint holds the buffer, for an exact resume; else it is refilled"
+  ] = True
+
+  @property
+  def prefill_updates(self) -> int:
+    return math.ceil(self.min_replay_size / self.num_envs)
+
+  def check(self, num_devices: int) -> None:
+    super().check(num_devices)
+    for name, least in (("num_envs", self.num_envs), ("min_replay_size", self.min_replay_size)):
+      if least > self.max_replay_size:
+        raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must not be below agent.{name}={least}.")
+    if self.max_replay_size // num_devices > _MOST:
+      raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must be at most {_MOST} for each device.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,15 +226,16 @@ class PPOConfig(AgentConfig):
 
   def check(self, num_devices: int) -> None:
     if (self.batch_size * self.num_minibatches) % self.num_envs:
+      product = f"agent.batch_size * agent.num_minibatches = {self.batch_size} * {self.num_minibatches}"
       raise ConfigError(
-        f"agent.batch_size * agent.num_minibatches = {self.batch_size * self.num_minibatches} must be a multiple of "
-        f"agent.num_envs={self.num_envs}, so that every environment gives the same number of trajectories."
+        f"agent.num_envs={self.num_envs} does not divide {product} = {self.batch_size * self.num_minibatches}: choose "
+        "sizes so that every environment gives the same number of trajectories."
       )
     super().check(num_devices)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SACConfig(AgentConfig):
+class SACConfig(OffPolicyConfig):
   """Hyperparameters of SAC."""
 
   algorithm = "playground.learning.sac:SAC"
@@ -227,10 +246,6 @@ class SACConfig(AgentConfig):
   num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 128
   batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 512
   grad_updates_per_step: Annotated[int, count(1, 100_000), "gradient steps for each step of all environments"] = 8
-  min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 8192
-  max_replay_size: Annotated[
-    int, count(1, 2**40), "transitions kept over all devices, the newest; a run prints their memory"
-  ] = 1_048_576
   learning_rate: Annotated[float, positive(1), "of Adam, for actor and critics"] = 1e-3
   alpha_learning_rate: Annotated[
     float, positive(1), "of Adam, for the temperature, which holds the entropy at half a nat per action below zero"
@@ -238,18 +253,7 @@ class SACConfig(AgentConfig):
   discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
   tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each gradient step"] = 0.005
   reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
-  checkpoint_replay: Annotated[
-    bool, "whether the newest checkpoint holds the buffer, for an exact resume; else it is refilled"
-  ] = True
   network: Annotated[SoftNetworkConfig, "actor and critics"] = dataclasses.field(default_factory=SoftNetworkConfig)
-
-  @property
-  def prefill_updates(self) -> int:
-    return math.ceil(self.min_replay_size / self.num_envs)
-
-  def check(self, num_devices: int) -> None:
-    super().check(num_devices)
-    _check_replay(self.max_replay_size, self.num_envs, self.min_replay_size, num_devices)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -332,7 +336,7 @@ class FastTD3NetworkConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FastTD3Config(AgentConfig):
+class FastTD3Config(OffPolicyConfig):
   """Hyperparameters of FastTD3; the defaults are those of public runs on DM Control."""
 
   algorithm = "playground.learning.fast_td3:FastTD3"
@@ -343,9 +347,6 @@ class FastTD3Config(AgentConfig):
   grad_updates_per_step: Annotated[int, count(1, 100_000), "critic updates for each step of all environments"] = 2
   policy_frequency: Annotated[int, count(1, 100_000), "the actor is updated with every n-th critic update"] = 2
   min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 10_240
-  max_replay_size: Annotated[
-    int, count(1, 2**40), "transitions kept over all devices, the newest; a run prints their memory"
-  ] = 1_048_576
   learning_rate: Annotated[float, positive(1), "of AdamW, for actor and critics"] = 3e-4
   weight_decay: Annotated[float, at_least_0(), "of AdamW"] = 0.1
   discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
@@ -363,20 +364,12 @@ class FastTD3Config(AgentConfig):
   use_smaller_q: Annotated[
     bool, "whether targets are of the critic with the smaller value (clipped double Q-learning); else each its own"
   ] = True
-  checkpoint_replay: Annotated[
-    bool, "whether the newest checkpoint holds the buffer, for an exact resume; else it is refilled"
-  ] = True
   network: Annotated[FastTD3NetworkConfig, "actor and critics"] = dataclasses.field(
     default_factory=FastTD3NetworkConfig
   )
 
-  @property
-  def prefill_updates(self) -> int:
-    return math.ceil(self.min_replay_size / self.num_envs)
-
   def check(self, num_devices: int) -> None:
     super().check(num_devices)
-    _check_replay(self.max_replay_size, self.num_envs, self.min_replay_size, num_devices)
     _check_values(self.min_value, self.max_value)
     if self.max_noise < self.min_noise:
       raise ConfigError(f"agent.max_noise={self.max_noise} must not be below agent.min_noise={self.min_noise}.")
@@ -385,14 +378,6 @@ class FastTD3Config(AgentConfig):
 def _check_values(low: float, high: float) -> None:
   if not low <= 0 <= high or low == high:
     raise ConfigError(f"agent.min_value={low} and agent.max_value={high} must hold 0 between them.")
-
-
-def _check_replay(size: int, num_envs: int, min_replay_size: int, num_devices: int) -> None:
-  for name, least in (("num_envs", num_envs), ("min_replay_size", min_replay_size)):
-    if least > size:
-      raise ConfigError(f"agent.max_replay_size={size} must not be below agent.{name}={least}.")
-  if size // num_devices > _MOST:
-    raise ConfigError(f"agent.max_replay_size={size} must be at most {_MOST} for each device.")
 
 
 def config_class(name: str) -> type[AgentConfig]:
@@ -407,8 +392,7 @@ def config_class(name: str) -> type[AgentConfig]:
   points = _entry_points()
   if name not in points:
     known = ", ".join(agent_names())
-    near = " RSL-RL trains through its own runner: docs/rsl-rl.md." if name == "rsl_rl_ppo" else ""
-    near = near or nearest(name, agent_names())
+    near = ELSEWHERE.get(name) or nearest(name, agent_names())
     raise UnknownNameError(f"agent.name={name} does not exist: choose from {known}.{near}")
   try:
     found = points[name].load()
@@ -420,9 +404,14 @@ def config_class(name: str) -> type[AgentConfig]:
   return found
 
 
-def read_config(agent: Any) -> AgentConfig:
-  """Builds the dataclass that an `agent` section (a mapping with `name`) is of; raises as `config_class`."""
-  return config_class(agent["name"]).from_config(agent)
+def read_config(agent: Mapping[str, object]) -> AgentConfig:
+  """Builds the dataclass that an `agent` section (a mapping with `name`) is of.
+
+  Raises:
+    UnknownNameError: no such algorithm, or a key that it does not have, such as one that another version has saved.
+    ConfigError: the entry point of another package does not work.
+  """
+  return build(config_class(str(agent["name"])), {k: value for k, value in agent.items() if k != "name"}, "agent")
 
 
 def agent_names() -> list[str]:
@@ -441,14 +430,3 @@ _BUILT_IN: dict[str, type[AgentConfig]] = {
 @functools.cache
 def _entry_points() -> Mapping[str, importlib.metadata.EntryPoint]:
   return {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
-
-
-def _build(config_class: Any, values: dict[str, Any], key: str) -> Any:
-  """Builds a dataclass, and those that are its fields, from nested mappings."""
-  hints = get_type_hints(config_class)
-  known = [field.name for field in dataclasses.fields(config_class)]
-  if unknown := [name for name in values if name not in known]:
-    raise UnknownNameError(f"{key}.{unknown[0]} does not exist.{nearest(unknown[0], known)}")
-  nested = {name: hints[name] for name in values if dataclasses.is_dataclass(hints[name])}
-  built = {name: _build(kind, dict(values[name]), f"{key}.{name}") for name, kind in nested.items()}
-  return config_class(**values | built)

@@ -9,18 +9,20 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
+from jax.stages import Wrapped
 
 from playground.collector import uncollected
 from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import agree, several
 from playground.hardware.mesh import divide, put
 from playground.learning.algorithm import Policy
+from playground.learning.evaluation import Evaluate, Recording
 from playground.learning.rollout import Step
 from playground.learning.trainer import Trainer, TrainState
 
@@ -66,7 +68,7 @@ def longest_stretch(events: Sequence[ScheduleEvent]) -> int:
 class Callbacks(Protocol):
   """What a run does with what happens; called on a thread of its own while the device works on."""
 
-  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Recording | None) -> None:
     """A row of the log.
 
     Args:
@@ -77,7 +79,7 @@ class Callbacks(Protocol):
     """
     ...
 
-  def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
+  def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
     """A state to keep, on the device; its buffers stay valid. After the final one there is nothing left to train."""
     ...
 
@@ -100,11 +102,11 @@ class CompiledFunctions:
     notice: a sentence on what went wrong with it, or None.
   """
 
-  train: Any
-  init: Any
-  reset: Any
-  evaluate: Any
-  copy: Any
+  train: Callable[..., tuple[TrainState, dict[str, jax.Array]]]
+  init: Callable[..., TrainState]
+  reset: Callable[..., TrainState]
+  evaluate: Evaluate
+  copy: Callable[[TrainState], TrainState]
   model: ModelFields
   eval_model: ModelFields
   trace_s: float
@@ -112,7 +114,7 @@ class CompiledFunctions:
   notice: str | None
 
 
-def compile_program(trainer: Trainer, evaluate: Any, draw: Draw, policy: Policy | None = None) -> CompiledFunctions:
+def compile_program(trainer: Trainer, evaluate: Wrapped, draw: Draw, policy: Policy | None = None) -> CompiledFunctions:
   """Traces each function once and compiles them side by side, Warp's kernels too, ahead of the first step.
 
   Args:
@@ -156,12 +158,12 @@ class SegmentResult:
 
   event: ScheduleEvent
   steps: int
-  trained: Any = None
+  trained: dict[str, jax.Array] | None = None
   train_s: float = 0.0
-  evaluated: Any = None
+  evaluated: tuple[dict[str, jax.Array], Recording] | None = None
   eval_s: float = 0.0
   captured: Step | None = None
-  snapshot: Any = None
+  snapshot: TrainState | None = None
 
 
 class Loop:
@@ -201,7 +203,7 @@ class Loop:
     placed = None if policy is None else self._trainer.place_policy(policy)
     return self._functions.init(self._place(self._init_key), self._functions.model, placed)
 
-  def run(self, state: Any, update: int | None = None) -> tuple[Any, bool]:
+  def run(self, state: TrainState, update: int | None = None) -> tuple[TrainState, bool]:
     """Runs to the end of the schedule, or until the callbacks say stop.
 
     Args:
@@ -230,7 +232,7 @@ class Loop:
         reported.result()
     return state, at == self._events[-1].update
 
-  def _work(self, state: Any, event: ScheduleEvent, num_updates: int) -> tuple[Any, SegmentResult]:
+  def _work(self, state: TrainState, event: ScheduleEvent, num_updates: int) -> tuple[TrainState, SegmentResult]:
     """Trains up to an event and does what it asks for; waits for the numbers, not for resets and copies."""
     done = SegmentResult(event, num_updates * self._trainer.steps_per_update)
     if num_updates:

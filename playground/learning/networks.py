@@ -3,14 +3,15 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics, specs
 from brax.training.distribution import NormalTanhDistribution
 from flax import linen, struct
+from jax.typing import DTypeLike
 
 from playground.envs.base import PIXELS, Observation
 from playground.errors import ConfigError, nearest
@@ -22,6 +23,7 @@ from playground.learning.hyperparameters import (
   REPPONetworkConfig,
   SoftNetworkConfig,
 )
+from playground.pytree import PyTree
 
 ACTIVATIONS = {"swish": linen.swish, "relu": linen.relu, "elu": linen.elu, "tanh": linen.tanh, "gelu": linen.gelu}
 
@@ -129,14 +131,16 @@ class Actor:
     """The entries of a selected observation that are no pictures: those that are normalised."""
     return {key: obs[key] for key in self.obs_keys}
 
-  def logits(self, policy_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
+  def logits(self, policy_params: PyTree, obs: Mapping[str, jax.Array]) -> jax.Array:
     """Parameters of the action distribution, [..., 2 * action_size], for normalised observations."""
     with self.at_precision():
       if self.pixel_sizes:
         return self._actor.apply(policy_params, *self._seen(obs, self.policy_obs_key))  # pyright: ignore[reportReturnType]
       return self.policy_network.apply(None, policy_params, self._vector(obs, self.policy_obs_key))
 
-  def logits_and_estimate(self, policy_params: Any, obs: Mapping[str, jax.Array]) -> tuple[jax.Array, jax.Array | None]:
+  def logits_and_estimate(
+    self, policy_params: PyTree, obs: Mapping[str, jax.Array]
+  ) -> tuple[jax.Array, jax.Array | None]:
     """`logits`, and what the actor takes `estimated_obs_key` to be, normalised, [..., D]; None where that is empty."""
     if not self.estimated_obs_key:
       return self.logits(policy_params, obs), None
@@ -146,7 +150,7 @@ class Actor:
       return logits, more["intermediates"]["estimate"][0]  # pyright: ignore[reportReturnType]
 
   def act(
-    self, policy: Any, normalizer: Normalizer | None, obs: Observation, key: jax.Array, deterministic: bool = False
+    self, policy: PyTree, normalizer: Normalizer | None, obs: Observation, key: jax.Array, deterministic: bool = False
   ) -> jax.Array:
     """Actions in [-1, 1], [..., action_size], sampled or (deterministic) the mode."""
     logits = self.logits(policy, normalize(self.select(obs), normalizer))
@@ -158,11 +162,14 @@ class Actor:
     ratio, distance = before.scale / after.scale, (before.loc - after.loc) / after.scale
     return (0.5 * (jnp.square(ratio) + jnp.square(distance) - 1) - jnp.log(ratio)).sum(axis=-1)
 
-  def mlp(self, policy: Any, normalizer: Any) -> tuple[Mapping[str, Any], tuple[Any, Any] | None]:
-    """The layers that act as Flax has them, with mean and deviation of the vector (None without one, or as it is)."""
+  def mlp(
+    self, policy: PyTree, normalizer: Normalizer | None
+  ) -> tuple[Mapping[str, PyTree], tuple[np.ndarray, np.ndarray] | None]:
+    """Layers as Flax has them, mean and deviation of the vector (None without one, or as it is), all on the host."""
     key = self.policy_obs_key
+    statistics: PyTree = normalizer
     layers = {name: layer for name, layer in policy["params"].items() if name != ESTIMATOR}
-    return layers, (normalizer.mean[key], normalizer.std[key]) if key and normalizer is not None else None
+    return layers, (statistics.mean[key], statistics.std[key]) if key and normalizer is not None else None
 
   @property
   def policy_inputs(self) -> dict[str, tuple[int, ...]]:
@@ -170,7 +177,7 @@ class Actor:
     key = self.policy_obs_key
     return self.pixel_sizes | ({key: self.obs_sizes[key]} if key else {})
 
-  def _on_pixels(self, cnn: CNNConfig, sizes: Sequence[int], output_size: int, **how: Any) -> PixelNetwork:
+  def _on_pixels(self, cnn: CNNConfig, sizes: Sequence[int], output_size: int, **how: PyTree) -> PixelNetwork:
     check_cnn(cnn, ACTIVATIONS)
     return PixelNetwork(cnn, ACTIVATIONS[cnn.activation], tuple(sizes), self.activation, output_size, **how)
 
@@ -187,7 +194,7 @@ class Actor:
     pictures = {key: jnp.zeros((1, *size), jnp.uint8) for key, size in self.pixel_sizes.items()}
     return pictures | {key: jnp.zeros((1, *size)) for key, size in self.obs_sizes.items()}
 
-  def at_precision(self) -> AbstractContextManager[Any]:
+  def at_precision(self) -> AbstractContextManager[None]:
     """A context in which matrix products have the networks' precision."""
     return jax.default_matmul_precision(self.precision or jax.config.jax_default_matmul_precision)
 
@@ -195,8 +202,8 @@ class Actor:
 class ActorCriticParams(struct.PyTreeNode):
   """Parameters of the two networks."""
 
-  policy: Any
-  value: Any
+  policy: PyTree
+  value: PyTree
 
 
 class Critic(linen.Module):
@@ -209,7 +216,7 @@ class Critic(linen.Module):
 
   hidden_layer_sizes: Sequence[int]
   activation: Callable[[jax.Array], jax.Array]
-  dtype: Any
+  dtype: DTypeLike
 
   @linen.compact
   def __call__(self, obs: jax.Array) -> jax.Array:
@@ -245,7 +252,7 @@ class ActorCritic(Actor):
     obs = jnp.zeros((1, *self.obs_sizes[self.value_obs_key]))
     return ActorCriticParams(self.policy_network.init(policy), self._critic.init(value, obs))
 
-  def value(self, value_params: Any, obs: Mapping[str, jax.Array]) -> jax.Array:
+  def value(self, value_params: PyTree, obs: Mapping[str, jax.Array]) -> jax.Array:
     """State values, [...], for normalised observations."""
     with self.at_precision():
       if self.pixel_sizes:
@@ -262,8 +269,8 @@ class SoftActorCriticParams(struct.PyTreeNode):
     log_alpha: logarithm of the temperature, [].
   """
 
-  q: Any
-  policy: Any
+  q: PyTree
+  policy: PyTree
   log_alpha: jax.Array
 
 
@@ -292,13 +299,13 @@ class SoftActorCritic(Actor):
     q = jax.vmap(lambda key: self._critic.init(key, jnp.zeros((1, length))))(jax.random.split(q))
     return SoftActorCriticParams(q, self.policy_network.init(policy), jnp.zeros(()))
 
-  def q(self, q_params: Any, obs: Mapping[str, jax.Array], action: jax.Array) -> jax.Array:
+  def q(self, q_params: PyTree, obs: Mapping[str, jax.Array], action: jax.Array) -> jax.Array:
     """Values of both critics, [2, ...], for normalised observations and actions [..., action_size]."""
     inputs = jnp.concatenate([obs[self.value_obs_key], action], axis=-1)
     with self.at_precision():
       return jax.vmap(self._critic.apply, (0, None))(q_params, inputs)[..., 0]  # pyright: ignore[reportIndexIssue, reportCallIssue, reportArgumentType]
 
-  def q_each(self, *evaluations: tuple[Any, Mapping[str, jax.Array], jax.Array]) -> tuple[jax.Array, ...]:
+  def q_each(self, *evaluations: tuple[PyTree, Mapping[str, jax.Array], jax.Array]) -> tuple[jax.Array, ...]:
     """`q` of several (parameters, observations, actions), all of the same shape."""
     if not self.batched:
       return tuple(self.q(*evaluation) for evaluation in evaluations)
@@ -315,6 +322,6 @@ def normalize(obs: Mapping[str, jax.Array], normalizer: Normalizer | None) -> di
   """Subtracts the running mean and divides by the running deviation; pictures stay, and with None all of it does."""
   if normalizer is None:
     return dict(obs)
-  mean: Any = normalizer.mean
-  std: Any = normalizer.std
+  mean: PyTree = normalizer.mean
+  std: PyTree = normalizer.std
   return {k: (v - mean[k]) / std[k] if k in mean else v for k, v in obs.items()}

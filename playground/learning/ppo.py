@@ -5,7 +5,7 @@ training step collects `batch_size * num_minibatches` trajectories of `unroll_le
 `num_updates_per_batch` times.
 """
 
-from typing import Any
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from playground.learning.hyperparameters import PPOConfig
 from playground.learning.networks import ActorCritic, ActorCriticParams, Normalizer, normalize
 from playground.learning.rollout import Environments, side_by_side, unroll
 from playground.mdp.symmetry import Mirror, mirror_of
+from playground.pytree import PyTree
 
 LOSSES = ("total_loss", "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")  # what is logged
 ESTIMATION = "estimation_loss"  # with them where something is estimated
@@ -103,9 +104,9 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
 
     # Collect: every environment gives the same number of trajectories.
     normalizer: Normalizer | None = state.normalizer if config.normalize_observations else None
-    critic = state.params.value if config.bootstrap_on_timeout else None
+    critic = functools.partial(networks.value, state.params.value) if config.bootstrap_on_timeout else None
 
-    def trajectories(envs: Environments, key: jax.Array) -> tuple[Environments, Any]:
+    def trajectories(envs: Environments, key: jax.Array) -> tuple[Environments, PyTree]:
       envs, data = unroll(envs, networks, state.params.policy, normalizer, key, config.unroll_length, critic)
       return envs, (data, envs.state.obs)
 
@@ -139,13 +140,13 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     # Learn: several epochs, each over its own shuffle of the trajectories.
     flat, unravel = ravel_pytree(state.params)
 
-    def epoch(carry: tuple[jax.Array, Any, jax.Array], key: jax.Array) -> tuple[Any, jax.Array]:
+    def epoch(carry: tuple[jax.Array, PyTree, jax.Array], key: jax.Array) -> tuple[PyTree, jax.Array]:
       *start, stopped = carry
       shuffle_key, loss_key = jax.random.split(key)
       columns = jax.random.permutation(shuffle_key, batch.reward.shape[1]).reshape(config.num_minibatches, -1)
       data = self._with_targets(batch, unravel(carry[0])) if config.targets == "epoch" else batch
 
-      def update(carry: tuple[jax.Array, Any], x: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+      def update(carry: tuple[jax.Array, PyTree], x: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
         flat, opt_state = carry
         minibatch, key = self._minibatch(data, *x)
         grads, parts = jax.grad(ppo_loss, has_aux=True)(unravel(flat), minibatch, key, networks, config, scale)
@@ -195,7 +196,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
       advantages = (advantages - mean) / (std + 1e-8)
     return batch.replace(targets=targets, advantages=advantages)
 
-  def _adapt(self, opt_state: Any, kl: jax.Array) -> Any:
+  def _adapt(self, opt_state: PyTree, kl: jax.Array) -> PyTree:
     """The optimiser's state with the learning rate that follows from a minibatch's divergence."""
     clip, adam = opt_state
     rate = adapted_rate(adam.hyperparams["learning_rate"], kl, self.config)

@@ -1,7 +1,6 @@
 """Replay: a ring of transitions on the device, of fixed size, drawn from uniformly."""
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec as P
 
 from playground.hardware.mesh import AXIS
+from playground.pytree import PyTree
 
 
 class Replay(struct.PyTreeNode):
@@ -20,18 +20,18 @@ class Replay(struct.PyTreeNode):
     inserted: steps put in so far, []; beyond `slots` they replace the oldest.
   """
 
-  data: Any
+  data: jax.Array
   inserted: jax.Array
 
 
 # Each device keeps the transitions of its own environments.
-REPLAY_SPEC: Any = Replay(data=P(None, AXIS), inserted=P())  # pyright: ignore[reportArgumentType]
+REPLAY_SPEC = Replay(data=P(None, AXIS), inserted=P())  # pyright: ignore[reportArgumentType]
 
 
 class ReplayBuffer:
   """Puts transitions in and draws them; pure functions on `Replay`, each device on its share of the environments."""
 
-  def __init__(self, max_size: int, num_envs: int, example: Any, saved: bool = True):
+  def __init__(self, max_size: int, num_envs: int, example: PyTree, saved: bool = True):
     """Sizes an empty buffer.
 
     Args:
@@ -60,13 +60,13 @@ class ReplayBuffer:
     """An empty buffer for a device's share of the environments."""
     return Replay(jnp.zeros((self.slots, num_envs, self.width)), jnp.zeros((), jnp.int32))
 
-  def insert(self, replay: Replay, transitions: Any) -> Replay:
+  def insert(self, replay: Replay, transitions: PyTree) -> Replay:
     """Puts in one step of all environments, a tree of [num_envs, ...], in the place of the oldest if it is full."""
     rows = self._ravel(transitions)
     data = jax.lax.dynamic_update_slice_in_dim(replay.data, rows[None], replay.inserted % self.slots, 0)
     return Replay(data, replay.inserted + 1)
 
-  def sample(self, replay: Replay, key: jax.Array, shape: tuple[int, ...]) -> Any:
+  def sample(self, replay: Replay, key: jax.Array, shape: tuple[int, ...]) -> PyTree:
     """Draws transitions, a tree of [*shape, ...], each of those held with the same probability."""
     rows = replay.data.reshape(-1, self.width)
     held = self.held(replay) * replay.data.shape[1]

@@ -10,8 +10,6 @@ one where time cuts it; the entropy bonus of a next state ends with the episode;
 Gaussians before squashing; the critic's prior is a constant.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import optax
@@ -27,6 +25,7 @@ from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Po
 from playground.learning.hyperparameters import REPPOConfig
 from playground.learning.networks import Actor, Normalizer, normalize
 from playground.learning.rollout import Environments
+from playground.pytree import PyTree
 
 CRITIC_LOSSES = ("critic_loss", "q_loss", "auxiliary_loss", "q_mean", "targets_outside")  # what is logged
 ACTOR_LOSSES = ("policy_loss", "entropy", "kl", "kl_above_bound", "alpha", "kl_multiplier")
@@ -45,8 +44,8 @@ class REPPOParams(struct.PyTreeNode):
     log_beta: logarithm of the multiplier of the divergence, [].
   """
 
-  policy: Any
-  q: Any
+  policy: PyTree
+  q: PyTree
   log_alpha: jax.Array
   log_beta: jax.Array
 
@@ -143,7 +142,7 @@ class REPPONetworks(Actor):
     action = jnp.zeros((1, self.action_size))
     return REPPOParams(self.policy_network.init(policy), self._critic.init(q, obs, action), alpha, beta)
 
-  def q(self, q_params: Any, obs: dict[str, jax.Array], action: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+  def q(self, q_params: PyTree, obs: dict[str, jax.Array], action: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """See `Critic`, for normalised observations."""
     with self.at_precision():
       return self._critic.apply(q_params, obs[self.value_obs_key], action)  # pyright: ignore[reportReturnType]
@@ -208,7 +207,7 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
     old_logits = networks.logits(state.params.policy, data.obs)
     (actor, unravel_actor), (critic, unravel_critic) = (ravel_pytree(part) for part in _split(state.params))
 
-    def update(carry: Any, x: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+    def update(carry: PyTree, x: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
       """One gradient step of the critic, then one of the actor on the new critic."""
       (actor, critic), (actor_opt, critic_opt) = carry
       rows, key = x
@@ -225,7 +224,7 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
       log = jnp.append(jnp.where(finite, log, 0.0), 1.0 - finite)
       return ((actor, critic), (actor_opt, critic_opt)), log
 
-    def epoch(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+    def epoch(carry: PyTree, key: jax.Array) -> tuple[PyTree, jax.Array]:
       shuffle_key, loss_key = jax.random.split(key)
       rows = jax.random.permutation(shuffle_key, data.reward.shape[0]).reshape(config.num_minibatches, -1)
       return jax.lax.scan(update, carry, (rows, jax.random.split(loss_key, config.num_minibatches)))
@@ -243,7 +242,7 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
     return state.replace(params=params, opt_state=opt_state, normalizer=statistics), envs, metrics
 
 
-def _split(params: REPPOParams) -> tuple[tuple[Any, jax.Array, jax.Array], Any]:
+def _split(params: REPPOParams) -> tuple[tuple[PyTree, jax.Array, jax.Array], PyTree]:
   """What the actor's optimiser changes, and what the critic's does."""
   return (params.policy, params.log_alpha, params.log_beta), params.q
 
@@ -273,7 +272,7 @@ def lambda_returns(
 
 
 def critic_loss(
-  params: Any, batch: Transition, networks: REPPONetworks, config: REPPOConfig
+  params: PyTree, batch: Transition, networks: REPPONetworks, config: REPPOConfig
 ) -> tuple[jax.Array, jax.Array]:
   """Cross-entropy to the targets' histograms, and the squared error in predicting the next reward and embedding.
 
@@ -300,8 +299,8 @@ def critic_loss(
 
 
 def actor_loss(
-  params: tuple[Any, jax.Array, jax.Array],
-  q_params: Any,
+  params: tuple[PyTree, jax.Array, jax.Array],
+  q_params: PyTree,
   batch: Transition,
   old_logits: jax.Array,
   key: jax.Array,

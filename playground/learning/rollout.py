@@ -1,7 +1,7 @@
 """Collecting experience: an actor steps a batch of environments for a fixed number of control steps."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,8 @@ from flax import struct
 
 from playground.envs.base import Observation, State
 from playground.envs.wrappers import FINAL_OBS, AutoReset, ModelFields
-from playground.learning.networks import ActorCritic, Normalizer, normalize
+from playground.learning.networks import Actor, Normalizer, normalize
+from playground.pytree import PyTree
 
 
 class Transitions(struct.PyTreeNode):
@@ -100,13 +101,13 @@ def _example(state: State, action_size: int, model: ModelFields) -> Step:
   return first(Step(state, jnp.zeros((1, action_size)), dict(model), state.info["nonfinite_state"]))
 
 
-def _to_bits(tree: Any) -> jax.Array:
+def _to_bits(tree: PyTree) -> jax.Array:
   """The leaves, each [N, ...], side by side: [N, words] uint32."""
   words = lambda x: jax.lax.bitcast_convert_type(x, jnp.uint32) if x.dtype.itemsize == 4 else x.astype(jnp.uint32)
   return jnp.concatenate([words(x).reshape(len(x), -1) for x in jax.tree.leaves(tree)], axis=1)
 
 
-def _from_bits(row: np.ndarray, example: Any) -> Any:
+def _from_bits(row: np.ndarray, example: PyTree) -> PyTree:
   """One row of them, [words], as a structure with these shapes and dtypes."""
   leaves, structure = jax.tree.flatten(example)
   parts = np.split(row, np.cumsum([leaf.size for leaf in leaves])[:-1])
@@ -115,6 +116,7 @@ def _from_bits(row: np.ndarray, example: Any) -> Any:
   return jax.tree.unflatten(structure, values)
 
 
+T = TypeVar("T")
 EpisodeSums = dict[str, jax.Array]
 
 
@@ -161,11 +163,13 @@ class Environments(struct.PyTreeNode):
     return self._after(after, capture, episode_sums(after)), final_obs
 
   def scan(
-    self, step: Callable[["Environments", jax.Array], tuple["Environments", Any]], keys: jax.Array
-  ) -> tuple["Environments", Any]:
+    self, step: Callable[["Environments", jax.Array], tuple["Environments", T]], keys: jax.Array
+  ) -> tuple["Environments", T]:
     """Does `step(envs, key)` for one key after the other; returns the environments and what it returned, stacked."""
 
-    def body(carry: tuple[State, NonfiniteCapture], key: jax.Array) -> tuple[Any, Any]:
+    def body(
+      carry: tuple[State, NonfiniteCapture], key: jax.Array
+    ) -> tuple[tuple[State, NonfiniteCapture], tuple[T, EpisodeSums]]:
       envs, out = step(self.replace(state=carry[0], capture=carry[1], sums={}), key)
       return (envs.state, envs.capture), (out, envs.sums)
 
@@ -179,17 +183,17 @@ class Environments(struct.PyTreeNode):
 
 def unroll(
   envs: Environments,
-  networks: ActorCritic,
-  policy_params: Any,
+  networks: Actor,
+  policy_params: PyTree,
   normalizer: Normalizer | None,
   key: jax.Array,
   length: int,
-  value_params: Any = None,
+  value: Callable[[dict[str, jax.Array]], jax.Array] | None = None,
 ) -> tuple[Environments, Transitions]:
   """Steps the environments `length` times with sampled actions.
 
-  With the critic's parameters it values the last observation of every episode that time cuts, in the steps in which it
-  cuts any.
+  With the critic's `value` of normalised observations it values the last observation of every episode that time cuts,
+  in the steps in which it cuts any.
   """
 
   def step(envs: Environments, key: jax.Array) -> tuple[Environments, Transitions]:
@@ -199,9 +203,9 @@ def unroll(
     envs, final_obs = envs.step(networks.distribution.postprocess(raw_action))
     after, truncation = envs.state, envs.state.info["truncation"]
     final_value = None
-    if value_params is not None:
-      value = lambda obs: networks.value(value_params, normalize(networks.select(obs), normalizer)) * truncation
-      final_value = jax.lax.cond(truncation.any(), value, lambda _: jnp.zeros_like(truncation), final_obs)
+    if value is not None:
+      final = lambda obs: value(normalize(networks.select(obs), normalizer)) * truncation
+      final_value = jax.lax.cond(truncation.any(), final, lambda _: jnp.zeros_like(truncation), final_obs)
     transitions = Transitions(
       obs=obs,
       raw_action=raw_action,

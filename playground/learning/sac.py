@@ -5,7 +5,7 @@ draws. One training step takes one step of every environment and then `grad_upda
 transitions drawn from the replay buffer.
 """
 
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from playground.learning.hyperparameters import SACConfig
 from playground.learning.networks import SoftActorCritic, SoftActorCriticParams, normalize
 from playground.learning.replay import ReplayBuffer
 from playground.learning.rollout import Environments
+from playground.pytree import PyTree
 
 PARTS = ("critic_loss", "actor_loss", "alpha_loss", "alpha", "entropy")  # what `sac_loss` reports
 
@@ -49,7 +50,7 @@ class Transition(struct.PyTreeNode):
 class SACState(AlgorithmState):
   """A state (params: `SoftActorCriticParams`) with target critics."""
 
-  target_q: Any = None
+  target_q: PyTree = None
 
 
 class SAC(Algorithm[SACConfig, SoftActorCritic, SACState]):
@@ -126,16 +127,18 @@ class SAC(Algorithm[SACConfig, SoftActorCritic, SACState]):
     )
     return envs, transition
 
-  def _learn(self, start: tuple[Any, Any, Any], batches: Transition, noise: jax.Array) -> tuple[Any, jax.Array]:
+  def _learn(
+    self, start: tuple[PyTree, PyTree, PyTree], batches: Transition, noise: jax.Array
+  ) -> tuple[PyTree, jax.Array]:
     """Gradient steps, one for each batch. Parameters travel as one vector: a kernel for each array costs far more."""
     params, target_q, opt_state = start
     (flat, unravel), (flat_target, unravel_target) = ravel_pytree(params), ravel_pytree(target_q)
     config = self.config
-    rates: Any = (config.learning_rate, config.learning_rate, config.alpha_learning_rate)  # critics, actor, temperature
-    rates = jax.tree.broadcast(SoftActorCriticParams(*rates), params)
+    rates = (config.learning_rate, config.learning_rate, config.alpha_learning_rate)  # critics, actor, temperature
+    rates = jax.tree.broadcast(SoftActorCriticParams(*rates), params)  # pyright: ignore[reportArgumentType]
     rates = ravel_pytree(jax.tree.map(jnp.full_like, params, rates))[0]
 
-    def update(carry: tuple[Any, Any, Any], x: tuple[Transition, jax.Array]) -> tuple[Any, jax.Array]:
+    def update(carry: tuple[PyTree, PyTree, PyTree], x: tuple[Transition, jax.Array]) -> tuple[PyTree, jax.Array]:
       """One gradient step for critics, actor and temperature, and one of the target critics after them."""
       params, target, opt_state = carry
       grads, parts = jax.grad(sac_loss, has_aux=True)(

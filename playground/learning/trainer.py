@@ -1,7 +1,5 @@
 """What is the same for all algorithms: the training state, its division over devices, training steps, checkpoints."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +18,7 @@ from playground.learning.checkpoints import Checkpoint
 from playground.learning.hyperparameters import AgentConfig
 from playground.learning.replay import REPLAY_SPEC, Replay
 from playground.learning.rollout import Environments, NonfiniteCapture
+from playground.pytree import PyTree
 
 
 class TrainState(struct.PyTreeNode):
@@ -35,7 +34,7 @@ class TrainState(struct.PyTreeNode):
     capture: the first step with a number that is not finite.
   """
 
-  algorithm: Any
+  algorithm: AlgorithmState
   replay: Replay | None
   key: jax.Array
   env_state: State
@@ -77,7 +76,7 @@ class Trainer:
     self._buffer = self.algorithm.replay
     if several() and self._buffer and self._buffer.saved:
       raise ConfigError("agent.checkpoint_replay=true needs one process for all devices: set it to false.")
-    specs: dict[str, Any] = {"algorithm": P(), "key": P(), "env_state": P(AXIS), "capture": P(AXIS)}
+    specs: dict[str, PyTree] = {"algorithm": P(), "key": P(), "env_state": P(AXIS), "capture": P(AXIS)}
     spec = self._spec = TrainState(**specs, replay=REPLAY_SPEC if self._buffer else None)
     self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS), P()), spec)
     self.reset = jit_on_mesh(self._reset, mesh, (spec, P(), P(AXIS)), spec, donate_argnums=0)
@@ -129,8 +128,8 @@ class Trainer:
     """Returns the replay buffer's data on the host; it is large, so only the newest checkpoint has it."""
     if self._buffer is None or not self._buffer.saved:
       return None
-    replay: Any = state.replay
-    return np.asarray(replay.data)[: int(self._buffer.held(replay))]
+    assert state.replay is not None
+    return np.asarray(state.replay.data)[: int(self._buffer.held(state.replay))]
 
   def restore(self, checkpoint: Checkpoint, template: TrainState) -> tuple[TrainState, str]:
     """Reads a training state.
@@ -165,25 +164,28 @@ class Trainer:
     """Puts a state's host arrays on the devices, each its share."""
     return put(state, self.mesh, self._spec)
 
-  def _restore_replay(self, checkpoint: Checkpoint, template: TrainState, replay: Any) -> tuple[Replay | None, str]:
+  def _restore_replay(
+    self, checkpoint: Checkpoint, template: TrainState, replay: Replay | None
+  ) -> tuple[Replay | None, str]:
     """Returns the replay buffer, empty if the checkpoint has none, and what the user is told of the state."""
     whole = "the whole training state"
-    if self._buffer is None or template.replay is None:
+    if self._buffer is None or template.replay is None or replay is None:
       return None, whole
     shape = template.replay.data.shape
     data = np.zeros(shape, np.float32)
     if checkpoint.has("replay"):
       held = min(int(replay.inserted), self._buffer.slots)
       data[:held] = checkpoint.restore("replay", jax.ShapeDtypeStruct((held, *shape[1:]), jnp.float32))
-      return Replay(data, replay.inserted), whole
+      return Replay(data, replay.inserted), whole  # pyright: ignore[reportArgumentType]  # on the host
     refill = f"{self.config.prefill_updates * self.config.num_envs:,} transitions are collected before it learns on"
-    return Replay(data, np.zeros_like(replay.inserted)), f"the training state without its replay buffer ({refill})"
+    empty = Replay(data, np.zeros_like(replay.inserted))  # pyright: ignore[reportArgumentType]
+    return empty, f"the training state without its replay buffer ({refill})"
 
-  def _saved(self, state: Any) -> Any:
+  def _saved(self, state: PyTree) -> PyTree:
     """Returns what a checkpoint needs of a state, or of its specs."""
     return self._without_data(state) if self._buffer and not self._buffer.saved else state
 
-  def _without_data(self, state: Any) -> Any:
+  def _without_data(self, state: PyTree) -> PyTree:
     return state if state.replay is None else state.replace(replay=state.replay.replace(data=None))
 
   # On each device
@@ -236,8 +238,9 @@ class Trainer:
 
 
 def _train_state(algorithm: AlgorithmState, key: jax.Array, env_state: State, capture: NonfiniteCapture) -> TrainState:
-  without: Any = algorithm.replace(replay=None)
-  return TrainState(algorithm=without, replay=algorithm.replay, key=key, env_state=env_state, capture=capture)
+  return TrainState(
+    algorithm=algorithm.replace(replay=None), replay=algorithm.replay, key=key, env_state=env_state, capture=capture
+  )
 
 
 _COUNTS = ("episodes", "nonfinite", "gradient_steps", "nonfinite_updates", "overflows")

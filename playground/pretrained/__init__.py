@@ -8,13 +8,13 @@ SHA-256 of every file. `playground pretrained` lists them; `add` makes one from 
 import hashlib
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from playground.errors import CheckpointError, UnknownNameError, nearest
+from playground.settings import Plain, Section
 
 PREFIX = "pretrained:"
 POLICIES = Path(__file__).parent / "policies"
@@ -23,7 +23,7 @@ _COPIES = Path("results/pretrained")
 _MEANING = ("observations", "observation_frames", "action_scale", "ctrl_dt")  # of an env section, for a policy
 
 
-def cards() -> dict[str, dict[str, Any]]:
+def cards() -> dict[str, dict[str, Plain]]:
   """The card of each policy, by task."""
   return {path.parent.name: yaml.safe_load(path.read_text()) for path in sorted(POLICIES.glob(f"*/{CARD}"))}
 
@@ -47,7 +47,7 @@ def locate(name: str) -> str:
   return str(folder)
 
 
-def working_copy(name: str, tasks: Mapping[str, Any] | list[str]) -> str:
+def working_copy(name: str, tasks: Container[str]) -> str:
   """The path that a name stands for, in a folder that results can be written to.
 
   A pretrained policy is copied to `results/pretrained/<task>` when it is asked for first.
@@ -78,7 +78,7 @@ def working_copy(name: str, tasks: Mapping[str, Any] | list[str]) -> str:
   return str(copy)
 
 
-def check_task(folder: Path, saved: Mapping[str, Any], today: Mapping[str, Any]) -> None:
+def check_task(folder: Path, saved: Section, today: Section) -> None:
   """Raises CheckpointError if a pretrained policy's task observes or acts otherwise today.
 
   Args:
@@ -94,7 +94,7 @@ def check_task(folder: Path, saved: Mapping[str, Any], today: Mapping[str, Any])
       )
 
 
-def _without_noise(value: Any) -> Any:
+def _without_noise(value: object) -> object:
   """A part of an env section as it bears on what a policy's inputs mean."""
   if isinstance(value, Mapping):
     return [(key, _without_noise(entry)) for key, entry in value.items() if key != "noise" and entry is not None]
@@ -110,7 +110,7 @@ def is_pretrained(folder: Path) -> bool:
   return (folder / CARD).is_file()
 
 
-def add(run: Path, task: str, facts: Mapping[str, Any]) -> Path:
+def add(run: Path, task: str, facts: Section) -> Path:
   """Copies a run's policy into the package and writes its card.
 
   Args:

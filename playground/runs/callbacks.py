@@ -4,7 +4,7 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import mujoco
@@ -14,9 +14,11 @@ from playground.envs.base import Env
 from playground.errors import PlaygroundError
 from playground.hardware.mesh import own_share
 from playground.learning.checkpoints import CheckpointStore, checksum
+from playground.learning.evaluation import Recording
 from playground.learning.loop import Loop, Metrics
 from playground.learning.rollout import Step
-from playground.learning.trainer import Trainer
+from playground.learning.trainer import Trainer, TrainState
+from playground.pytree import PyTree
 from playground.rendering.video import render_video
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_metrics
 from playground.runs.interrupts import Interrupts
@@ -70,7 +72,7 @@ class RunCallbacks:
     self._evaluations = 0
     self._step = plan.step or 0
     self._return: float | None = None  # of the newest row
-    self._recording: Any = None
+    self._recording: Recording | None = None
     self._rates: list[float] = []  # steps per second, by row
     self._start_to_first_update_s: float | None = None
     self._rejected = 0  # gradient steps
@@ -85,7 +87,7 @@ class RunCallbacks:
     """Time the run has taken, over all its starts, without compiling."""
     return self._earlier_s + time.perf_counter() - self._began
 
-  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Recording | None) -> None:
     score = metrics.get(RETURN)
     self._trackers.log(step, metrics | {"time/wall_clock_s": self.wall_clock_s})
     self._progress.update(step, metrics.get("time/steps_per_second"), score)
@@ -95,14 +97,14 @@ class RunCallbacks:
     if score is not None:
       self._evaluations += 1
       every = self._config.video.every_evals
-      if every and self._evaluations % every == 0:
+      if recording is not None and every and self._evaluations % every == 0:
         self._start_video(step, recording)
     self._advance_trace(metrics)
     self._check_buffers(taken, metrics)
     self._check_numbers(step, taken, metrics, captured)
     self._rejected += check_updates(metrics, self._config.on_nonfinite.max_fraction, step)
 
-  def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
+  def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
     policy, rest = self._trainer.split(state)
     meta = {
       "update": update,
@@ -117,7 +119,7 @@ class RunCallbacks:
   def should_stop(self) -> bool:
     return self._interrupts.signum is not None
 
-  def finish(self, loop: Loop, state: Any, completed: bool) -> None:
+  def finish(self, loop: Loop, state: TrainState, completed: bool) -> None:
     """Waits for what is being written, and writes the run's result."""
     self._progress.phase("saving")
     self._store.close()
@@ -197,7 +199,7 @@ class RunCallbacks:
       self._start_to_first_update_s = process_age_s() - self._process_began_s - after_first
     self._rates.append(rate)
 
-  def _start_video(self, step: int, recording: Any) -> None:
+  def _start_video(self, step: int, recording: Recording) -> None:
     """Renders the first recorded episodes in a child process while training goes on."""
     view = self._config.video
     self._video = self._videos.submit(
@@ -257,13 +259,13 @@ class NonMainCallbacks:
     self._interrupts = interrupts
     self._step = step or 0
 
-  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
+  def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Recording | None) -> None:
     taken, self._step = step - self._step, step
     bad = metrics.get("training/nonfinite", 0.0)
     check_fraction(bad * self._action_repeat / max(taken, 1), self._allowed, step)
     check_updates(metrics, self._allowed, step)
 
-  def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
+  def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
     """Process 0 saves."""
 
   def should_stop(self) -> bool:
@@ -294,7 +296,7 @@ def check_updates(metrics: Metrics, allowed: float, step: int) -> int:
   return bad
 
 
-def episodes_of(recording: Any, count: int) -> dict[str, Any]:
+def episodes_of(recording: Recording, count: int) -> dict[str, PyTree]:
   """The first `count` episodes of an evaluation's recording, one after the other: `qpos` [T, nq] and mocap poses."""
   tape = {name: own_share(value, axis=1) for name, value in recording.items()}
   active = tape.pop("active")[:, :count] > 0

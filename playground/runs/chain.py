@@ -12,7 +12,7 @@ import contextlib
 import gc
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from playground import registry
 from playground.config import in_stage, stage_folders
@@ -20,7 +20,6 @@ from playground.errors import ConfigError
 from playground.hardware.distributed import agree, is_main, noting_loss, share
 from playground.hardware.setup import setup
 from playground.learning.checkpoints import describe
-from playground.learning.hyperparameters import read_config
 from playground.learning.trainer import Trainer
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
@@ -61,7 +60,7 @@ def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun
       print(f"{chain.path} is finished: nothing to resume (init_from={chain.path} trains on from its weights).")
       return 0
   setup(config.hardware)  # from here on a process knows whether it writes
-  folders = stage_folders(config.resolved["curriculum"])
+  folders = stage_folders(config.curriculum)
   began_s, before = 0.0, None  # what the first stage starts from is in its config
   with chain.recorded() if is_main() else contextlib.nullcontext(), noting_loss(chain.note_loss):
     try:
@@ -97,27 +96,27 @@ def _check(config: "RunConfig") -> None:
     RunDirectory(str(config.run_dir)).must_be_new()
   print(f"Checking the stages {', '.join(stage_folders(config.resolved['curriculum']))}")
   hardware = setup(config.hardware)
-  before: tuple[str, dict[str, Any]] | None = None
-  for stage, name in zip(config.stages, stage_folders(config.resolved["curriculum"]), strict=True):
+  before: tuple[str, dict[str, object]] | None = None
+  for stage, name in zip(config.stages, stage_folders(config.curriculum), strict=True):
     with in_stage(name):
       env = registry.load(stage.choices["env"], config=stage.env)
       need_camera(env.mj_model, stage.video.camera, "video.camera")
       Randomizer(env.mj_model, stage.env.events)
-      trainer = Trainer(env, read_config(stage.agent), hardware.mesh, hardware.network_precision)
+      trainer = Trainer(env, stage.agent, hardware.mesh, hardware.network_precision)
       trainer.notices()  # raises for a replay buffer that the device cannot hold
       size = env.observation_size
-      facts: dict[str, Any] = {"agent.name": stage.agent.name, "size of the action": env.action_size}
+      facts: dict[str, object] = {"agent.name": stage.agent_name, "size of the action": env.action_size}
       facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
       facts |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(trainer.policy_shape())}
       if before is None and config.init_from is not None:
         plan = RestorePlan(weights=weights_of(config.init_from))
-        plan.restore(trainer, stage.agent.name, lambda: ({}, {}))
+        plan.restore(trainer, stage.agent_name, lambda: ({}, {}))
       if before is not None:
         _compare(f"env={stage.choices['env']}", facts, *before)
       before = name, facts
 
 
-def _compare(env: str, facts: dict[str, Any], before: str, theirs: dict[str, Any]) -> None:
+def _compare(env: str, facts: dict[str, object], before: str, theirs: dict[str, object]) -> None:
   """Raises ConfigError where a stage's networks are not those of the stage before it."""
   for key in {**facts, **theirs}:
     if facts.get(key) != theirs.get(key):
@@ -135,7 +134,7 @@ def _lay_out(config: "RunConfig") -> "tuple[RunDirectory, list[RunConfig]]":
   else:
     chain = RunDirectory(share())
   before, stages = config.init_from, []
-  for stage, folder in zip(config.stages, stage_folders(config.resolved["curriculum"]).values(), strict=True):
+  for stage, folder in zip(config.stages, stage_folders(config.curriculum).values(), strict=True):
     path = str(chain.path / folder)
     tracking = stage.resolved["tracking"]
     wandb = {**tracking["wandb"], "group": tracking["wandb"]["group"] or chain.path.resolve().name}

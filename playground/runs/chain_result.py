@@ -1,12 +1,12 @@
 """What a chain's directory says of all its stages: one metrics.csv, one curve, one summary."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from playground.files import write_text
 from playground.runs.csv_tracker import STAGE, read_metrics
 from playground.runs.plots import plot_learning_curve
 from playground.runs.run_dir import RunDirectory
+from playground.settings import Plain, Section
 
 _RETURNS = ("final_return", "final_sampled_return", "final_mode_return", "best_return")
 _RESULT = ("env", *_RETURNS, "best_step", "params_sha256")
@@ -26,7 +26,7 @@ def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
   stages = [_stage(name, run) for name, run in runs.items()]
   begun = [stage for stage in stages if stage["steps"] is not None]
   open_ = [stage["status"] for stage in stages if stage["status"] != "finished"]
-  last: Mapping[str, Any] = begun[-1] if begun else {}
+  last: Section = begun[-1] if begun else {}
   steps, rates = sum(stage["steps"] for stage in begun), [stage["steps_per_second"] for stage in begun]
   seconds = sum(stage["steps"] / rate for stage, rate in zip(begun, rates, strict=True) if rate)
   status = "finished" if not open_ else "failed" if "failed" in open_ else "preempted"
@@ -43,7 +43,7 @@ def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
   )
 
 
-def _stage(name: str, run: RunDirectory) -> dict[str, Any]:
+def _stage(name: str, run: RunDirectory) -> dict[str, Plain]:
   """A stage's result; None where it has none yet."""
   status, summary = run.status.get("status", "not begun"), run.summary
   return {"name": name, "folder": run.path.name, "status": status, **{key: summary.get(key) for key in _OF_A_RUN}}

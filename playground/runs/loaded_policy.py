@@ -3,18 +3,18 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 from ml_collections import ConfigDict
 
 from playground import config as configs
 from playground import registry
-from playground.envs.base import Env
+from playground.envs.base import Env, Observation
+from playground.hardware.options import Platform
 from playground.hardware.setup import Hardware, setup, this_machine
 from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import Checkpoint
-from playground.learning.hyperparameters import read_config
 from playground.learning.trainer import Trainer
 from playground.runs.restore_plan import weights_of
 from playground.runs.run_dir import RunDirectory
@@ -49,7 +49,7 @@ class LoadedPolicy:
   def task(self) -> str:
     return self.config.choices["env"]
 
-  def act(self, obs: Any, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
+  def act(self, obs: Observation, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
     """Actions in [-1, 1], [..., action_size]."""
     return self.trainer.act(self.policy, obs, key, deterministic)
 
@@ -68,7 +68,7 @@ def load_policy(
   path: str | Path,
   *,
   load_task: Callable[[str, ConfigDict], Env] | None = None,
-  platform: str | None = None,
+  platform: Platform | None = None,
   precision: str | None = None,
 ) -> LoadedPolicy:
   """Reads a run's newest checkpoint, or the checkpoint given.
@@ -85,10 +85,8 @@ def load_policy(
   checkpoint = weights_of(path)
   run_dir = RunDirectory.open(checkpoint.path.parents[1])
   config = configs.from_saved(run_dir.config)
-  hardware_config = this_machine(config.hardware)
-  hardware_config.platform = platform or hardware_config.platform
-  hardware = setup(hardware_config)
+  hardware = setup(this_machine(config.hardware, platform))
   env = (load_task or registry.load)(config.choices["env"], config.env)
-  trainer = Trainer(env, read_config(config.agent), hardware.mesh, precision or hardware.network_precision)
+  trainer = Trainer(env, config.agent, hardware.mesh, precision or hardware.network_precision)
   policy = trainer.place_policy(checkpoint.restore("policy", trainer.policy_shape()))
   return LoadedPolicy(run_dir, config, checkpoint, env, hardware, trainer, policy)

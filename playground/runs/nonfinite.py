@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -12,9 +11,11 @@ from playground.envs.wrappers import MAX_VALUE, MAX_VELOCITY
 from playground.errors import CheckpointError
 from playground.files import replacing
 from playground.learning.rollout import Step
+from playground.pytree import PyTree
+from playground.settings import Section
 
 
-def write_dump(folder: Path, step: int, captured: Step | None, config: dict[str, Any]) -> Path | None:
+def write_dump(folder: Path, step: int, captured: Step | None, config: Section) -> Path | None:
   """Writes the captured step as `step_<step>.npz`, with the run's config inside so that it can travel alone.
 
   Args:
@@ -29,7 +30,7 @@ def write_dump(folder: Path, step: int, captured: Step | None, config: dict[str,
   if captured is None:
     return None
   one = jax.tree.map(lambda x: x[0], captured)
-  arrays = {f"state{name}": leaf for name, leaf in _named(one.state)}
+  arrays: dict[str, PyTree] = {f"state{name}": leaf for name, leaf in _named(one.state)}
   arrays |= {f"model/{name}": value for name, value in one.model.items()}
   arrays |= {f"after/{name}": value for name, value in one.after.items()}
   folder.mkdir(parents=True, exist_ok=True)
@@ -47,7 +48,7 @@ class Dump:
     try:
       with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-      self.config: dict[str, Any] = json.loads(str(arrays.pop("config")))
+      self.config: Section = json.loads(str(arrays.pop("config")))
       self.action = arrays.pop("action")
     except (OSError, ValueError, KeyError) as error:
       raise CheckpointError(f"{path} is not a dump of a non-finite step (nan_dump/step_*.npz of a run).") from error
@@ -68,7 +69,7 @@ class Dump:
     return env.jitted[1](self.state(env), self.action, self.model)
 
 
-def nonfinite_fields(tree: Any) -> list[str]:
+def nonfinite_fields(tree: PyTree) -> list[str]:
   """Names of the leaves that hold a NaN, infinity or value beyond the guard's limit, with how many."""
   lines = []
   for name, leaf in _named(tree):
@@ -79,6 +80,6 @@ def nonfinite_fields(tree: Any) -> list[str]:
   return lines
 
 
-def _named(tree: Any) -> list[tuple[str, Any]]:
+def _named(tree: PyTree) -> list[tuple[str, np.ndarray]]:
   flat, _ = jax.tree_util.tree_flatten_with_path(tree)
   return [(jax.tree_util.keystr(path), leaf) for path, leaf in flat]

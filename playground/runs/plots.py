@@ -2,12 +2,15 @@
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from playground.files import replacing
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_metrics
+
+if TYPE_CHECKING:
+  import pandas as pd
 
 _AXES = {  # file name -> (column, its label)
   "return_over_steps.png": ("step", "environment steps"),
@@ -43,7 +46,7 @@ def plot_learning_curve(metrics_csv: str | Path, out_dir: str | Path) -> list[Pa
   return written
 
 
-def _draw(rows: Any, column: str, label: str, path: Path) -> None:
+def _draw(rows: "pd.DataFrame", column: str, label: str, path: Path) -> None:
   from matplotlib.figure import Figure  # not pyplot: no global state, no display, safe in any thread
   from matplotlib.ticker import EngFormatter
 
@@ -70,9 +73,11 @@ def _draw(rows: Any, column: str, label: str, path: Path) -> None:
       line = f"mean, {name}" if first else None
       axes.plot(x[part], values[part], color="tab:orange", linewidth=1.2, linestyle="--", label=line)
     if names[begin]:
-      axes.axvline(x[begin], color="0.5", linewidth=0.9, linestyle="--", zorder=1)
-      place: Any = {"xycoords": axes.get_xaxis_transform(), "textcoords": "offset points", "ha": "left", "va": "top"}
-      axes.annotate(str(names[begin]), (x[begin], 1), (3, -3), rotation=90, fontsize=8, color="0.35", **place)
+      axes.axvline(float(x[begin]), color="0.5", linewidth=0.9, linestyle="--", zorder=1)
+      axes.annotate(
+        str(names[begin]), (x[begin], 1), (3, -3), axes.get_xaxis_transform(), "offset points",
+        rotation=90, fontsize=8, color="0.35", ha="left", va="top",
+      )  # fmt: skip
   axes.set_xlabel(label)
   axes.set_ylabel("evaluation return")
   axes.set_title(f"last {mean[-1]:.1f}   best {mean.max():.1f}", loc="right", fontsize=9, color="0.35")

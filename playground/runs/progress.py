@@ -3,7 +3,8 @@
 import errno
 import sys
 import time
-from typing import Any, Self
+from collections.abc import Callable
+from typing import Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn
@@ -103,7 +104,7 @@ class Progress:
 class _Terminal:
   """A stream that ignores that its terminal is gone: the run is about to be told by SIGHUP, and saves."""
 
-  def __init__(self, stream: Any):
+  def __init__(self, stream: TextIO):
     self._stream = stream
 
   def write(self, text: str) -> None:
@@ -112,11 +113,11 @@ class _Terminal:
   def flush(self) -> None:
     self._unless_gone(self._stream.flush)
 
-  def __getattr__(self, name: str) -> Any:
+  def __getattr__(self, name: str) -> object:
     return getattr(self._stream, name)
 
   @staticmethod
-  def _unless_gone(call: Any, *args: str) -> None:
+  def _unless_gone(call: Callable[..., object], *args: str) -> None:
     try:
       call(*args)
     except OSError as error:

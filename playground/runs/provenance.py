@@ -5,7 +5,6 @@ import platform
 import subprocess
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 PACKAGES = (
   "playground-run",
@@ -37,7 +36,7 @@ def package_versions() -> dict[str, str | None]:
   return {"python": platform.python_version()} | {name: package_version(name) for name in PACKAGES}
 
 
-def git_state(root: Path = Path(__file__).parents[2]) -> dict[str, Any] | None:
+def git_state(root: Path = Path(__file__).parents[2]) -> dict[str, str | bool] | None:
   """Returns {"commit", "dirty"} of the checkout that this package runs from, or None outside one."""
   # A wheel in a venv inside somebody's own repository must not report that repository's commit as ours.
   toplevel = _git(root, "rev-parse", "--show-toplevel")

@@ -4,16 +4,17 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import jax
 
 from playground import registry
 from playground.errors import CheckpointError
 from playground.hardware.distributed import is_main
+from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import Checkpoint, DamagedCheckpointError, NoCheckpointError, find_checkpoints
 from playground.learning.loop import Draw
-from playground.learning.trainer import Trainer
+from playground.learning.trainer import Trainer, TrainState
 from playground.pretrained import check_task, is_pretrained, locate
 from playground.runs.run_dir import RunDirectory
 
@@ -55,11 +56,11 @@ class RestorePlan:
   checkpoints: list[Path] = dataclasses.field(default_factory=list)
   weights: Checkpoint | None = None
   notices: list[str] = dataclasses.field(default_factory=list)
-  state: Any = None
+  state: TrainState | None = None
   update: int | None = None
   step: int | None = None
   wall_clock_s: float = 0.0
-  policy: Any = None
+  policy: Policy | None = None
   columns: list[str] = dataclasses.field(default_factory=list)
   began_s: float = 0.0
 

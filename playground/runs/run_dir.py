@@ -8,15 +8,15 @@ import socket
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import yaml
-from ml_collections import ConfigDict
 
 from playground.errors import CheckpointError, PlaygroundError, nearest
 from playground.files import lock_holder, locking, plain, read_json, write_json, write_text
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
+from playground.settings import Plain, Section
 
 _RETURNS = ("final_return", "final_sampled_return", "final_mode_return", "best_return")
 _NUMBERS_OF_SUMMARY = (*_RETURNS, "best_step", "steps", "steps_per_second", "wall_clock_s")
@@ -34,7 +34,7 @@ class RunDirectory:
   def create(
     cls,
     path: str | Path,
-    config: Mapping[str, Any] | ConfigDict,
+    config: Section,
     overrides: Sequence[str] = (),
     numbered: bool = False,
   ) -> "RunDirectory":
@@ -66,7 +66,7 @@ class RunDirectory:
       run.path.mkdir(parents=True, exist_ok=True)
     return run
 
-  def write_config(self, config: Mapping[str, Any] | ConfigDict, overrides: Sequence[str] = ()) -> None:
+  def write_config(self, config: Section, overrides: Sequence[str] = ()) -> None:
     """Writes the resolved `config` and the command line's `overrides`; raises CheckpointError if it cannot."""
     with _writing(self.path):
       self.path.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ class RunDirectory:
     return self.path / "nan_dump"
 
   @property
-  def config(self) -> dict[str, Any]:
+  def config(self) -> dict[str, Plain]:
     """The resolved config that the run was started with."""
     return yaml.safe_load(self.config_path.read_text(encoding="utf-8"))
 
@@ -142,19 +142,19 @@ class RunDirectory:
     return yaml.safe_load(self.overrides_path.read_text(encoding="utf-8")) if self.overrides_path.is_file() else []
 
   @property
-  def manifest(self) -> dict[str, Any]:
+  def manifest(self) -> dict[str, Plain]:
     return read_json(self.path / "manifest.json", earlier_starts=list, git=(dict, NoneType), timings=dict)
 
   @property
-  def status(self) -> dict[str, Any]:
+  def status(self) -> dict[str, Plain]:
     return read_json(self.path / "status.json", status=str, reason=str, started=str)
 
   @property
-  def summary(self) -> dict[str, Any]:
+  def summary(self) -> dict[str, Plain]:
     numbers = dict.fromkeys(_NUMBERS_OF_SUMMARY, (int, float, NoneType))
     return read_json(self.path / "summary.json", status=str, **numbers)
 
-  def write_manifest(self, **fields: Any) -> None:
+  def write_manifest(self, **fields: object) -> None:
     """Records this process: git state, package versions, host, and `fields` (device, precision, seed, timings, …).
 
     A resumed run may sit on another machine or commit, so the manifests of earlier starts are kept, oldest first,
@@ -165,7 +165,7 @@ class RunDirectory:
     facts = {"created": _now(), "host": socket.gethostname(), "git": git_state(), "versions": package_versions()}
     write_json(self.path / "manifest.json", _merged(facts, fields) | {"earlier_starts": starts})
 
-  def update_manifest(self, **fields: Any) -> None:
+  def update_manifest(self, **fields: object) -> None:
     """Merges `fields` into the manifest; nested mappings (`timings={"compile_s": 9.1}`) are merged key by key."""
     write_json(self.path / "manifest.json", _merged(self.manifest, fields))
 
@@ -239,7 +239,7 @@ class RunDirectory:
     with contextlib.suppress(OSError, CheckpointError):
       self.set_status(status, reason)
 
-  def write_summary(self, summary: Mapping[str, Any]) -> None:
+  def write_summary(self, summary: Mapping[str, object]) -> None:
     """Writes the run's result, which sweeps and tables read."""
     write_json(self.path / "summary.json", summary)
 
@@ -268,6 +268,6 @@ def _now() -> str:
   return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
 
 
-def _merged(base: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(base: Section, new: Section) -> dict[str, Plain]:
   shared = [k for k in new if isinstance(new[k], Mapping) and isinstance(base.get(k), Mapping)]
   return {**base, **new, **{k: _merged(base[k], new[k]) for k in shared}}

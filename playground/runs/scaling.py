@@ -1,10 +1,11 @@
 """`hardware.scale_envs`: as much work for each device as one device alone would have."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-from playground.config import config_dict
 from playground.errors import ConfigError
+from playground.learning.hyperparameters import AgentConfig
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
@@ -26,23 +27,28 @@ def scale_envs(config: "RunConfig", devices: int) -> "tuple[RunConfig, str]":
   """
   if config.resume is not None:
     raise ConfigError(f"hardware.scale_envs=true would change the sizes of {config.resume}: they are fixed by now.")
-  agents = [stage.agent for stage in config.stages] or [config.agent]
-  sizes = [key for key in SCALED if key in agents[0]]
-  changes = ", ".join(f"agent.{key} {agents[0][key]} -> {agents[0][key] * devices}" for key in sizes)
+  agent = (config.stages or [config])[0].agent
+  changes = ", ".join(f"agent.{key} {size} -> {size * devices}" for key, size in _sizes(agent, SCALED).items())
   stages = tuple(_scaled(stage, devices) for stage in config.stages)
   notice = f"hardware.scale_envs: {devices} device{'s' * (devices > 1)}, so {changes}."
   return dataclasses.replace(_scaled(config, devices), stages=stages), notice
 
 
-def describe_division(agent: Any, devices: int) -> str:
+def describe_division(agent: AgentConfig, devices: int) -> str:
   """How environments and batch divide, in a sentence."""
-  sizes = [key for key in (*SCALED, "num_eval_envs") if key in agent]
-  shares = [f"{agent[key] // devices} of agent.{key}={agent[key]}" for key in sizes]
+  sizes = _sizes(agent, (*SCALED, "num_eval_envs"))
+  shares = [f"{size // devices} of agent.{key}={size}" for key, size in sizes.items()]
   return f"On each of {devices} devices: {', '.join(shares)}."
 
 
+def _sizes(agent: AgentConfig, keys: Iterable[str]) -> dict[str, int]:
+  """Those of the keys that the algorithm has, with their values."""
+  return {key: getattr(agent, key) for key in keys if hasattr(agent, key)}
+
+
 def _scaled(config: "RunConfig", devices: int) -> "RunConfig":
-  agent = {key: size * devices if key in SCALED else size for key, size in config.resolved["agent"].items()}
-  resolved = {**config.resolved, "agent": agent, "hardware": {**config.resolved["hardware"], "scale_envs": False}}
-  sections = {key: config_dict(resolved[key]) for key in ("agent", "hardware")}
-  return dataclasses.replace(config, resolved=resolved, **sections)
+  sizes = {key: size * devices for key, size in _sizes(config.agent, SCALED).items()}
+  sections = {"agent": sizes, "hardware": {"scale_envs": False}}
+  resolved = {**config.resolved, **{key: {**config.resolved[key], **changes} for key, changes in sections.items()}}
+  changed = {key: dataclasses.replace(getattr(config, key), **changes) for key, changes in sections.items()}
+  return dataclasses.replace(config, resolved=resolved, **changed)

@@ -8,11 +8,12 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from playground.files import write_text
+from playground.settings import Plain
 
-Event = dict[str, Any]
+Event = dict[str, Plain]
 
 
 class Op(NamedTuple):
@@ -94,14 +95,15 @@ def _is_operation(name: str) -> bool:
 
 def _self_times(lane: Sequence[Event]) -> Iterable[tuple[str, float]]:
   """Name and self time (s) of each event of a thread, whose events lie inside one another or apart."""
-  open_: list[list[Any]] = []  # name, end, self time
+  open_: list[tuple[str, float, float]] = []  # name, end, self time
   for event in sorted(lane, key=lambda event: (event["ts"], -event.get("dur", 0.0))):
     begin, length = event["ts"], event.get("dur", 0.0)
     while open_ and begin >= open_[-1][1]:
       name, _, time = open_.pop()
       yield name, max(time, 0.0) * 1e-6
     if open_:
-      open_[-1][2] -= length
-    open_.append([event["name"], begin + length, length])
+      name, end, time = open_.pop()
+      open_.append((name, end, time - length))
+    open_.append((event["name"], begin + length, length))
   for name, _, time in open_:
     yield name, max(time, 0.0) * 1e-6

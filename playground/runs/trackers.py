@@ -2,16 +2,14 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from ml_collections import ConfigDict
-
-from playground.files import plain
 from playground.runs.csv_tracker import CsvTracker
 from playground.runs.run_dir import RunDirectory
 from playground.runs.wandb_tracker import WandbTracker
+from playground.settings import Section
 
 
 class Tracker(Protocol):
@@ -43,7 +41,7 @@ class TensorBoardTracker:
     self._writer = EventsWriter(str(folder / "events"))
     self._flushed = time.monotonic()
     if resume_step is not None:
-      session: Any = SessionLog(status=SessionLog.START)  # pyright: ignore[reportAttributeAccessIssue]
+      session = SessionLog(status=SessionLog.START)  # pyright: ignore[reportAttributeAccessIssue]
       self._writer.write_event(Event(step=resume_step + 1, wall_time=time.time(), session_log=session))
 
   def log(self, step: int, metrics: dict[str, float]) -> None:
@@ -80,7 +78,7 @@ class TrackerGroup:
 
 
 def make_trackers(
-  config: Mapping[str, Any] | ConfigDict,
+  config: Section,
   run_dir: RunDirectory,
   resume_step: int | None = None,
   notify: Callable[[str], None] = print,
@@ -96,8 +94,7 @@ def make_trackers(
     notify: takes one sentence when a tracker drops out, or a file is damaged.
     columns: of metrics.csv at that checkpoint, if it knows them.
   """
-  resolved: dict[str, Any] = plain(config)
-  tracking = resolved["tracking"]
+  tracking = config["tracking"]
   csv = CsvTracker(run_dir.metrics_csv, columns, notify)
   if resume_step is not None and csv.truncate_after(resume_step) < resume_step:
     file = run_dir.metrics_csv
@@ -106,5 +103,5 @@ def make_trackers(
   if tracking["tensorboard"]:
     trackers.append(TensorBoardTracker(run_dir.path / "tensorboard", resume_step))
   if tracking["wandb"]["enable"]:
-    trackers.append(WandbTracker(tracking["wandb"], run_dir.path, resolved, notify))
+    trackers.append(WandbTracker(tracking["wandb"], run_dir.path, config, notify))
   return TrackerGroup(csv, trackers)

@@ -4,7 +4,7 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 
@@ -15,7 +15,7 @@ from playground.hardware.distributed import ending_together, is_main, leave, not
 from playground.hardware.setup import Hardware, setup
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
-from playground.learning.hyperparameters import read_config
+from playground.learning.hyperparameters import AgentConfig
 from playground.learning.loop import Loop, ScheduleEvent, compile_program, longest_stretch, schedule
 from playground.learning.trainer import Trainer, TrainState
 from playground.randomization import Randomizer
@@ -75,7 +75,7 @@ def _train_locked(
 ) -> int:
   """One run, new or to resume, that no other process writes."""
   preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
-  agent = read_config(config.agent)
+  agent = config.agent
   agent.check(hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
@@ -84,8 +84,8 @@ def _train_locked(
   trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision)
   plan.notices += trainer.notices()
   if hardware.mesh.size > 1:
-    plan.notices.append(describe_division(config.agent, hardware.mesh.size))
-  plan.restore(trainer, config.agent.name, draw)
+    plan.notices.append(describe_division(agent, hardware.mesh.size))
+  plan.restore(trainer, config.agent_name, draw)
   preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # one may see it damaged
 
   num_updates = math.ceil(agent.num_timesteps / trainer.steps_per_update)
@@ -126,7 +126,9 @@ def _train_locked(
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
 
 
-def cut_short(agent: Any, episode_length: int, events: Sequence[ScheduleEvent], steps_per_update: int) -> list[str]:
+def cut_short(
+  agent: AgentConfig, episode_length: int, events: Sequence[ScheduleEvent], steps_per_update: int
+) -> list[str]:
   """A sentence for the user where fresh starts of all environments leave no time for a whole episode.
 
   They come closer with fewer steps to train: a trial of a tenth of the steps sees a tenth as much of an episode, and
@@ -183,7 +185,11 @@ def _say_where(run_dir: RunDirectory) -> None:
   """The last lines of a run: what lies where."""
   summary = run_dir.summary
   print(f"{summary['status']}: return {format_return(summary['final_return'])}, {summary['steps']:,} steps")
-  places: dict[str, Any] = {"metrics": run_dir.metrics_csv, "plots": run_dir.plots, "checkpoints": run_dir.checkpoints}
+  places: dict[str, object] = {
+    "metrics": run_dir.metrics_csv,
+    "plots": run_dir.plots,
+    "checkpoints": run_dir.checkpoints,
+  }
   if (best := run_dir.checkpoints / BEST).is_dir():
     places["best"] = f"{best} (return {format_return(summary['best_return'])} after {summary['best_step']:,} steps)"
   for name, path in places.items():

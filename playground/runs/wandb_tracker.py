@@ -4,12 +4,16 @@ import contextlib
 import netrc
 import os
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from playground.files import write_text
+from playground.settings import Section
+
+if TYPE_CHECKING:
+  import wandb
 
 # wandb 0.31 renamed its public server, and still takes a netrc entry under the old name.
 _PUBLIC_HOSTS = {"api.wandb.ai", "api.forge.coreweave.com"}
@@ -52,23 +56,21 @@ class WandbTracker:
     notify: takes one sentence when W&B fails; the run then goes on without it.
   """
 
-  def __init__(
-    self, options: Mapping[str, Any], folder: Path, config: Mapping[str, Any], notify: Callable[[str], None] = print
-  ):
+  def __init__(self, options: Section, folder: Path, config: Section, notify: Callable[[str], None] = print):
     self._notify = notify
-    self._run: Any = None
+    self._run: wandb.Run | None = None
     self._guard(lambda: self._start(options, folder, config))
 
   def log(self, step: int, metrics: dict[str, float]) -> None:
-    if self._run is not None:
-      self._guard(lambda: self._run.log(metrics, step=step))
+    if (run := self._run) is not None:
+      self._guard(lambda: run.log(metrics, step=step))
 
   def close(self, status: str) -> None:
-    if self._run is not None:
-      self._guard(lambda: self._run.finish(exit_code=0 if status == "finished" else 1))
+    if (run := self._run) is not None:
+      self._guard(lambda: run.finish(exit_code=0 if status == "finished" else 1))
       self._run = None
 
-  def _start(self, options: Mapping[str, Any], folder: Path, config: Mapping[str, Any]) -> None:
+  def _start(self, options: Section, folder: Path, config: Section) -> None:
     import wandb
 
     id_file = folder / "wandb_run_id"
@@ -82,10 +84,10 @@ class WandbTracker:
       # The progress bar is ours; W&B neither prints nor wraps the terminal.
       "settings": wandb.Settings(silent=True, console="off", init_timeout=30),
     }
-    mode: Any = resolve_mode(options["mode"])
+    mode = resolve_mode(options["mode"])
     try:
       # Offline, the id alone decides, and `resume` would only warn.
-      self._run = wandb.init(**start, mode=mode, resume="allow" if mode == "online" else None)
+      self._run = wandb.init(**start, mode=mode, resume="allow" if mode == "online" else None)  # pyright: ignore[reportArgumentType]
     except Exception as error:
       if mode != "online":
         raise
@@ -95,7 +97,7 @@ class WandbTracker:
     if recorded := sorted(folder.glob("wandb/offline-run-*")):  # the names begin with the time
       self._notify(f"W&B records this run offline; to upload it: wandb sync {recorded[-1]}")
 
-  def _guard(self, call: Callable[[], Any]) -> None:
+  def _guard(self, call: Callable[[], object]) -> None:
     try:
       call()
     except Exception as error:  # whatever a third-party service throws, training is worth more

@@ -5,10 +5,11 @@ import dataclasses
 import datetime
 import os
 import re
+import types
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal
+from typing import Literal
 
 import yaml
 
@@ -17,6 +18,7 @@ from playground.errors import CheckpointError, ConfigError, nearest
 from playground.files import is_locked, lock_holder, locking, read_json, write_json, write_text
 from playground.runs.csv_tracker import RETURN
 from playground.runs.run_dir import RunDirectory
+from playground.settings import Plain
 from playground.text import first_line
 
 Status = Literal["queued", "submitted", "running", "finished", "failed", "timeout", "preempted", "killed"]
@@ -40,7 +42,7 @@ class Job:
 
   name: str
   overrides: list[str]
-  varies: dict[str, Any]
+  varies: dict[str, Plain]
   needs: int | None = None
   steps: int | None = None
 
@@ -72,11 +74,11 @@ class Job:
     return cls(f"{number:03d}_{text}", kept, varies, needs, int(steps))
 
 
-def _value(config: RunConfig, key: str) -> Any:
+def _value(config: RunConfig, key: str) -> Plain:
   """A job's value of a key or group."""
   if key in config.choices:
     return config.choices[key]
-  node: Any = config.resolved
+  node: Plain = config.resolved
   for part in {"terrain": "env.scene.terrain", "visuals": "video.visuals"}.get(key, key).split("."):
     node = node[int(part)] if isinstance(node, list) else node.get(part) if isinstance(node, Mapping) else None
   return format_value(node) if isinstance(node, list | Mapping) else node
@@ -119,9 +121,9 @@ class JobFolder:
     return (self.path / "config.yaml").is_file()
 
   @property
-  def record(self) -> dict[str, Any]:
+  def record(self) -> dict[str, Plain]:
     optional = (str, NoneType)
-    kinds: Any = {"status": str, "reason": str, "attempt": int, "started": optional, "ended": optional, "where": str}
+    kinds = {"status": str, "reason": str, "attempt": int, "started": optional, "ended": optional, "where": str}
     return read_json(self.record_path, **kinds)
 
   @property
@@ -129,7 +131,7 @@ class JobFolder:
     """The job's run directory."""
     return RunDirectory(self.path)
 
-  def write(self, **fields: Any) -> None:
+  def write(self, **fields: object) -> None:
     """Records the job's state."""
     self.path.mkdir(parents=True, exist_ok=True)
     write_json(self.record_path, fields)
@@ -271,7 +273,7 @@ class SweepDirectory:
     write_text(self.path / "sweep.yaml", yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
-def _check(content: Any) -> None:
+def _check(content: Plain) -> None:
   """Raises KeyError, TypeError or ValueError where a sweep.yaml has not the form that `create` writes."""
   texts = lambda key, value: _need(key, value, list) and [_need(key, text, str) for text in value]
   _need("it", content, dict)
@@ -289,7 +291,7 @@ def _check(content: Any) -> None:
     _need("steps", job.steps, int | None)
 
 
-def _need(what: str, value: Any, kind: Any) -> Any:
+def _need(what: str, value: Plain, kind: type | types.UnionType) -> Plain:
   if not isinstance(value, kind):
     raise TypeError(f"{what} is {format_value(value)}")
   return value

@@ -7,8 +7,8 @@ from datetime import datetime
 from pathlib import Path
 
 from playground import config as configs
-from playground.config import RunConfig, Section
-from playground.config.sweep_options import LAUNCHERS, typed
+from playground.config import RunConfig
+from playground.config.sweep_options import GridConfig, SweepSettings
 from playground.errors import ConfigError
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.runner import launcher_class
@@ -19,14 +19,14 @@ ROOT = Path("results/sweeps")
 def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
   """The configurations of all jobs of a `-m` command line; of a search, that of its first job."""
   _, chosen, sets = _lines(overrides)
-  if chosen.search.name != "grid":
+  if not isinstance(chosen.search, GridConfig):
     from playground.sweep.search import first_values
 
     return configs.compose_all([first_values(sets[0])])
   return configs.compose_all(configs.combinations(*sets))
 
 
-def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
+def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
   """Composes and checks every job, and writes the sweep to disk or finds it there.
 
   A `sweep_dir` that holds the same jobs is continued. Without `sweep_dir`, the newest unfinished sweep of the same name
@@ -40,7 +40,7 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
   """
   settings, chosen, sets = _lines(overrides)
   lines = sets[0]
-  if chosen.search.name != "grid":
+  if not isinstance(chosen.search, GridConfig):
     from playground.sweep.search import first_values
 
     (config,), jobs = configs.compose_all([first_values(lines)]), []
@@ -58,13 +58,13 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, Section]:
   found = _find(chosen.sweep_dir, name, lines, jobs)
   if found is not None:
     return found, chosen
-  launcher_class(chosen.launcher.name).check(typed(LAUNCHERS, chosen.launcher), jobs)
+  launcher_class(chosen.launcher).check(chosen.launcher, jobs)
   path = chosen.sweep_dir or _new(ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
   settings = [line for line in settings if not line.startswith("sweep_dir=")]
   return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen
 
 
-def _lines(overrides: Sequence[str]) -> tuple[list[str], Section, list[list[str]]]:
+def _lines(overrides: Sequence[str]) -> tuple[list[str], SweepSettings, list[list[str]]]:
   """Splits a command line.
 
   Returns:
@@ -75,7 +75,7 @@ def _lines(overrides: Sequence[str]) -> tuple[list[str], Section, list[list[str]
   """
   settings, lines = configs.split(configs.expand(overrides))
   chosen, listed = configs.compose_settings(settings), configs.listed_jobs(overrides)
-  if listed and chosen.search.name != "grid":
+  if listed and not isinstance(chosen.search, GridConfig):
     raise ConfigError("A search draws from what one job may be: its sweep file cannot list jobs.")
   return settings, chosen, [configs.with_default_experiment(one) for one in configs.with_listed(lines, listed)]
 
@@ -123,7 +123,7 @@ def _new(path: Path) -> Path:
   return folder
 
 
-def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> Section:
+def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> SweepSettings:
   """The settings that a sweep was started with, changed by `extra`.
 
   Raises:

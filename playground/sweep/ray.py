@@ -5,7 +5,6 @@ import os
 import socket
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 from playground.config.sweep_options import RayConfig
@@ -37,7 +36,7 @@ class RayLauncher:
     self._sweep = sweep
     self._config = config
     self._command = tuple(command)
-    self._tasks: dict[str, Any] = {}
+    self._tasks: dict[str, ray.ObjectRef] = {}
     self._run = ray.remote(max_calls=1)(_run)  # a process for each job, as with the other launchers
 
   @staticmethod

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table as ConsoleTable
@@ -68,7 +68,7 @@ def collect(sweep: SweepDirectory) -> "pd.DataFrame":
   for job in sweep.jobs:
     folder = sweep.folder(job)
     state, summary = folder.state(), folder.run.summary
-    row: dict[str, Any] = {"job": job.name, **job.varies, "status": state.status}
+    row: dict[str, object] = {"job": job.name, **job.varies, "status": state.status}
     row |= {key: summary.get(key) for key in FIGURES}
     row |= {"attempts": state.attempt, "reason": state.reason, "overrides": " ".join(job.overrides)}
     rows.append(row)
@@ -98,9 +98,9 @@ def group(jobs: "pd.DataFrame", keys: Sequence[str]) -> "pd.DataFrame":
   finished = jobs[jobs["status"] == "finished"]
   by = [finished[key].map(_label) for key in keys] or [pd.Series("all", finished.index, name="jobs of")]
   rows = []
-  labels: Any
   for labels, part in finished.groupby(by, sort=False, dropna=False):
-    row: dict[str, Any] = {**dict(zip(keys or ["jobs of"], labels, strict=True)), "jobs": len(part)}
+    named = zip(keys or ["jobs of"], labels, strict=True)  # pyright: ignore[reportArgumentType]
+    row: dict[str, object] = {**dict(named), "jobs": len(part)}
     for name in AVERAGED:
       values = part[name].dropna().to_list()
       row[name], row[f"{name}_ci95"] = mean_and_ci95(values) if values else (None, None)
@@ -195,11 +195,11 @@ def _group_rows(groups: "pd.DataFrame") -> tuple[list[str], list[list[str]]]:
   return [*keys, *(name.replace("_", " ") for name in AVERAGED)], rows
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
   if value is None or value != value:
     return ""
   return short(value) if isinstance(value, float | int) and not isinstance(value, bool) else str(value)
 
 
-def _label(value: Any) -> str:
+def _label(value: object) -> str:
   return "null" if value is None or value != value else str(value)

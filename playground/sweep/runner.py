@@ -5,16 +5,24 @@ again it does what is missing and waits for jobs that are still at work.
 """
 
 import contextlib
+import importlib
 import time
 from collections import deque
 from collections.abc import Sequence
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from rich.console import Console
 
-from playground.config import Section, check_saved_job
-from playground.config.sweep_options import LAUNCHERS, SEARCHES, typed
+from playground.config import check_saved_job
+from playground.config.sweep_options import (
+  LauncherConfig,
+  LocalConfig,
+  OptunaConfig,
+  RayConfig,
+  SlurmConfig,
+  SweepSettings,
+)
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
 from playground.sweep.report import write_result
@@ -24,8 +32,11 @@ from playground.sweep.worker import COMMAND
 if TYPE_CHECKING:
   from playground.sweep.search import Search
 
+ConfigT = TypeVar("ConfigT", bound=LauncherConfig, contravariant=True)
+
 POLL_S = 0.3
 MAX_CODE = 100  # exit codes above are signals'
+_CLASSES = {LocalConfig: "local:LocalLauncher", RayConfig: "ray:RayLauncher", SlurmConfig: "slurm:SlurmLauncher"}
 
 
 class Launcher(Protocol):
@@ -36,13 +47,6 @@ class Launcher(Protocol):
   """
 
   outlives: bool
-
-  def __init__(self, sweep: SweepDirectory, config: Any, command: Sequence[str] = COMMAND):
-    """Takes a sweep, settings (of `LAUNCHERS`), and the command that runs a job's overrides; raises as `check`."""
-
-  @staticmethod
-  def check(config: Any, jobs: Sequence[Job]) -> None:
-    """Raises PlaygroundError for missing software, invalid settings and jobs that can never start; writes nothing."""
 
   def start(self, job: Job) -> bool:
     """Starts a job, or returns False because there is no room for it now."""
@@ -59,23 +63,25 @@ class Launcher(Protocol):
     """Waits for the jobs that do not outlive this process, and frees what the launcher holds."""
 
 
-def launcher_class(name: str) -> type[Launcher]:
-  """The class for `launcher.name`; raises ConfigError where its package is not installed."""
-  if name == "slurm":
-    from playground.sweep.slurm import SlurmLauncher
+class LauncherClass(Protocol[ConfigT]):
+  """The class of a launcher with these settings."""
 
-    return SlurmLauncher
-  if name == "ray":
-    from playground.sweep.ray import RayLauncher
+  def __call__(self, sweep: SweepDirectory, config: ConfigT, command: Sequence[str] = COMMAND) -> Launcher:
+    """Takes a sweep, settings, and the command that runs a job's overrides; raises as `check`."""
+    ...
 
-    return RayLauncher
-  from playground.sweep.local import LocalLauncher
+  def check(self, config: ConfigT, jobs: Sequence[Job]) -> None:
+    """Raises PlaygroundError for missing software, invalid settings and jobs that can never start; writes nothing."""
 
-  return LocalLauncher
+
+def launcher_class(config: ConfigT) -> LauncherClass[ConfigT]:
+  """The class that these settings are of; raises ConfigError where its package is not installed."""
+  module, _, name = _CLASSES[type(config)].partition(":")
+  return getattr(importlib.import_module(f"playground.sweep.{module}"), name)
 
 
 def run_sweep(
-  sweep: SweepDirectory, settings: Section, command: Sequence[str] = COMMAND, console: Console | None = None
+  sweep: SweepDirectory, settings: SweepSettings, command: Sequence[str] = COMMAND, console: Console | None = None
 ) -> int:
   """Runs the unfinished jobs of a sweep and writes its result.
 
@@ -95,13 +101,12 @@ def run_sweep(
     check_saved_job(job.name, job.overrides)
   with sweep.controlled():
     view, search = View(sweep, console), None
-    if settings.search.name != "grid":
+    if isinstance(settings.search, OptunaConfig):
       from playground.sweep.search import Search
 
-      search = Search(sweep, typed(SEARCHES, settings.search), view.print)
-    wait = settings.launcher.get("wait", True)
-    make_launcher = launcher_class(settings.launcher.name)
-    with contextlib.closing(make_launcher(sweep, typed(LAUNCHERS, settings.launcher), command)) as launcher:
+      search = Search(sweep, settings.search, view.print)
+    wait = not isinstance(settings.launcher, SlurmConfig) or settings.launcher.wait
+    with contextlib.closing(launcher_class(settings.launcher)(sweep, settings.launcher, command)) as launcher:
       code = Runner(sweep, launcher, view, search, settings.on_error == "stop", wait).run()
     if wait:
       write_result(sweep, view.print)

@@ -4,7 +4,6 @@ The study lies in the sweep's folder (`study.log`), a trial is one of its jobs; 
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSweep
 from hydra.core.override_parser.types import Override as HydraOverride
@@ -42,7 +41,9 @@ class Search:
     self._refused = 0
     parsed = [parse_with_hydra(line) for line in sweep.lines]
     self._fixed = [line for line, o in zip(sweep.lines, parsed, strict=True) if not o.is_sweep_override()]
-    self._drawn = {str(o.get_key_element()): distribution(o) for o in parsed if o.is_sweep_override()}
+    self._drawn: dict[str, BaseDistribution] = {
+      str(o.get_key_element()): distribution(o) for o in parsed if o.is_sweep_override()
+    }
     self._study = optuna.create_study(
       storage=JournalStorage(JournalFileBackend(str(sweep.path / "study.log"))),
       sampler=_SAMPLERS[config.sampler](config.seed + len(sweep.jobs)),
@@ -110,7 +111,7 @@ class Search:
     return f"Best of {len(self._sweep.jobs)} trials: {self._config.metric} {trial.value:g} with {values}"
 
 
-def distribution(override: HydraOverride) -> BaseDistribution:
+def distribution(override: HydraOverride) -> CategoricalDistribution | FloatDistribution | IntDistribution:
   """The distribution of an override; `tag(log, interval(a, b))` is drawn on a log scale.
 
   Raises:
@@ -140,7 +141,7 @@ def first_values(lines: Sequence[str]) -> list[str]:
     override = parse_with_hydra(line)
     if override.is_sweep_override():
       drawn = True
-      draws: Any = distribution(override)
+      draws = distribution(override)
       low = draws.choices[0] if isinstance(draws, CategoricalDistribution) else draws.low
       overrides.append(f"{override.get_key_element()}={low}")
     else:

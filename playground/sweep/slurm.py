@@ -15,11 +15,11 @@ import subprocess
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from playground.config.sweep_options import SlurmConfig
 from playground.errors import ConfigError, HardwareError
 from playground.interpreter import PYTHON
+from playground.settings import Plain
 from playground.sweep.folder import ENDED, STOP_FILE, Job, JobFolder, SweepDirectory
 from playground.sweep.worker import COMMAND, Worker
 
@@ -50,7 +50,7 @@ class SlurmJob:
       signal.raise_signal(signal.SIGUSR2)  # submitit's: Slurm queues nothing again that left before it was killed
     return code
 
-  def checkpoint(self) -> Any:
+  def checkpoint(self) -> submitit.helpers.DelayedSubmission:
     """Called by submitit in the middle of `__call__`, on preemption and shortly before the time limit."""
     if self._worker is not None:
       self._worker.interrupt("Slurm wants its place; it is queued again")
@@ -92,7 +92,11 @@ class SlurmLauncher:
   outlives = True
 
   def __init__(
-    self, sweep: SweepDirectory, config: SlurmConfig, command: Sequence[str] = COMMAND, executor: Any = None
+    self,
+    sweep: SweepDirectory,
+    config: SlurmConfig,
+    command: Sequence[str] = COMMAND,
+    executor: submitit.Executor | None = None,
   ):
     """See `runner.Launcher`; `executor` is submitit's for Slurm if not given."""
     self.check(config, sweep.jobs)
@@ -102,7 +106,7 @@ class SlurmLauncher:
     self._config = config
     self._command = tuple(command)
     self._queue = Queue()
-    self.submitted: dict[str, Any] = {}
+    self.submitted: dict[str, submitit.Job[int]] = {}
 
   @staticmethod
   def check(config: SlurmConfig, jobs: Sequence[Job]) -> None:
@@ -157,7 +161,7 @@ class SlurmLauncher:
   def close(self) -> None:
     """Jobs go on by themselves."""
 
-  def _submitted(self, job: Job, folder: JobFolder) -> Any:
+  def _submitted(self, job: Job, folder: JobFolder) -> "submitit.Job[int] | None":
     """Submitit's handle of a job, also of one that an earlier process submitted."""
     known = folder.path / "slurm_id"
     if job.name not in self.submitted and known.is_file() and _SLURM_ID.fullmatch(job_id := known.read_text()):
@@ -165,12 +169,12 @@ class SlurmLauncher:
     return self.submitted.get(job.name)
 
 
-def _executor(folder: Path, requeues: int) -> Any:
+def _executor(folder: Path, requeues: int) -> submitit.SlurmExecutor:
   """Submitit's, whose jobs start Python as `PYTHON` says."""
   return submitit.SlurmExecutor(folder, max_num_timeout=requeues, python=shlex.join(PYTHON))
 
 
-def slurm_parameters(config: SlurmConfig, job: Job) -> dict[str, Any]:
+def slurm_parameters(config: SlurmConfig, job: Job) -> dict[str, Plain]:
   """The parameters of sbatch for a job, by submitit's names."""
   gpus = config.gpus_per_job if config.gpus_per_job is not None else 1 if job.needs is None else job.needs
   parameters = {

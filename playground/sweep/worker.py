@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from playground.interpreter import PYTHON
 from playground.runs.interrupts import on_signals
@@ -47,13 +46,13 @@ class Worker:
     self._stopping = False
     self._sweep_path = self._folder.path.parents[1]
     self._child: subprocess.Popen[bytes] | None = None
-    self._record: dict[str, Any] = {}
+    self._record: dict[str, object] = {}
 
   def stop(self) -> None:
     """Asks the job to save and leave."""
     self._stopping = True
 
-  def run(self, where: str = "", **facts: Any) -> int:
+  def run(self, where: str = "", **facts: object) -> int:
     """Runs the job to its end and returns its exit code; returns 0 if another worker runs it or has finished it.
 
     Args:

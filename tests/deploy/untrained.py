@@ -11,7 +11,6 @@ from playground.envs.c_physics import on_c_physics
 from playground.hardware.mesh import make_mesh
 from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import CheckpointStore
-from playground.learning.hyperparameters import read_config
 from playground.learning.trainer import Trainer
 from playground.registry import load
 from playground.runs.run_dir import RunDirectory
@@ -25,7 +24,7 @@ class UntrainedRun:
     config = compose([f"env={task}", "hardware=cpu", f"run_dir={path}", *overrides])
     self.directory = RunDirectory.create(path, config.resolved)
     self._task = task
-    trainer = Trainer(on_c_physics(load(task, config=config.env)), read_config(config.agent), make_mesh(1))
+    trainer = Trainer(on_c_physics(load(task, config=config.env)), config.agent, make_mesh(1))
     rng = np.random.default_rng(0)
     weights = jax.tree.map(lambda x: rng.uniform(0.1, 0.5, x.shape).astype(x.dtype), trainer.policy_shape())
     self._policy = Policy(jax.tree.map(lambda x: x * np.float32(scale), weights.params), weights.normalizer)

@@ -15,7 +15,6 @@ from playground.errors import ConfigError
 from playground.hardware.mesh import make_mesh
 from playground.learning import ppo
 from playground.learning.cnn import CNN, CNNConfig, random_shift
-from playground.learning.hyperparameters import PPOConfig
 from playground.learning.networks import ACTIVATIONS, ActorCritic, NetworkConfig, SoftActorCritic, SoftNetworkConfig
 from playground.learning.ppo import Batch, ppo_loss
 from playground.learning.trainer import Trainer
@@ -56,9 +55,9 @@ def test_number_of_features_of_64_pixels_squared(config: CNNConfig, size: int) -
 
 
 def test_experiments_have_the_networks_of_their_sources() -> None:
-  cartpole = PPOConfig.from_config(compose(["experiment=cartpole_pixels"]).agent).network
+  cartpole = compose(["experiment=cartpole_pixels"]).agent.network
   assert (cartpole.cnn.max_pool, tuple(cartpole.cnn.channels), cartpole.policy_obs_key) == (True, (16, 32), "")
-  panda = PPOConfig.from_config(compose(["experiment=panda_pick_pixels"]).agent).network
+  panda = compose(["experiment=panda_pick_pixels"]).agent.network
   assert panda.cnn == dataclasses.replace(
     CNNConfig([32, 64, 64], [8, 4, 3], [4, 2, 1], "relu", max_pool=False), global_pool="none", normalize_channels=True
   )

@@ -1,6 +1,7 @@
 """What is PPO's own; what it shares with the other algorithms is in test_trainer.py."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -74,8 +75,9 @@ def test_a_time_out_is_worth_what_its_true_last_observation_promises() -> None:
   normalizer = jax.tree.map(lambda x: x + 0.25 if x.dtype == jnp.float32 else x, state.algorithm.normalizer)
   actor = (trainer.networks, state.algorithm.params.policy, normalizer)
   envs = lambda env_state: Environments(env_state, state.capture, {}, {}, trainer.env)
-  roll = lambda env_state, *args: unroll(envs(env_state), *actor, *args)[1]
-  data = jax.jit(roll, static_argnums=2)(state.env_state, jax.random.PRNGKey(1), 6, state.algorithm.params.value)
+  value = functools.partial(trainer.networks.value, state.algorithm.params.value)
+  roll = lambda env_state, key, length: unroll(envs(env_state), *actor, key, length, value)[1]
+  data = jax.jit(roll, static_argnums=2)(state.env_state, jax.random.PRNGKey(1), 6)
   place, action = data.obs["state"], trainer.networks.distribution.postprocess(data.raw_action)
   last = {"state": place + 0.1 * action, "privileged_state": jnp.concatenate([place + 0.1 * action, action], -1)}
   value = trainer.networks.value(state.algorithm.params.value, normalize(last, normalizer))

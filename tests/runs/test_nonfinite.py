@@ -1,5 +1,6 @@
 """Runs whose numbers go NaN or infinite: counted, dumped, kept out of what learns, and replayed."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -60,7 +61,7 @@ def test_nan_is_counted_dumped_and_kept_out(
 def test_too_many_rejected_gradient_steps_stop_the_run(tmp_path: Path, cache: Path, agent: str) -> None:
   run = tmp_path / "run"
   config = compose([*TASK, f"agent={agent}", f"run_dir={run}"])
-  config.agent.reward_scaling = math.inf  # which composing refuses
+  config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, reward_scaling=math.inf))  # pyright: ignore[reportCallIssue]
   with pytest.raises(NonfiniteError, match=r"(\d+) of \1 gradient steps before step .* on_nonfinite.max_fraction=0.01"):
     train(config)
   assert RunDirectory(run).status["status"] == "failed"
@@ -70,7 +71,7 @@ def test_a_run_says_how_many_gradient_steps_it_left_out(
   tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
   config = compose([*TASK, "on_nonfinite.max_fraction=1", f"run_dir={tmp_path / 'run'}"])
-  config.agent.reward_scaling = math.inf
+  config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, reward_scaling=math.inf))  # pyright: ignore[reportCallIssue]
   assert train(config) == 0
   left_out = np.nansum(pd.read_csv(tmp_path / "run/metrics.csv")["training/nonfinite_updates"].to_numpy())
   assert left_out > 0

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from playground.config import sweeps
+from playground.config.sweep_options import LocalConfig, SlurmConfig
 from playground.errors import ConfigError, PlaygroundError
 from playground.sweep import local
 from playground.sweep.plan import plan, settings_of
@@ -24,15 +25,15 @@ def test_jobs_are_named_after_what_they_differ_in(here: Path) -> None:
   assert sweep.path == Path("mine")
   assert [job.name for job in sweep.jobs][::3] == [
     "000_CartpoleBalance_seed=1_max_grad_norm=None",
-    "003_CartpoleBalance_seed=2_max_grad_norm=1.0",
+    "003_CartpoleBalance_seed=2_max_grad_norm=1",
     "006_CartpoleSwingup_seed=2_max_grad_norm=None",
   ]
   assert sweep.jobs[3].varies == {"env": "CartpoleBalance", "seed": 2, "agent.max_grad_norm": 1.0}
   assert sweep.jobs[3].overrides == ["env=CartpoleBalance", "seed=2", "agent.max_grad_norm=1.0", "debug=fast"]
   assert {job.steps for job in sweep.jobs} == {320}
   assert {job.needs for job in sweep.jobs} == {None}
-  assert settings.launcher.slots_per_gpu == settings_of(sweep).launcher.slots_per_gpu == 2
-  assert settings_of(sweep, ["launcher=slurm"]).launcher.name == "slurm"
+  assert settings.launcher == settings_of(sweep).launcher == LocalConfig(slots_per_gpu=2)
+  assert isinstance(settings_of(sweep, ["launcher=slurm"]).launcher, SlurmConfig)
 
 
 def test_a_listed_job_is_named_after_what_it_says_itself(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,7 +42,7 @@ def test_a_listed_job_is_named_after_what_it_says_itself(here: Path, monkeypatch
   monkeypatch.setattr(sweeps, "shipped", lambda name: here)
   sweep, _ = plan(["sweep=these"])
   assert [job.name for job in sweep.jobs] == [
-    "000_CartpoleBalance_max_grad_norm=2.0", "001_cheetah_run_seed=4", "002_cheetah_run_seed=5",
+    "000_CartpoleBalance_max_grad_norm=2", "001_cheetah_run_seed=4", "002_cheetah_run_seed=5",
   ]  # fmt: skip
   assert [job.varies["env"] for job in sweep.jobs] == ["CartpoleBalance", "CheetahRun", "CheetahRun"]
   assert plan(["sweep=these"])[0].path == sweep.path  # the same command goes on with it

@@ -12,7 +12,6 @@ from playground import registry
 from playground.config import compose
 from playground.envs.wrappers import wrap_for_training
 from playground.hardware.mesh import make_mesh
-from playground.learning.hyperparameters import read_config
 from playground.learning.trainer import Trainer
 from playground.physics.backend import mjx
 
@@ -53,7 +52,7 @@ def training_step(agent: str, overrides: tuple[str, ...], layers: tuple[int, int
     layers: rows, width and number of the products.
   """
   config = compose(["env=CartpoleBalance", f"agent={agent}", "env.impl=jax", *overrides])
-  trainer = Trainer(registry.load("CartpoleBalance", config=config.env), read_config(config.agent), make_mesh(1))
+  trainer = Trainer(registry.load("CartpoleBalance", config=config.env), config.agent, make_mesh(1))
   state = trainer.init(jax.random.PRNGKey(0), {}, None)
   state, _ = trainer.train(state, {}, np.int32(trainer.config.prefill_updates))
 

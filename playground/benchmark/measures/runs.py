@@ -18,7 +18,6 @@ from playground.benchmark.worker import Facts
 from playground.config import RunConfig, compose
 from playground.errors import PlaygroundError, nearest
 from playground.interpreter import PYTHON
-from playground.learning.hyperparameters import read_config
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
 from playground.runs.run_dir import RunDirectory
 
@@ -147,7 +146,7 @@ def emit_result(facts: Facts, result: Mapping[str, Any], quantities: Sequence[st
 
 def _one_update(config: RunConfig) -> int:
   """The budget (control steps) with which something is learned once."""
-  settings = read_config(config.agent)
+  settings = config.agent
   return (settings.prefill_updates + 1) * settings.steps_per_update * config.env.action_repeat
 
 

@@ -22,7 +22,6 @@ from playground.config import RunConfig, compose
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
 from playground.hardware.setup import Hardware, setup
-from playground.learning.hyperparameters import read_config
 from playground.learning.trainer import Trainer
 from playground.runs.scaling import scale_envs
 from playground.runs.train import model_sampler
@@ -47,7 +46,7 @@ class Subject:
     hardware = setup(config.hardware)
     if config.hardware.scale_envs:
       config, _ = scale_envs(config, hardware.mesh.size)
-    settings = read_config(config.agent)
+    settings = config.agent
     env = registry.load(task, config=config.env)
     draw = model_sampler(env, config, settings.num_envs, settings.num_eval_envs)
     trainer = Trainer(env, settings, hardware.mesh, hardware.network_precision)

@@ -8,13 +8,12 @@ import pytest
 from playground.benchmark.measures import training
 from playground.benchmark.worker import Facts
 from playground.config import compose
-from playground.learning.hyperparameters import config_class
 
 
 @pytest.mark.parametrize(("agent", "before"), [("ppo", 1), ("sac", 1 + 64 // 16)])
 def test_a_seed_begins_anew_and_warms_up_before_the_clock(monkeypatch: pytest.MonkeyPatch, agent: str, before: int):
   sizes = ["agent.num_envs=16", "agent.min_replay_size=64"] if agent == "sac" else []
-  config = config_class(agent).from_config(compose(["env=CartpoleBalance", f"agent={agent}", *sizes]).agent)
+  config = compose(["env=CartpoleBalance", f"agent={agent}", *sizes]).agent
   done: list[Any] = []
 
   def train(state: Any, model: Any, count: Any) -> tuple[Any, Any]:
