@@ -6,7 +6,6 @@ And locks: files that say which process is at work on a run, a job or a sweep.
 import errno
 import fcntl
 import json
-import math
 import os
 import shutil
 import socket
@@ -17,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from playground.errors import CheckpointError, ConfigError
-from playground.settings import Plain
+from playground.settings import Plain, plain
 
 
 def need_folder(folder: Path, option: str) -> None:
@@ -123,14 +122,18 @@ def _try_lock(handle: int, kind: int) -> bool:
   return True
 
 
+def numbered(path: Path) -> Path:
+  """The first of `<stem><suffix>`, `<stem>_2<suffix>`, `<stem>_3<suffix>`, ... that is not there."""
+  number, free = 1, path
+  while free.exists():
+    number += 1
+    free = path.with_name(f"{path.stem}_{number}{path.suffix}")
+  return free
+
+
 def keep_copy(path: Path, stem: str) -> Path:
   """Copies a file to a sibling `<stem><suffix>`, numbered if that is there already; returns the copy."""
-  number, copy = 1, path.with_name(f"{stem}{path.suffix}")
-  while copy.exists():
-    number += 1
-    copy = path.with_name(f"{stem}_{number}{path.suffix}")
-  shutil.copy2(path, copy)
-  return copy
+  return Path(shutil.copy2(path, numbered(path.with_name(f"{stem}{path.suffix}"))))
 
 
 def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Plain]:
@@ -157,18 +160,3 @@ def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Plain]:
     why = f"its {wrong[0]!r} has the wrong type" if wrong else "it is no JSON object"
     raise CheckpointError(f"{path} is damaged ({why}): move it away to go on without it.")
   return content
-
-
-def plain(value: Plain, finite: bool = False) -> Plain:
-  """Returns `value` (ConfigDict, tuple, path, array, …) as the dicts, lists and scalars that YAML and JSON know."""
-  if hasattr(value, "to_dict"):  # ml_collections.ConfigDict
-    value = value.to_dict()
-  if isinstance(value, Mapping):
-    return {str(k): plain(v, finite) for k, v in value.items()}
-  if isinstance(value, list | tuple | set):
-    return [plain(v, finite) for v in value]
-  if hasattr(value, "tolist"):  # NumPy and JAX arrays and scalars
-    return plain(value.tolist(), finite)
-  if isinstance(value, float):
-    return None if finite and not math.isfinite(value) else value
-  return value if value is None or isinstance(value, bool | int | str) else str(value)

@@ -13,6 +13,7 @@ reference pages show them. Nothing here imports JAX.
 
 import dataclasses
 import functools
+import math
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -88,13 +89,26 @@ def nested(hint: object) -> type | None:
   return kind if dataclasses.is_dataclass(kind) and isinstance(kind, type) else None
 
 
-def plain(value: object) -> Plain:
-  """Returns nested mappings, lists and scalars for a value that may hold dataclasses and tuples."""
+def plain(value: Plain, finite: bool = False) -> Plain:
+  """Returns a value (dataclass, ConfigDict, tuple, path, array, …) as the dicts, lists and scalars of YAML and JSON.
+
+  Args:
+    value: it.
+    finite: whether NaN and infinity, which JSON has not, become None.
+  """
   if dataclasses.is_dataclass(value) and not isinstance(value, type):
-    return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+  elif hasattr(value, "to_dict"):  # ml_collections.ConfigDict
+    value = value.to_dict()
   if isinstance(value, Mapping):
-    return {key: plain(entry) for key, entry in value.items()}
-  return [plain(entry) for entry in value] if isinstance(value, list | tuple) else value
+    return {str(key): plain(entry, finite) for key, entry in value.items()}
+  if isinstance(value, list | tuple | set):
+    return [plain(entry, finite) for entry in value]
+  if hasattr(value, "tolist"):  # NumPy and JAX arrays and scalars
+    return plain(value.tolist(), finite)
+  if isinstance(value, float):
+    return None if finite and not math.isfinite(value) else value
+  return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
 def _settings(cls: type, prefix: str = "") -> Iterator[Setting]:

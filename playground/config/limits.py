@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from playground.config.definitions import chosen_names, definition
 from playground.config.schema import wrong_type
-from playground.envs.options import NUMBERS
+from playground.envs.options import NUMBERS, sees
 from playground.errors import ConfigError, nearest
 from playground.limits import Limit
 from playground.mdp.options import OPTIONS
@@ -30,7 +30,7 @@ def check_limits(resolved: Section) -> None:
   for key, value in _leaves(resolved):
     if value is not None and not _OF_TERMS.match(key):
       _check(key, value, names)
-  _check_xla_flags(_get(resolved, "hardware.xla_flags"))
+  _check_xla_flags(resolved.get("hardware", {}).get("xla_flags"))
   env = resolved.get("env", {})
   _check_order(env, "env")
   contacts, convex = env.get("naconmax_per_env"), env.get("naccdmax_per_env")
@@ -73,7 +73,7 @@ def _check_order(node: Section, key: str) -> None:
 def check_vision(said: Iterable[str], resolved: Section) -> None:
   """Raises ConfigError where a command line says how a task sees (its keys are `said`) that sees nothing."""
   unused = [key for key in said if key.startswith("env.vision.") and key != "env.vision.enable"]
-  if unused and _get(resolved, "env.vision.enable") is False:
+  if unused and not sees(resolved["env"]):
     raise ConfigError(f"{unused[0]}: this task sees nothing. Add env.vision.enable=true env.vision.camera=<name>.")
 
 
@@ -105,10 +105,3 @@ def _leaves(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
       yield from _leaves(value, join(prefix, name))
     else:
       yield join(prefix, name), value
-
-
-def _get(node: Plain, key: str) -> Plain:
-  """The value of a dotted key, None if there is none."""
-  for part in key.split("."):
-    node = node.get(part) if isinstance(node, Mapping) else None
-  return node

@@ -12,8 +12,8 @@ from playground.config import format_value
 from playground.deploy.graph import OUTPUT, input_names
 from playground.envs.base import PIXELS, Env, State
 from playground.errors import CheckpointError
-from playground.files import plain
 from playground.mdp.options import OPTIONS
+from playground.settings import plain
 
 FORMAT = "playground-policy/3"
 

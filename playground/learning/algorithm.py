@@ -92,6 +92,10 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
       left out: there was nothing to learn from yet.
     """
 
+  def new_policy(self, key: jax.Array) -> Policy:
+    """Returns fresh parameters, and statistics of no observations."""
+    return Policy(self.networks.init(key), self.networks.init_normalizer())
+
   def policy(self, state: StateT) -> Policy:
     """Returns what acting needs."""
     return Policy(state.params, state.normalizer)

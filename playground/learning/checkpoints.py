@@ -34,6 +34,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from playground.errors import CheckpointError
+from playground.files import numbered
 from playground.pytree import PyTree
 from playground.settings import Plain, Section
 
@@ -117,7 +118,7 @@ class CheckpointStore:
     self._best = max(((value, step) for step, value in returns.items() if value is not None), default=_NO_BEST)
     self._link_best()  # before others are moved: what it points to is always whole
     for step in damaged:
-      _set_aside(there[step])
+      there[step].rename(numbered(there[step].with_name(f"damaged_{there[step].name}")))
     self._alias = _Alias(self._folder)
     options = ocp.CheckpointManagerOptions(
       create=False,
@@ -384,15 +385,6 @@ def _by_step(folder: Path) -> dict[int, Path]:
     return {}
   except OSError as error:
     raise CheckpointError(f"{folder} cannot be read: {error.strerror}.") from error
-
-
-def _set_aside(folder: Path) -> Path:
-  """Renames a damaged checkpoint to `damaged_<step>`, numbered if an earlier one has the name."""
-  aside, number = folder.with_name(f"damaged_{folder.name}"), 1
-  while aside.exists():
-    number += 1
-    aside = folder.with_name(f"damaged_{folder.name}_{number}")
-  return folder.rename(aside)
 
 
 def _linked(best: Path) -> Path:

@@ -147,11 +147,12 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
     self._noise_for = env.episode_length
 
   def init(self, key: jax.Array, policy: Policy | None) -> FastTD3State:
-    params = self.networks.init(key) if policy is None else policy.params
+    policy = policy or self.new_policy(key)
+    params = policy.params
     return FastTD3State(
       params=params,
       opt_state=tuple(self.optimizer.init(ravel_pytree(part)[0]) for part in (params.policy, params.q)),
-      normalizer=self.networks.init_normalizer() if policy is None else policy.normalizer,
+      normalizer=policy.normalizer,
       replay=self.buffer.init(self.config.num_envs // jax.lax.axis_size(AXIS)),
       target_q=params.q,
     )

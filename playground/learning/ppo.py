@@ -92,11 +92,10 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     self.losses = LOSSES + (ESTIMATION,) * bool(networks.estimated_obs_key) + (KL,) * self.bounds_kl
 
   def init(self, key: jax.Array, policy: Policy | None) -> PPOState:
-    params = self.networks.init(key) if policy is None else policy.params
-    normalizer = self.networks.init_normalizer() if policy is None else policy.normalizer
-    opt_state = self.optimizer.init(ravel_pytree(params)[0])
+    policy = policy or self.new_policy(key)
+    opt_state = self.optimizer.init(ravel_pytree(policy.params)[0])
     seen = jnp.zeros(3) if self.config.normalize_value_targets else None
-    return PPOState(params=params, opt_state=opt_state, normalizer=normalizer, targets_seen=seen)
+    return PPOState(params=policy.params, opt_state=opt_state, normalizer=policy.normalizer, targets_seen=seen)
 
   def train_step(self, state: PPOState, envs: Environments, key: jax.Array) -> tuple[PPOState, Environments, Metrics]:
     config, networks = self.config, self.networks

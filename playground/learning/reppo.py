@@ -162,11 +162,9 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
     self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
 
   def init(self, key: jax.Array, policy: Policy | None) -> AlgorithmState:
-    params = self.networks.init(key) if policy is None else policy.params
-    normalizer = self.networks.init_normalizer() if policy is None else policy.normalizer
-    actor, critic = _split(params)
-    opt_state = tuple(self.optimizer.init(ravel_pytree(part)[0]) for part in (actor, critic))
-    return AlgorithmState(params=params, opt_state=opt_state, normalizer=normalizer)
+    policy = policy or self.new_policy(key)
+    opt_state = tuple(self.optimizer.init(ravel_pytree(part)[0]) for part in _split(policy.params))
+    return AlgorithmState(params=policy.params, opt_state=opt_state, normalizer=policy.normalizer)
 
   def train_step(
     self, state: AlgorithmState, envs: Environments, key: jax.Array

@@ -71,13 +71,13 @@ class SAC(Algorithm[SACConfig, SoftActorCritic, SACState]):
     self.buffer, self.optimizer = buffer, optax.scale_by_adam()
 
   def init(self, key: jax.Array, policy: Policy | None) -> SACState:
-    params = self.networks.init(key) if policy is None else policy.params
+    policy = policy or self.new_policy(key)
     return SACState(
-      params=params,
-      opt_state=self.optimizer.init(ravel_pytree(params)[0]),
-      normalizer=self.networks.init_normalizer() if policy is None else policy.normalizer,
+      params=policy.params,
+      opt_state=self.optimizer.init(ravel_pytree(policy.params)[0]),
+      normalizer=policy.normalizer,
       replay=self.buffer.init(self.config.num_envs // jax.lax.axis_size(AXIS)),
-      target_q=params.q,
+      target_q=policy.params.q,
     )
 
   def train_step(self, state: SACState, envs: Environments, key: jax.Array) -> tuple[SACState, Environments, Metrics]:

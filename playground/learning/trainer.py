@@ -91,8 +91,7 @@ class Trainer:
 
   def policy_shape(self) -> Policy:
     """Returns a policy's structure, shapes and dtypes, to read one from a checkpoint; no environment is traced."""
-    make = lambda: Policy(self.networks.init(jax.random.PRNGKey(0)), self.networks.init_normalizer())
-    return jax.eval_shape(make)
+    return jax.eval_shape(self.algorithm.new_policy, jax.random.PRNGKey(0))
 
   def place_policy(self, policy: Policy) -> Policy:
     """Puts a policy's host arrays on every device."""

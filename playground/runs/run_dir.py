@@ -2,7 +2,6 @@
 
 import contextlib
 import datetime
-import itertools
 import os
 import socket
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,10 +12,10 @@ from typing import Literal, get_args
 import yaml
 
 from playground.errors import CheckpointError, PlaygroundError, nearest
-from playground.files import lock_holder, locking, plain, read_json, write_json, write_text
+from playground.files import lock_holder, locking, numbered, read_json, write_json, write_text
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
-from playground.settings import Plain, Section
+from playground.settings import Plain, Section, plain
 
 _RETURNS = ("final_return", "final_sampled_return", "final_mode_return", "best_return")
 _NUMBERS_OF_SUMMARY = (*_RETURNS, "best_step", "steps", "steps_per_second", "wall_clock_s")
@@ -256,12 +255,11 @@ def _writing(path: Path) -> Iterator[None]:
 def _make_new(path: Path) -> Path:
   """Makes a folder that was not there before; making it is the claim, so no two processes get the same."""
   path.parent.mkdir(parents=True, exist_ok=True)
-  for number in itertools.count(1):
-    folder = path if number == 1 else path.with_name(f"{path.name}_{number}")
+  while True:
+    folder = numbered(path)
     with contextlib.suppress(FileExistsError):
       folder.mkdir()
       return folder
-  raise AssertionError("unreachable")
 
 
 def _now() -> str:

@@ -10,6 +10,7 @@ from playground import config as configs
 from playground.config import RunConfig
 from playground.config.sweep_options import GridConfig, SweepSettings
 from playground.errors import ConfigError
+from playground.files import numbered
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.runner import launcher_class
 
@@ -59,7 +60,8 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
   if found is not None:
     return found, chosen
   launcher_class(chosen.launcher).check(chosen.launcher, jobs)
-  path = chosen.sweep_dir or _new(ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
+  started = ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"  # maybe that of another sweep, too
+  path = chosen.sweep_dir or numbered(started)
   settings = [line for line in settings if not line.startswith("sweep_dir=")]
   return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen
 
@@ -112,15 +114,6 @@ def _find(path: str | None, name: str, lines: Sequence[str], jobs: Sequence[Job]
 def _same(sweep: SweepDirectory, lines: Sequence[str], jobs: Sequence[Job]) -> bool:
   ours = [job.overrides for job in jobs]
   return sweep.lines == list(lines) and (not jobs or [job.overrides for job in sweep.jobs] == ours)
-
-
-def _new(path: Path) -> Path:
-  """A folder that is not there yet: two sweeps may be started in the same second."""
-  number, folder = 1, path
-  while folder.exists():
-    number += 1
-    folder = path.with_name(f"{path.name}_{number}")
-  return folder
 
 
 def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> SweepSettings:

@@ -22,9 +22,9 @@ class Reinforce(Algorithm[ReinforceConfig, ActorCritic, AlgorithmState]):
     self.optimizer = optax.adam(config.learning_rate)
 
   def init(self, key: jax.Array, policy: Policy | None) -> AlgorithmState:
-    params = self.networks.init(key) if policy is None else policy.params
-    normalizer = self.networks.init_normalizer() if policy is None else policy.normalizer
-    return AlgorithmState(params=params, opt_state=self.optimizer.init(ravel_pytree(params)[0]), normalizer=normalizer)
+    policy = policy or self.new_policy(key)
+    opt_state = self.optimizer.init(ravel_pytree(policy.params)[0])
+    return AlgorithmState(params=policy.params, opt_state=opt_state, normalizer=policy.normalizer)
 
   def train_step(
     self, state: AlgorithmState, envs: Environments, key: jax.Array
