@@ -204,7 +204,7 @@ def unroll(
     after, truncation = envs.state, envs.state.info["truncation"]
     final_value = None
     if value is not None:
-      final = lambda obs: value(normalize(networks.select(obs), normalizer)) * truncation
+      final = lambda obs, value=value: value(normalize(networks.select(obs), normalizer)) * truncation
       final_value = jax.lax.cond(truncation.any(), final, lambda _: jnp.zeros_like(truncation), final_obs)
     transitions = Transitions(
       obs=obs,
