@@ -38,7 +38,7 @@ def show_keys(prefix: str, overrides: Sequence[str]) -> int:
   """
   config = compose([text for text in overrides if not is_of_sweep(text.partition("=")[0])])
   sweeps = compose_settings([text for text in overrides if is_of_sweep(text.partition("=")[0])])
-  values = {**config.resolved, **sweeps.to_dict()}
+  values = {**config.resolved, **sweeps.resolved}
   roots = config_roots()
   console = Console()
   console = console if console.is_terminal else Console(width=_WIDE)

@@ -117,9 +117,9 @@ def compose_settings(overrides: Sequence[str], config_dir: Path | None = None) -
   config, _ = _hydra(group_overrides(parsed), roots, "sweep")
   resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], _plain(config))
   check_limits(resolved)
-  chosen = {key: resolved.pop(key) for key in ("launcher", "search")}
-  classes = {key: defined()[key][section.pop("name")] for key, section in chosen.items()}
-  return SweepSettings(**resolved, **{key: build(classes[key], chosen[key]) for key in chosen})
+  chosen = {key: resolved[key] for key in ("launcher", "search")}
+  sections = {key: build(defined()[key][section["name"]], section) for key, section in chosen.items()}
+  return SweepSettings(**resolved | sections, resolved=resolved)
 
 
 def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Sequence[Path]) -> RunConfig:

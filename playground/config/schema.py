@@ -1,7 +1,7 @@
 """Keys that exist and the types of their values. The schema is a nested dict of default values."""
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from playground.config.definitions import definition
 from playground.config.files import DELTAS
@@ -80,7 +80,7 @@ def fit(value: Plain, default: Plain, names: Mapping[str, object], key: str = ""
   if not _fits(value, default):
     allowed = _KINDS.get(type(default), "a mapping")
     raise wrong_type(key, value, f"{allowed}, as its default {format_value(default)} is")
-  kind: Callable[[Plain], Plain] = type(default)
+  kind: Plain = type(default)
   return kind(value) if isinstance(default, int | float) else value
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 from playground.limits import SEED, at_least_0, count, positive
+from playground.settings import Section
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -107,7 +108,8 @@ class SweepConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SweepSettings(SweepConfig):
-  """All that a sweep is told of itself."""
+  """All that a sweep is told of itself; `resolved` holds it as plain dicts, lists and scalars."""
 
   launcher: LauncherConfig
   search: GridConfig | OptunaConfig
+  resolved: Section

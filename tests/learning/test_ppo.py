@@ -38,7 +38,7 @@ def test_a_bad_gradient_is_left_out() -> None:
 @pytest.mark.parametrize(
   ("change", "words"),
   [
-    ({"num_envs": 24}, ["agent.num_envs=24", "multiple", "32"]),
+    ({"num_envs": 24}, ["agent.num_envs=24", "does not divide", "= 32"]),
     ({"num_eval_envs": 15}, ["agent.num_eval_envs=15", "devices, 2"]),
   ],
 )
