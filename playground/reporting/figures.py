@@ -71,9 +71,9 @@ def curves(panels: Mapping[str, Mapping[str, Curve]], x: str, y: str, kind: str 
 
   def draw(figure: Any) -> None:
     cells = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, (title, group) in zip(cells, panels.items(), strict=False):
+    for (title, group), axes in zip(panels.items(), cells, strict=False):
       for colour, (name, curve) in zip(COLOURS * len(group), group.items(), strict=False):
-        axes.plot(curve.x, curve.y, label=name, color=colour)
+        axes.plot(curve.x, curve.y, label=name, color=colour, marker="o" if len(curve.x) == 1 else "")
         if curve.half_width is not None:
           low, high = zip(*((m - h, m + h) for m, h in zip(curve.y, curve.half_width, strict=True)), strict=True)
           axes.fill_between(curve.x, low, high, color=colour, alpha=0.2, linewidth=0)

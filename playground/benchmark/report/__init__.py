@@ -7,6 +7,7 @@ from playground.benchmark.arguments import option
 from playground.benchmark.report import sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.pixels import pixels
+from playground.benchmark.report.public import beside_public
 from playground.errors import ConfigError
 from playground.files import need_folder, write_text
 from playground.reporting.page import Block, Heading, Picture, Text, to_html, to_markdown
@@ -16,7 +17,7 @@ PICTURES = "report_pictures"
 TITLE = "Measured"
 SECTIONS = (
   *(sections.throughput, sections.compared, sections.startup, sections.scaling),
-  *(sections.topology, sections.breakdown, pixels, sections.chains, sections.returns),
+  *(sections.topology, sections.breakdown, pixels, sections.chains, sections.returns, beside_public),
 )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from playground.benchmark.schema import COLUMNS, QUANTITIES
 from playground.errors import ConfigError
 from playground.reporting.page import mean_and_ci95
+from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
 
 # Tables measured before `playground-bench`: their words for what a row's quantity is, and their columns.
 _WORDS = {
@@ -49,11 +50,13 @@ class Evidence:
     self.files: list[Path] = []  # those that something was found in
     self.rows: list[Row] = []
     self.curves: dict[str, list[tuple[float, float]]] = {}
+    self.mode_curves: dict[str, list[tuple[float, float]]] = {}  # of the policy's mode, where `curves` is of samples
     for path in (path for folder in folders for path in sorted(folder.rglob("*.csv"))):
       lines = _read(path)
-      rows, curves = list(_rows(path, lines)), _curves(path, lines)
+      rows, curves = list(_rows(path, lines)), _curves(path, lines, RETURN)
       self.rows += rows
       self.curves |= curves
+      self.mode_curves |= _curves(path, lines, OTHER_RETURNS["mode"])
       self.files += [path] * bool(rows or curves)
     self.rows = _once(self.rows)
 
@@ -159,15 +162,15 @@ def _row(path: Path, line: dict[str, str], quantity: str, value: float) -> Row:
   return row
 
 
-def _curves(path: Path, lines: Sequence[dict[str, str]]) -> dict[str, list[tuple[float, float]]]:
-  """Learning curves of a file, (steps, return) by name: one a run, where it says which."""
+def _curves(path: Path, lines: Sequence[dict[str, str]], column: str) -> dict[str, list[tuple[float, float]]]:
+  """Learning curves of a file, (steps, return in `column`) by name: one a run, where it says which."""
   curves: dict[str, list[tuple[float, float]]] = {}
   if (path.parent.parent / "config.yaml").is_file():  # a stage of a chain, whose own curve has it
     return curves
-  if lines and {"step", "eval/episode_reward"} <= set(lines[0]):
+  if lines and {"step", column} <= set(lines[0]):
     name = path.parent.name if path.stem == "metrics" else path.stem.removeprefix("curve_")
     for line in lines:
-      if line["eval/episode_reward"]:
-        point = _number(path, line["step"]), _number(path, line["eval/episode_reward"])
+      if line[column]:
+        point = _number(path, line["step"]), _number(path, line[column])
         curves.setdefault(line.get("run") or name, []).append(point)
   return curves

@@ -302,10 +302,13 @@ def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     yield Table(["task", "agent", "who", "setting", "return of each run", "backend", "device", "note"], sorted(rows))
 
 
-def runs_by_step(evidence: Evidence) -> dict[str, dict[str, list[tuple[float, float]]]]:
-  """Curves from the rows `return`, whose setting ends in `step=`; a task's runs are named by what they differ in."""
+def runs_by_step(evidence: Evidence, quantity: str = "return") -> dict[str, dict[str, list[tuple[float, float]]]]:
+  """Curves from the rows of evaluations, whose setting ends in `step=`; a task's runs are named by what they differ in.
+
+  `quantity` is `return` or `mode_return`.
+  """
   tasks: dict[str, dict[tuple[str, ...], dict[float, float]]] = {}
-  for figure in evidence.find(quantity="return"):
+  for figure in evidence.find(quantity=quantity):
     setting, by_step, step = figure["setting"].rpartition("step=")
     if by_step:
       run = (figure["who"], figure["agent"], figure["device"], *setting.split())

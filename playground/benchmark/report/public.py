@@ -1,0 +1,177 @@
+"""Our learning curves over those of public repositories (`benchmarks/public/`), tasks where we are below first."""
+
+import csv
+import dataclasses
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from itertools import groupby, pairwise
+
+from playground.benchmark.report.evidence import Evidence
+from playground.benchmark.report.sections import Notes, runs_by_step
+from playground.config.files import shipped, task_names
+from playground.paper import tasks_of
+from playground.reporting import figures
+from playground.reporting.page import Block, Heading, Picture, Table, Text
+
+Points = list[tuple[float, float]]  # (environment steps, return), steps ascending
+SHARE = 0.95  # of the best public PPO at equal steps: below it a task counts as below
+_AS_SET = "as set"
+_AGENT = re.compile(r"(?<![a-z])(sac|reppo|fast_td3)(?![a-z])")
+_OTHER_EPISODES = "kengz/SLM-Lab"  # whose manipulation tasks have episodes of other lengths
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+  """A learning curve and what it was measured under.
+
+  Attributes:
+    label: the run, or algorithm and repository.
+    actions: sampled or mode.
+    points: (environment steps, return), steps ascending.
+  """
+
+  label: str
+  actions: str
+  points: Points
+
+
+def beside_public(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """For each task our best run over public curves, and a table that begins with those where we are below."""
+  ours, theirs = our_best(evidence), public_curves()
+  shared = sorted(set(ours) & set(theirs))
+  if not shared:
+    return
+  yield Heading(2, "Beside public curves")
+  yield Text(
+    "Our best run of each task and algorithm over what public repositories report (`benchmarks/public/`). `At equal "
+    "steps` is the best public PPO there, read between its points and never beyond our last step; our PPO is below "
+    f"where it has under {SHARE:.0%} of that. Policies act as `our actions` and the public names say (as set: as the "
+    "run's agent.deterministic_eval says, sampled by default). Public settings stand below the table, ours are in the "
+    "run's name."
+  )
+  panels = {task: _panel(ours[task], theirs[task]) for task in shared}
+  drawn = figures.curves(panels, "million control steps", "return").decode()
+  yield Picture("public", drawn, "Our curves over public ones, of each public algorithm the one that ends highest.")
+  compared = [_compared(task, curve, theirs[task]) for task in shared for curve in ours[task]]
+  rows = [row.cells() for row in sorted(compared, key=lambda row: (-row.below, row.ratio))]
+  header = ["task", "our run", "our actions", "ours", "million steps", "best public PPO at equal steps", "of it", ""]
+  yield Table([*header, "best public at its end"], rows)
+  settings = [list(row.values()) for row in _read("settings")]
+  yield Table(["repository", "pushes", "randomisation", "actions", "note"], settings)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Comparison:
+  task: str
+  curve: Curve
+  equal: tuple[float, str] | None
+  best: tuple[float, str]
+
+  @property
+  def score(self) -> float:
+    return self.curve.points[-1][1]
+
+  @property
+  def below(self) -> bool:
+    return (
+      self.equal is not None
+      and _agent_of(self.curve.label) == "ppo"
+      and self.score < self.equal[0] - (1 - SHARE) * abs(self.equal[0])
+    )
+
+  @property
+  def ratio(self) -> float:
+    """Ours over theirs; infinite where they have nothing to divide by."""
+    return self.score / self.equal[0] if self.equal and self.equal[0] > 0 else math.inf
+
+  def cells(self) -> list[str]:
+    told = lambda found: f"{found[0]:,.1f} ({found[1]})" if found else "none so early"
+    share = f"{self.ratio:.2f}" if math.isfinite(self.ratio) else ""
+    steps = f"{self.curve.points[-1][0] / 1e6:,.0f}"
+    own = [self.task, self.curve.label, self.curve.actions, f"{self.score:,.1f}", steps]
+    return [*own, told(self.equal), share, "below" * self.below, told(self.best)]
+
+
+def _compared(task: str, curve: Curve, theirs: Sequence[Curve]) -> _Comparison:
+  steps = curve.points[-1][0]
+  ppo = [(value, c.label) for c in theirs if "PPO" in c.label and (value := at(c.points, steps)) is not None]
+  ends = [(c.points[-1][1], c.label) for c in theirs]
+  return _Comparison(task, curve, max(ppo, default=None), max(ends))
+
+
+def at(points: Points, steps: float) -> float | None:
+  """The return of a curve at `steps`: linear between its points, the last one beyond its end, None before it began."""
+  if steps < points[0][0]:
+    return None
+  for (x0, y0), (x1, y1) in pairwise(points):
+    if steps < x1:
+      return y0 + (y1 - y0) * (steps - x0) / (x1 - x0)
+  return points[-1][1]
+
+
+def our_best(evidence: Evidence) -> dict[str, list[Curve]]:
+  """By task the curves that end highest, one for each algorithm and way to act."""
+  found: dict[str, list[Curve]] = {}
+  for actions, curves in ((_AS_SET, evidence.curves), ("mode", evidence.mode_curves)):
+    for name, points in curves.items():
+      if (task := _task_of(name)) is not None:
+        found.setdefault(task, []).append(
+          Curve(f"ours: {name.removeprefix(task).strip('_') or 'run'}", actions, points)
+        )
+  for actions, quantity in ((_AS_SET, "return"), ("mode", "mode_return")):
+    for task, runs in runs_by_step(evidence, quantity).items():
+      found.setdefault(task, []).extend(
+        Curve(f"ours: {name}", actions, points) for name, points in runs.items() if not name.startswith("playground")
+      )
+  best: dict[str, dict[tuple[str, str], Curve]] = {}
+  for task, curves in found.items():
+    ascending = [dataclasses.replace(curve, points=sorted(curve.points)) for curve in curves]
+    for curve in sorted(ascending, key=lambda curve: curve.points[-1][1]):
+      best.setdefault(task, {})[_agent_of(curve.label), curve.actions] = curve  # the highest is the last
+  return {task: list(curves.values()) for task, curves in best.items()}
+
+
+def _agent_of(label: str) -> str:
+  """The algorithm that a run's name has, PPO if none."""
+  found = _AGENT.search(label)
+  return found.group() if found else "ppo"
+
+
+@cache
+def public_curves() -> dict[str, list[Curve]]:
+  """The public curves by task, one for each algorithm of a repository; episodes of other lengths are left out."""
+  settings = {row["repository"]: row for row in _read("settings")}
+  manipulation = {*tasks_of("manipulation")}
+  curves: dict[str, list[Curve]] = {}
+  key = lambda row: (row["task"], row["algorithm"], row["source"].partition("@")[0])
+  for (task, algorithm, repository), rows in groupby(sorted(_read("returns"), key=key), key=key):
+    if repository == _OTHER_EPISODES and task in manipulation:
+      continue
+    points = sorted((float(row["env_steps"]), float(row["return_mean"])) for row in rows)
+    label = f"{algorithm}, {settings[repository]['actions']}"
+    curves.setdefault(task, []).append(Curve(label, settings[repository]["actions"], points))
+  return curves
+
+
+def _task_of(name: str) -> str | None:
+  """The task that a curve's name begins with."""
+  return max((task for task in task_names() if name == task or name.startswith(f"{task}_")), key=len, default=None)
+
+
+def _panel(ours: Sequence[Curve], theirs: Sequence[Curve]) -> dict[str, figures.Curve]:
+  """A task's curves by short names, ours first."""
+  named = {f"our {_agent_of(curve.label)}{', mode' * (curve.actions == 'mode')}": curve.points for curve in ours}
+  for curve in sorted(theirs, key=lambda curve: curve.points[-1][1]):
+    named[re.split(r"[ ,(]", curve.label)[0]] = curve.points  # the highest is the last
+  return {
+    name: figures.Curve([step / 1e6 for step, _ in points], [value for _, value in points])
+    for name, points in named.items()
+  }
+
+
+@cache
+def _read(name: str) -> Sequence[Mapping[str, str]]:
+  with (shipped("benchmarks") / "public" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+    return list(csv.DictReader(file))
