@@ -1,4 +1,4 @@
-"""`playground-bench report`: one page from everything that was measured."""
+"""`playground-bench report`: one page from everything that was measured, and the tables of the result pages."""
 
 import dataclasses
 from pathlib import Path
@@ -8,6 +8,7 @@ from playground.benchmark.report import sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.pixels import pixels
 from playground.benchmark.report.public import beside_public
+from playground.benchmark.report.suites import write_pages
 from playground.errors import ConfigError
 from playground.files import need_folder, write_text
 from playground.reporting.page import Block, Heading, Picture, Text, to_html, to_markdown
@@ -27,6 +28,7 @@ class Options:
 
   out: str = option("results/benchmarks", "folder of the page")
   rows: tuple[str, ...] = option(ROWS, "folders whose CSVs it is made of")
+  pages: str | None = option(None, "instead: folder of the result pages (docs) whose tables of runs to write anew")
 
 
 def run(options: Options) -> int:
@@ -35,6 +37,10 @@ def run(options: Options) -> int:
   Raises:
     ConfigError: no rows anywhere, a file of them that is damaged, or a folder that cannot be read or written.
   """
+  if options.pages is not None:
+    pages = write_pages(Path(options.pages).expanduser(), Path(ROWS[0]))
+    print(f"written: {', '.join(map(str, pages))}")
+    return 0
   out = Path(options.out).expanduser()
   need_folder(out, f"out={options.out}")
   for folder in options.rows:

@@ -1,0 +1,108 @@
+"""The tables of the result pages: training runs of a suite from results/reference/, what is not learnt first.
+
+A page is written by hand but for what stands between two comments, which `playground-bench report pages=docs` replaces.
+"""
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from playground.catalog import entries
+from playground.errors import ConfigError
+from playground.files import write_text
+from playground.reporting.page import Block, Heading, Table, to_markdown
+
+PAGES = {  # page -> the tables that it shows
+  "results-dm-control.md": ("dm_control",),
+  "results-locomotion.md": ("locomotion",),
+  "results-manipulation.md": ("manipulation", "vision"),
+}
+BEGIN, END = "<!-- runs: written by `playground-bench report pages=docs` -->", "<!-- end of runs -->"
+_TITLES = {"open": "Not learnt yet", "learning": "Learning", "solved": "Solved"}
+# What a row says in columns of its own.
+_BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env=\w+| \(learning\)")
+_SHORT = {"agent.": "", "curriculum.": ""}
+_COLUMNS, _FIGURE = ("task", "run", "physics", "M steps", "return"), "success or falls"
+_LONG = 60  # characters of a setting
+Row = dict[str, str]
+
+
+def write_pages(pages: Path, reference: Path) -> list[Path]:
+  """Writes the tables into the pages of a folder.
+
+  Args:
+    pages: the folder, such as docs.
+    reference: the folder of the tables.
+
+  Returns:
+    The pages.
+
+  Raises:
+    ConfigError: a page or a table is missing, or a page has no place for its table.
+  """
+  written = []
+  for name, tables in PAGES.items():
+    path = pages / name
+    try:
+      text = path.read_text(encoding="utf-8")
+      rows = [row for table in tables for row in _read(reference / f"{table}.csv")]
+    except FileNotFoundError as error:
+      raise ConfigError(f"pages={pages}: {error.filename} does not exist.") from None
+    if BEGIN not in text or END not in text:
+      raise ConfigError(f"pages={pages}: {path} lacks the line {BEGIN} or {END}.")
+    before, after = text.split(BEGIN)[0], text.split(END)[1]
+    write_text(path, f"{before}{BEGIN}\n\n{to_markdown(list(_blocks(rows)), '')}\n{END}{after}")
+    written.append(path)
+  return written
+
+
+def _read(path: Path) -> list[Row]:
+  with path.open(encoding="utf-8", newline="") as file:
+    return list(csv.DictReader(file))
+
+
+def _blocks(rows: Sequence[Row]) -> Iterator[Block]:
+  """A table for each status; runs that differ only in seed or repetition share a row."""
+  known = entries()
+  for status, title in _TITLES.items():
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+      if known[row["task"]].status == status:
+        groups.setdefault((row["task"], *_run(row)), []).append(row)
+    if groups:
+      cells = [_cells(key, runs) for key, runs in sorted(groups.items(), key=lambda group: group[0][0])]
+      columns = [*_COLUMNS, *([_FIGURE] if any(row[-1] for row in cells) else [])]
+      yield Heading(2, title)
+      yield Table(columns, [row[: len(columns)] for row in cells])
+
+
+def _run(row: Row) -> tuple[str, str, str]:
+  """Who and what trained, the backend, and millions of steps."""
+  if (who := row.get("who") or "ours") != "ours":
+    return who, row["backend"], _millions(row)
+  setting = " ".join(_BUDGET.sub("", f"{row.get('agent') or 'ppo'} {row.get('setting') or ''}").split())
+  for long, short in _SHORT.items():
+    setting = setting.replace(long, short)
+  if row.get("experiment", "").endswith("_chain"):
+    setting = f"{row['experiment']} {setting.removeprefix('ppo ')}"
+  setting = setting if len(setting) <= _LONG else f"{setting[: setting.rindex(' ', 0, _LONG)]} …"
+  return setting.replace("ppo agent=", ""), row["backend"], _millions(row)
+
+
+def _millions(row: Row) -> str:
+  return f"{float(row['steps']) / 1e6:.3g}"
+
+
+def _cells(key: tuple[str, ...], runs: Sequence[Row]) -> list[str]:
+  returns = ", ".join(f"{float(row['final_return']):.4g}" for row in runs)
+  return [*key, returns, next(filter(None, map(_figure, reversed(runs))), "")]
+
+
+def _figure(row: Row) -> str:
+  """The share of successes, the turns of a cube or the falls an episode; "" where the run logged none."""
+  if row.get("success"):
+    return f"success {float(row['success']):.2f}"
+  if row.get("turns"):
+    return f"{float(row['turns']):.1f} turns"
+  return f"{float(row['falls_per_episode']):.2f} falls" if row.get("falls_per_episode") else ""
