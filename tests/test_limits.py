@@ -10,8 +10,8 @@ import yaml
 
 from playground.config import compose, compose_settings, config_roots, override_section
 from playground.config.definitions import RunSettings, defined, definition
-from playground.config.limits import _OF_TERMS as OF_TERMS
 from playground.config.limits import limit_of
+from playground.config.schema import is_of_terms
 from playground.config.sweep_options import SweepConfig
 from playground.envs.options import VisionConfig
 from playground.errors import ConfigError
@@ -45,7 +45,7 @@ def test_every_number_of_a_file_has_limits() -> None:
     for key, value in leaves(yaml.safe_load(path.read_text()) or {}, section) if path.suffix == ".yaml" else ():
       setting = definition(key, {})
       text = setting is not None and setting.text_depth is not None
-      if takes_a_number(value) and not OF_TERMS.match(key) and not text and not limit_of(key, {}):
+      if takes_a_number(value) and not is_of_terms(key) and not text and not limit_of(key, {}):
         missing.append(f"{path.name}: {key}={value}")
   assert not missing, "give these a limit in playground/envs/options.py, or say text there"
 

@@ -63,14 +63,12 @@ from playground.config.sweep_options import SweepSettings
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.learning.hyperparameters import config_class
-from playground.mdp.options import OPTIONS
 from playground.pretrained import locate
 from playground.settings import Plain, Section, build, defaults
 from playground.text import first_line, join
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that say which keys a run has, in this order
-_BY_NAME = tuple(OPTIONS)  # mappings whose keys are a task's choice
 _CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
@@ -177,8 +175,7 @@ def from_saved(resolved: Section, config_dir: Path | None = None) -> RunConfig:
   ]
   today = _plain(_hydra(chosen, roots)[0])
   filled = {
-    section: _fit_known(_fill(saved.resolved[section], today[section]), today[section], section, chosen_names(today))
-    for section in SECTIONS
+    section: _fit_saved(saved.resolved[section], today[section], section, chosen_names(today)) for section in SECTIONS
   }
   check_limits(filled)
   hardware = filled["hardware"]  # what only a command line says, see `is_of_command`
@@ -193,27 +190,20 @@ def saved_section(section: str, saved: Section, default: Section) -> dict[str, P
   Raises:
     ConfigError: a value of another type than its default, or one that cannot work.
   """
-  fitted = _fit_known(_fill(saved, default), default, section, {})
+  fitted = _fit_saved(saved, default, section, {})
   check_limits({section: fitted})
   return fitted
 
 
-def _fit_known(value: object, default: object, key: str, names: Mapping[str, object]) -> Plain:
-  """As `fit`, but keys that the default lacks are left as they are."""
-  if not (isinstance(default, Mapping) and default and isinstance(value, Mapping)) or is_terms(key):
-    return fit(value, default, names, key)
-  known = {name: _fit_known(value[name], default[name], join(key, name), names) for name in default if name in value}
-  return {**value, **known}
-
-
-def _fill(saved: Section, default: Section) -> dict[str, Plain]:
-  filled = dict(saved)
-  for key, value in default.items():
-    if key not in saved:
-      filled[key] = value
-    elif isinstance(value, Mapping) and isinstance(saved[key], Mapping) and key not in _BY_NAME:
-      filled[key] = _fill(saved[key], value)
-  return filled
+def _fit_saved(saved: Plain, default: Plain, key: str, names: Mapping[str, object]) -> Plain:
+  """As `fit`, but keys that only the default has are taken from it, and keys that it lacks are left as they are."""
+  if not (isinstance(default, Mapping) and default and isinstance(saved, Mapping)) or is_terms(key):
+    return fit(saved, default, names, key)
+  fitted = {
+    name: _fit_saved(saved[name], value, join(key, name), names) if name in saved else value
+    for name, value in default.items()
+  }
+  return {**saved, **fitted}
 
 
 class _Files(NamedTuple):

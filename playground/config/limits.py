@@ -6,17 +6,15 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 
 from playground.config.definitions import chosen_names, definition
-from playground.config.schema import wrong_type
+from playground.config.schema import is_of_terms, wrong_type
 from playground.envs.options import NUMBERS, sees
 from playground.errors import ConfigError, nearest
 from playground.limits import Limit
-from playground.mdp.options import OPTIONS
 from playground.settings import Plain, Section
 from playground.text import format_value, join
 
 _XLA_SWITCH = re.compile(r"--xla_\w+(=(true|false|-?\d+(\.\d+)?))?")
 _XLA_PLACES = ("dir", "path", "file", "dump", "load", "cache", "option", "override", "_to", "_from")  # in flags' names
-_OF_TERMS = re.compile(rf"env\.({'|'.join(OPTIONS)})\.")  # checked when a task binds them (playground/mdp/terms.py)
 _NESTED = ("text (put quotes around a number)", "a list of texts", "a list of lists of texts")
 
 
@@ -28,7 +26,7 @@ def check_limits(resolved: Section) -> None:
   """
   names = chosen_names(resolved)
   for key, value in _leaves(resolved):
-    if value is not None and not _OF_TERMS.match(key):
+    if value is not None and not is_of_terms(key):
       _check(key, value, names)
   _check_xla_flags(resolved.get("hardware", {}).get("xla_flags"))
   env = resolved.get("env", {})

@@ -11,9 +11,9 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from playground.config.files import DELTAS, config_roots, groups, listed_options, options
+from playground.config.schema import is_of_terms
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.learning.hyperparameters import ELSEWHERE
-from playground.mdp.options import OPTIONS
 from playground.settings import Section
 from playground.text import format_value, quoted
 
@@ -126,12 +126,6 @@ def canonical(overrides: Iterable[Override], resolved: Section) -> list[str]:
     else:
       lines.append(f"{adds}{override.text.lstrip('+')}")
   return lines
-
-
-def is_of_terms(key: str) -> bool:
-  """Whether a dotted key is in a mapping of terms (`env.rewards`, ...), which may have entries of any name."""
-  parts = key.split(".")
-  return len(parts) > 2 and parts[0] == "env" and parts[1] in OPTIONS
 
 
 def _check_option(group: str, option: object, roots: Sequence[Path]) -> None:

@@ -36,7 +36,7 @@ def is_open(parts: Sequence[str], schema: Section) -> bool:
   Raises:
     UnknownNameError: a term has no such key.
   """
-  if len(parts) < 3 or parts[0] != "env" or parts[1] not in OPTIONS or parts[1] not in schema.get("env", {}):
+  if not is_of_terms(".".join(parts)) or parts[1] not in schema.get("env", {}):
     return False
   name = 3 if parts[1] == "observations" else 2  # observations are in groups
   if len(parts) > name + 1 and parts[name + 1] not in keys(parts[1]):
@@ -44,6 +44,12 @@ def is_open(parts: Sequence[str], schema: Section) -> bool:
     has = f"a term of env.{parts[1]} has {', '.join(keys(parts[1]))}"
     raise UnknownNameError(f"{'.'.join(parts)} does not exist: {has}.{near}")
   return True
+
+
+def is_of_terms(key: str) -> bool:
+  """Whether a dotted key is in a mapping of terms (`env.rewards`, ...), which may have entries of any name."""
+  parts = key.split(".")
+  return len(parts) > 2 and parts[0] == "env" and parts[1] in OPTIONS
 
 
 def is_terms(key: str) -> bool:

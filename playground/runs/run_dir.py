@@ -27,6 +27,13 @@ class RunDirectory:
 
   def __init__(self, path: str | Path):
     self.path = Path(os.path.expanduser(path))
+    self.config_path = self.path / "config.yaml"
+    self.overrides_path = self.path / "overrides.yaml"
+    self.metrics_csv = self.path / "metrics.csv"
+    self.checkpoints = self.path / "checkpoints"
+    self.videos = self.path / "videos"
+    self.plots = self.path / "plots"
+    self.nan_dump = self.path / "nan_dump"
     self._locked = False
 
   @classmethod
@@ -101,34 +108,6 @@ class RunDirectory:
         f"run_dir={self.path} already holds a run: give resume={self.path} to continue it, or another run_dir= "
         f"(with init_from={self.path} to start anew from its weights)."
       )
-
-  @property
-  def config_path(self) -> Path:
-    return self.path / "config.yaml"
-
-  @property
-  def overrides_path(self) -> Path:
-    return self.path / "overrides.yaml"
-
-  @property
-  def metrics_csv(self) -> Path:
-    return self.path / "metrics.csv"
-
-  @property
-  def checkpoints(self) -> Path:
-    return self.path / "checkpoints"
-
-  @property
-  def videos(self) -> Path:
-    return self.path / "videos"
-
-  @property
-  def plots(self) -> Path:
-    return self.path / "plots"
-
-  @property
-  def nan_dump(self) -> Path:
-    return self.path / "nan_dump"
 
   @property
   def config(self) -> dict[str, Plain]:
