@@ -1,4 +1,4 @@
-"""From command line to configuration: finds configs/, composes them with Hydra, checks them, hands out ConfigDicts.
+"""From command line to configuration: finds configs/, composes them with Hydra, checks them, hands out typed sections.
 
 The only place that knows OmegaConf. Nothing here needs JAX, so that a mistake is reported at once.
 
