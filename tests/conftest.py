@@ -16,7 +16,8 @@ import pytest
 from playground.config import composition, config_roots
 
 EMPTY = 1e9  # bytes that a worker holds with everything imported
-GROWTH = 1.5e9  # bytes by which it may grow before JAX forgets what it has traced and compiled
+MEMORY = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+GROWTH = max(1.5e9, MEMORY / 8)  # bytes by which it may grow before JAX forgets what it has traced and compiled
 
 # JAX makes millions of objects that stay: at Python's own thresholds, looking through them again and again is a tenth
 # of all the time.

@@ -254,6 +254,7 @@ def test_the_notebook_runs(tmp_path: Path):
   assert shown if find_gl() else "No video" in said
 
 
+@pytest.mark.slow
 def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(tmp_path / "site")]
   done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)

@@ -2,9 +2,12 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from playground import registry
+from playground.config import compose
 from playground.robots.scene import ROBOTS
 from tests.packages import PACKAGES, install, run
 
@@ -57,18 +60,13 @@ def test_a_package_with_a_robot_alone(robot_only: Path):
   run(robot_only, "-c", code)
 
 
-def test_a_robot_by_a_path(tmp_path: Path):
+def test_a_robot_by_a_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
   """An MJCF in the place of a robot's own, relative to where the command is typed."""
+  monkeypatch.chdir(tmp_path)
   text = (ROBOTS / "go1/go1.xml").read_text()
   (tmp_path / "mine.xml").write_text(text.replace('forcerange="-23.7 23.7"', 'forcerange="-20 20"'))
-  code = """
-    from playground import registry
-    from playground.config import compose
-
-    env = registry.build(compose(["env=joystick", "robot=go1", "env.robot.mjcf=mine.xml"]).env)
-    assert env.mj_model.actuator("FR_hip").forcerange.tolist() == [-20, 20]
-    """
-  run(tmp_path, "-c", code, cwd=tmp_path)
+  env: Any = registry.build(compose(["env=joystick", "robot=go1", "env.robot.mjcf=mine.xml"]).env)
+  assert env.mj_model.actuator("FR_hip").forcerange.tolist() == [-20, 20]
 
 
 def test_terms_of_a_package_from_the_command_line(terms_only: Path):

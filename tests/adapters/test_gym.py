@@ -46,7 +46,7 @@ def test_gymnasium_finds_nothing_to_complain_about(env: GymEnv) -> None:
     check_env(env, skip_render_check=find_gl() is None)
 
 
-@pytest.mark.parametrize("end", ["env.close(); env.close()", ""])
+@pytest.mark.parametrize("end", ["env.close(); env.close()", pytest.param("", marks=pytest.mark.slow)])
 def test_renders_without_a_screen(end: str) -> None:
   if find_gl() is None:
     pytest.skip(NO_GL_REMEDY)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from playground.compat020 import legs
-from tests.envs.golden import load_task, recorded
+from tests.envs.golden import golden, load_task, recorded
 from tests.mdp.context import context
 
 LEFT, SIDEWAYS = (0.0, 0.5, 0.0), (0.0, -0.5, 0.0)
@@ -64,7 +64,8 @@ def test_pushes_know_the_nominal_mass_only(task: str, monkeypatch: pytest.Monkey
 
 
 def test_h1s_contacts_are_read_at_a_wrong_place() -> None:
-  env, state = load_task("v020/H1JoystickGaitTracking"), recorded("H1JoystickGaitTracking")
+  env: Any = golden("H1JoystickGaitTracking").env
+  state = recorded("H1JoystickGaitTracking")
   feet = [env.mj_model.sensor(f"{geom}_floor_found").adr[0] for geom in env.config.robot.floor_contacts]
   lifted = state.data.replace(sensordata=state.data.sensordata.at[np.array(feet)].set(0.0))
   after = env.post_step(lifted, state.info, jnp.zeros(19))

@@ -68,15 +68,15 @@ def untraced(monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setattr(play.configs, "compose", lambda words: composed(*words))
 
 
-@pytest.mark.parametrize("each", [1, pytest.param(len(VALUES), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("step", "each"), [(3, 1), pytest.param(1, len(VALUES), marks=pytest.mark.slow)])
 def test_every_change_works_or_is_one_sentence(
-  folder: Path, each: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+  folder: Path, step: int, each: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
   untraced(monkeypatch)
   command, policy = caller(monkeypatch, "playground", main), folder / "policy.yaml"
   contract, draw, codes = yaml.safe_load(policy.read_text()), random.Random(0), []
   contract["command"] = {"max": [1.0, 1.0, 1.0], "min": None}
-  for path in places(contract):
+  for path in list(places(contract))[::step]:
     for value in draw.sample(VALUES, each):
       policy.write_text(yaml.safe_dump(changed(contract, path, value)))
       what = f"{path} -> {'gone' if value is GONE else value!r}"
@@ -87,4 +87,5 @@ def test_every_change_works_or_is_one_sentence(
       lines = capsys.readouterr().err.splitlines()
       refused = len(lines) == 1 and lines[0].startswith("error: ") and len(lines[0]) < 1000
       assert codes[-1] == 0 or (codes[-1] == 2 and refused), (what, lines)
-  assert codes.count(0) > 10 * each and codes.count(2) > 10 * each
+  least = 10 * each // step
+  assert codes.count(0) > least and codes.count(2) > least

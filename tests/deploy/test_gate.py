@@ -219,7 +219,7 @@ def test_requests_without_end_do_not_stop_time(watch: Watch) -> None:
   session._requests.get()
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signum", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_signal_ends_it_whatever_its_clients_say(run: Path, signum: signal.Signals) -> None:
   port = free_port()
   command = [sys.executable, "-m", "playground.cli.main", "play", str(run), "--web", "--port", str(port)]

@@ -44,12 +44,14 @@ def trained(*overrides, until=None):
   assert code == 0, code
   return ended[-1]
 """
-THERE_AND_BACK = """
-import json
+POINT = """
 from playground import registry
 from tests.dummy import Point
 
 registry.load = lambda *_, **__: Point()
+"""
+THERE_AND_BACK = """
+import json
 results = [trained("hardware.devices=2", "run_dir=run", until=400)]
 sys.argv[1:] = []
 results.append(trained("resume=run", "hardware.devices=1", until=960))
@@ -61,7 +63,7 @@ print(json.dumps(results))
 def test_checkpoints_go_on_on_another_topology(tmp_path: Path) -> None:
   """From two devices to one, and back."""
   line = [*LINE, "agent.num_timesteps=1600", "agent.num_evals=5", "hardware=cpu"]
-  process = start(TRAIN + THERE_AND_BACK, tmp_path, *line, devices=2)
+  process = start(TRAIN + POINT + THERE_AND_BACK, tmp_path, *line, devices=2)
   out, _ = process.communicate(timeout=800)
   assert process.returncode == 0, out[-3000:]
   *_, ours = json.loads(out.strip().splitlines()[-1])
@@ -75,12 +77,14 @@ def test_checkpoints_go_on_on_another_topology(tmp_path: Path) -> None:
   assert "It was written on 1 device: on 2," in out
 
 
-def test_two_processes_are_one_training(tmp_path: Path) -> None:
-  """Two devices each, a real task: the same parameters everywhere, one run directory, one process's return curve."""
+@pytest.mark.parametrize("task", ["point", pytest.param("cart and pole", marks=pytest.mark.slow)])
+def test_two_processes_are_one_training(task: str, tmp_path: Path) -> None:
+  """Two devices each: the same parameters everywhere, one run directory, one process's return curve."""
   params = "{field:dof_damping,target:all,operation:scale,range:[0.5,2.0]}"
   damping = f"env.events.damping={{mode:startup,func:model_field,params:{params}}}"
-  line = [*LINE, damping, "agent.num_timesteps=640", "agent.num_evals=3", "run_dir=run"]
-  script = TRAIN + "print(trained(), jax.process_index(), jax.device_count())"
+  line = [*LINE, "agent.num_timesteps=640", "agent.num_evals=3", "run_dir=run"]
+  line += [] if task == "point" else [damping]
+  script = TRAIN + (POINT if task == "point" else "") + "print(trained(), jax.process_index(), jax.device_count())"
   first, second = ended(two_processes(tmp_path, script, *line))
   ours, *place = first.strip().splitlines()[-1].split()
   assert place == ["0", "4"]

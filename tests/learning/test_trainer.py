@@ -26,6 +26,14 @@ from tests.dummy import (
 )
 
 every_algorithm = pytest.mark.parametrize("config", SMALL.values(), ids=SMALL)
+# Each compiles a trainer of its own: PPO and SAC for those on and off policy, all by `make test-slow`.
+two_of_them = pytest.mark.parametrize(
+  "config",
+  [
+    pytest.param(config, id=name, marks=[pytest.mark.slow] * (name not in ("ppo", "sac")))
+    for name, config in SMALL.items()
+  ],
+)
 
 
 @cache
@@ -99,7 +107,7 @@ def test_a_training_call_of_any_length_is_one_program(config: Config) -> None:
   assert trainer.train._cache_size() == 1
 
 
-@every_algorithm
+@two_of_them
 def test_nan_in_first_observations_is_counted_and_kept_from_what_is_learned(config: Config) -> None:
   trainer, program = built(config, nan_reset=True)
   state = program.init(jax.random.PRNGKey(0), {}, None)
@@ -135,7 +143,7 @@ class Rising(PointTask):
     return state.replace(info=state.info | {PRESERVE_INFO: {"level": info[PRESERVE_INFO]["level"] + 1}})
 
 
-@every_algorithm
+@two_of_them
 def test_a_fresh_start_of_all_environments_keeps_what_outlasts_a_reset(config: Config) -> None:
   trainer = Trainer(Rising(), config, make_mesh(1))
   model: dict[str, Any] = {}

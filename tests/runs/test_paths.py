@@ -49,7 +49,9 @@ def resolved() -> dict[str, Any]:
   return compose([*TASK, "tracking=tensorboard"]).resolved
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+  "shape", [*SHAPES[::4], *(pytest.param(s, marks=pytest.mark.slow) for s in SHAPES if s not in SHAPES[::4])]
+)
 def test_what_is_saved_is_read_again(shape: str, tmp_path: Path, resolved: dict[str, Any]) -> None:
   path = tmp_path / shape / "run"
   run = RunDirectory.create(path, resolved)

@@ -210,6 +210,7 @@ def test_a_signal_while_compiling(whole: Path, cache: Path, tmp_path: Path, caps
   assert_same_result(run, whole)
 
 
+@pytest.mark.slow
 def test_a_second_start_compiles_next_to_nothing(whole: Path, cache: Path, tmp_path: Path) -> None:
   """On an idle machine all of the second start takes under half of the first; here others are at work, too."""
   timings = lambda run: RunDirectory(run).manifest["timings"]
@@ -308,6 +309,7 @@ def _read_all(handle: int) -> None:
       pass
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full(whole: Path, cache: Path, tmp_path: Path) -> None:
   """Here every file may have 12 KB, which metrics.csv needs more of."""
   run = tmp_path / "run"
@@ -363,6 +365,7 @@ def test_a_run_directory_is_not_used_twice(whole: Path, refused: Callable[..., s
   assert RunDirectory(whole).status["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_two_do_not_resume_one_run(whole: Path, copy: Path, cache: Path, refused: Callable[..., str]) -> None:
   first = start(copy, cache, resumed=True)
   lock = copy / "run.lock"

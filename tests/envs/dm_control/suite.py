@@ -13,7 +13,7 @@ FIGURES = {
   for path in sorted(_DOMAINS.glob("*.xml"))
   if path.stem != "looks"
 }  # domain to file
-COSTLY = ("cheetah", "humanoid", "swimmer", "walker")  # compiling one takes 12 to 25 s: `make test-slow` steps them
+COSTLY = ("cheetah", "finger", "fish", "humanoid", "swimmer", "walker")  # `make test-slow` compiles their physics
 DOMAIN = {env["name"]: domain for domain, file in FIGURES.items() for env in figures(file)["envs"]}  # of every task
 
 
