@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from playground import catalog
-from playground.benchmark.report.suites import BEGIN, PAGES, write_pages
+from playground.benchmark.report.suites import BEGIN, GALLERY, PAGES, write_pages
 from playground.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -15,9 +15,10 @@ REFERENCE = ROOT / "results/reference"
 
 
 def test_the_pages_have_the_runs_of_the_reference_tables(tmp_path: Path):
-  for page in PAGES:
+  for page in (*PAGES, GALLERY):
     shutil.copyfile(ROOT / "docs" / page, tmp_path / page)
-  assert write_pages(tmp_path, REFERENCE) == [tmp_path / page for page in PAGES]
+  assert write_pages(tmp_path, REFERENCE) == [tmp_path / page for page in (*PAGES, GALLERY)]
+  assert (tmp_path / GALLERY).read_text() == (ROOT / "docs" / GALLERY).read_text()
   texts = {page: (tmp_path / page).read_text() for page in PAGES}
   for page, text in texts.items():
     assert text == (ROOT / "docs" / page).read_text(), "write them: playground-bench report pages=docs"

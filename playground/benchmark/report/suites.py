@@ -1,6 +1,7 @@
-"""The tables of the result pages: training runs of a suite from results/reference/, what is not learnt first.
+"""The tables of the result pages and the grids of the gallery, from results/reference/ and the catalogue.
 
 A page is written by hand but for what stands between two comments, which `playground-bench report pages=docs` replaces.
+In a table of runs, tasks that are not learnt come first.
 """
 
 import csv
@@ -19,6 +20,9 @@ PAGES = {  # page -> the tables that it shows
   "results-manipulation.md": ("manipulation", "vision"),
 }
 BEGIN, END = "<!-- runs: written by `playground-bench report pages=docs` -->", "<!-- end of runs -->"
+GALLERY = "gallery.md"
+GRID_BEGIN, GRID_END = "<!-- grid {}: written by `playground-bench report pages=docs` -->", "<!-- end of grid -->"
+_GRID_WIDTH = 4  # pictures in a row
 _TITLES = {"open": "Not learnt yet", "learning": "Learning", "solved": "Solved"}
 # What a row says in columns of its own.
 _BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env=\w+| \(learning\)")
@@ -29,7 +33,7 @@ Row = dict[str, str]
 
 
 def write_pages(pages: Path, reference: Path) -> list[Path]:
-  """Writes the tables into the pages of a folder.
+  """Writes the tables into the pages of a folder, and the grids into its gallery.
 
   Args:
     pages: the folder, such as docs.
@@ -49,12 +53,34 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
       rows = [row for table in tables for row in _read(reference / f"{table}.csv")]
     except FileNotFoundError as error:
       raise ConfigError(f"pages={pages}: {error.filename} does not exist.") from None
-    if BEGIN not in text or END not in text:
-      raise ConfigError(f"pages={pages}: {path} lacks the line {BEGIN} or {END}.")
-    before, after = text.split(BEGIN)[0], text.split(END)[1]
-    write_text(path, f"{before}{BEGIN}\n\n{to_markdown(list(_blocks(rows)), '')}\n{END}{after}")
+    write_text(path, _replaced(path, text, BEGIN, END, to_markdown(list(_blocks(rows)), "")))
     written.append(path)
-  return written
+  gallery = pages / GALLERY
+  for suite in dict.fromkeys(entry.suite for entry in entries().values()):
+    text = gallery.read_text(encoding="utf-8")
+    write_text(gallery, _replaced(gallery, text, GRID_BEGIN.format(suite), GRID_END, _grid(suite)))
+  return [*written, gallery]
+
+
+def _replaced(path: Path, text: str, begin: str, end: str, content: str) -> str:
+  """The text of a page with other content between two comments."""
+  before, found, rest = text.partition(begin)
+  _, closed, after = rest.partition(end)
+  if not found or not closed:
+    raise ConfigError(f"pages={path.parent}: {path} lacks the line {begin if not found else end}.")
+  return f"{before}{begin}\n\n{content}\n{end}{after}"
+
+
+def _grid(suite: str) -> str:
+  """A table of pictures, with each task's name, status and best return."""
+  cells = []
+  for task, entry in entries().items():
+    if entry.suite == suite:
+      score = "" if entry.reference_return is None else f", {entry.reference_return:.4g}"
+      cells.append(f"![{task}](gallery/{task}.webp)<br>{task}<br>{entry.status}{score}")
+  rows = [cells[i : i + _GRID_WIDTH] for i in range(0, len(cells), _GRID_WIDTH)]
+  full = [[*row, *[""] * (_GRID_WIDTH - len(row))] for row in rows]
+  return "\n".join(f"| {' | '.join(row)} |" for row in [[""] * _GRID_WIDTH, ["---"] * _GRID_WIDTH, *full]) + "\n"
 
 
 def _read(path: Path) -> list[Row]:
