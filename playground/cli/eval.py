@@ -6,6 +6,7 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
+from playground.envs.locomotion.gait_metrics import with_gait_metrics
 from playground.errors import ConfigError
 from playground.files import need_folder, write_json
 from playground.learning.evaluation import make_evaluator
@@ -58,7 +59,7 @@ def evaluate_run(
   need_camera(drawn, camera, "--camera")
   _, model = model_sampler(env, run, 1, count)(run.seed)
   act = lambda policy, obs, key: trained.trainer.act(policy, obs, key, deterministic or None)
-  evaluate = make_evaluator(env, act, count, hardware.mesh, 1 if film else 0)
+  evaluate = make_evaluator(with_gait_metrics(env), act, count, hardware.mesh, 1 if film else 0)
   scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model)
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
 

@@ -17,6 +17,7 @@ from playground.deploy.scripted import ScriptedPolicy, build_task
 from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
+from playground.envs.locomotion.gait_metrics import with_gait_metrics
 from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.extras import need
 from playground.files import need_folder, write_json
@@ -111,7 +112,7 @@ def play(
     return 0
   if opened.folder is not None:
     need_folder(opened.folder, str(opened.folder))
-  evaluate = make_evaluator(env, exported.act, episodes, make_mesh(1), 1 if film else 0)
+  evaluate = make_evaluator(with_gait_metrics(env), exported.act, episodes, make_mesh(1), 1 if film else 0)
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
   origin = exported.contract["origin"]

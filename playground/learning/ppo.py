@@ -15,6 +15,7 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from playground.envs.base import Env
+from playground.envs.symmetry import Mirror, mirror_of
 from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy, gradient_step
@@ -22,7 +23,6 @@ from playground.learning.cnn import random_shift
 from playground.learning.hyperparameters import PPOConfig
 from playground.learning.networks import ActorCritic, ActorCriticParams, Normalizer, normalize
 from playground.learning.rollout import Environments, side_by_side, unroll
-from playground.mdp.symmetry import Mirror, mirror_of
 from playground.pytree import PyTree
 
 LOSSES = ("total_loss", "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")  # what is logged

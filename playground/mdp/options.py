@@ -17,7 +17,7 @@ _STEPS = Limit(0, 1000, whole=True, form="list", length=2, rising=True)
 
 
 def mirrors_as(kind: MirrorKind) -> Callable[[_Function], _Function]:
-  """Declares how the vector of an observation term's function mirrors (`playground.mdp.symmetry`)."""
+  """Declares how the vector of an observation term's function mirrors (`playground.envs.symmetry`)."""
 
   def declare(function: _Function) -> _Function:
     function.mirror = kind  # pyright: ignore[reportFunctionMemberAccess]

@@ -82,7 +82,7 @@ def joint_reflection(robot: LeggedRobot) -> Reflection:
   root = model.jnt_bodyid[0]
   to_root = data.xmat[root].reshape(3, 3).T
   axes, anchors = data.xaxis[1:] @ to_root.T, (data.xanchor[1:] - data.xpos[root]) @ to_root.T
-  source = _partners(robot, robot.joint_names)
+  source = partners(robot, robot.joint_names)
   turns = (model.jnt_type[1:] == mujoco.mjtJoint.mjJNT_HINGE)[:, None]
   flip = np.where(turns, _SIGNS["axial"], _SIGNS["polar"])
   cosine = (flip * axes * axes[source]).sum(axis=1)
@@ -101,11 +101,15 @@ def joint_reflection(robot: LeggedRobot) -> Reflection:
 
 
 def _feet_reflection(robot: LeggedRobot) -> Reflection:
-  return Reflection(_partners(robot, robot.foot_names), np.ones(len(robot.foot_names), np.float32))
+  return Reflection(partners(robot, robot.foot_names), np.ones(len(robot.foot_names), np.float32))
 
 
-def _partners(robot: LeggedRobot, names: tuple[str, ...]) -> np.ndarray:
-  """The index of the part on the other side, for each of `names`; a part on neither side is its own."""
+def partners(robot: LeggedRobot, names: tuple[str, ...]) -> np.ndarray:
+  """Returns the index of the part on the other side, for each of `names`; a part on neither side is its own.
+
+  Raises:
+    ConfigError: the robot's YAML has no `mirror`, or no part of that name is on the other side.
+  """
   if not robot.left_to_right:
     raise ConfigError("the robot's YAML has no `mirror`, such as {left_: right_}: its left and right are not known.")
   found = []

@@ -11,10 +11,10 @@ import pytest
 from playground import registry
 from playground.envs.base import State
 from playground.envs.c_physics import on_c_physics
+from playground.envs.symmetry import Mirror, Reflection, joint_reflection, mirror_of
 from playground.errors import ConfigError
 from playground.mdp import observations
 from playground.mdp.options import mirrors_as
-from playground.mdp.symmetry import Mirror, Reflection, joint_reflection, mirror_of
 from tests.dummy import PointTask
 
 ROBOTS = ["Go1JoystickFlatTerrain", pytest.param("G1JoystickFlatTerrain", marks=pytest.mark.slow)]
