@@ -1,6 +1,6 @@
 """The catalogue of our tasks, `catalog.json`: what `playground list` shows without building a task.
 
-`make catalog` (`python -m playground.catalog`) writes it anew from the configurations, the built tasks and the
+`make catalog` (`python -m playground.catalog`) generates it from the configurations, the built tasks and the
 reference runs in results/reference/. A task of another package is not in it.
 """
 

@@ -5,8 +5,13 @@ import importlib.util
 from playground.errors import ConfigError
 
 
+def install_command(extra: str) -> str:
+  """Returns how to install an extra: this package lies in no registry."""
+  return f"pip install -e '.[{extra}]' in the checkout"
+
+
 def need(extra: str, *modules: str) -> None:
-  """Raises ConfigError if one of the modules that `pip install 'playground-run[<extra>]'` brings is not installed."""
+  """Raises ConfigError if one of the modules that an extra brings is not installed."""
   missing = [name for name in modules if importlib.util.find_spec(name) is None]
   if missing:
-    raise ConfigError(f"This needs {', '.join(missing)}: pip install 'playground-run[{extra}]'.")
+    raise ConfigError(f"This needs {', '.join(missing)}: {install_command(extra)}.")

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from playground.extras import install_command
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.runs.provenance import package_version
 from playground.runs.wandb_tracker import logged_in
@@ -119,7 +120,7 @@ def _devices() -> Iterator[Finding]:
     unused = jax.default_backend() == "cpu"
     cuda = 13 if driver.partition(".")[0].isdecimal() and int(driver.partition(".")[0]) >= 580 else 12
     missing = unused or package_version("warp-lang") is None
-    remedy = f'pip install "playground-run[cuda{cuda}]"' if missing else ""
+    remedy = install_command(f"cuda{cuda}") if missing else ""
     value = f"{gpu}, driver {driver}{', not used by JAX' if unused else ''}"
     yield Finding("GPU", value, None if missing else True, remedy)
   else:

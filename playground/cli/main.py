@@ -92,10 +92,10 @@ def _parser() -> argparse.ArgumentParser:
   for name in ("suite", "robot", "status", "backend"):
     tasks.add_argument(f"--{name}", metavar="NAME", help=f"only tasks of this {name}")
   tasks.add_argument("--json", action="store_true", help="print JSON instead of a table")
-  show = add("show", _show, "Show what a task observes, does, is paid for and is trained with.")
-  show.add_argument("task", help="a task, or randomization=<name> for what that draws")
+  show = add("show", _show, "Show a task's observations, rewards, terminations, events and hyperparameters.")
+  show.add_argument("task", help="a task, or randomization=<name> for its events")
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
-  show.add_argument("--views", metavar="FILE", help="instead, a picture of what its camera sees on randomised models")
+  show.add_argument("--views", metavar="FILE", help="write images of its camera on randomised models instead")
   show.add_argument("--num-views", type=int, default=16, help="randomised models of --views (default: %(default)s)")
   keys = add("keys", _keys, "Explain a section's or group's keys: value, allowed values and meaning.")
   keys.add_argument("prefix", help="such as agent, env.rewards, hardware.platform or tracking")
@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
   completion = add("completion", _completion, "Print a script that completes our commands in a shell.")
   completion.add_argument("shell", choices=("bash", "zsh", "fish", "query"), help="eval it in the shell's start file")
   completion.add_argument("line", nargs="?", default="", help=argparse.SUPPRESS)  # of query, which the scripts call
-  add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, and what is missing.")
+  add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, missing packages.")
   evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
   evaluate.add_argument("run", help=_RUN)
   evaluate.add_argument("--episodes", type=int, help="episodes to run (default: the run's agent.num_eval_envs)")
@@ -145,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
   view.add_argument("--port", type=int, default=8080, help="port of the page (default: %(default)s)")
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
   pretrained.add_argument("--add", metavar="RUN", help="measure a run's policy in C MuJoCo and put it into the package")
-  sweep = add("sweep", _sweep, "Look at a sweep, gather its result, or do what is missing of it.")
+  sweep = add("sweep", _sweep, "Show a sweep, collect its results, or run its missing jobs.")
   sweep.add_argument(
     "action",
     choices=("status", "collect", "retry", "stop"),
@@ -159,7 +159,7 @@ def _parser() -> argparse.ArgumentParser:
   tune.add_argument("--run", help="a run or checkpoint whose policy acts, beside random actions")
   tune.add_argument("--envs", type=int, default=256, help="environments (default: %(default)s)")
   tune.add_argument("--steps", type=int, default=500, help="policy steps in each environment (default: %(default)s)")
-  replay = add("replay", _replay, "Replay the step that was not finite.")
+  replay = add("replay", _replay, "Repeat the step that was NaN or infinite.")
   replay.add_argument("dump", help="a run's nan_dump/step_*.npz")
   for builds_tasks in (show, keys, evaluate, export, play, view, sweep, tune, replay):
     builds_tasks.add_argument(

@@ -1,4 +1,4 @@
-"""`playground show <task>`: what a task observes, does and is paid for, term by term, and what it is trained with."""
+"""`playground show <task>`: observations, rewards, terminations, commands, events and hyperparameters, as tables."""
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

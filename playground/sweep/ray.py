@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 
 from playground.config.sweep_options import RayConfig
 from playground.errors import ConfigError, HardwareError
+from playground.extras import install_command
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import MEMORY_FRACTION
 from playground.sweep.worker import COMMAND, Worker
@@ -16,7 +17,7 @@ from playground.sweep.worker import COMMAND, Worker
 try:
   import ray
 except ImportError:
-  raise ConfigError('launcher=ray needs Ray: pip install "playground-run[ray]".') from None
+  raise ConfigError(f"launcher=ray needs Ray: {install_command('ray')}.") from None
 
 
 _CORES = 4  # of a job, unless launcher.cores_per_job says otherwise

@@ -12,6 +12,7 @@ from playground import config as configs
 from playground.config.overrides import parse_with_hydra
 from playground.config.sweep_options import OptunaConfig
 from playground.errors import ConfigError, PlaygroundError
+from playground.extras import install_command
 from playground.sweep.folder import Job, JobFolder, SweepDirectory
 
 try:
@@ -21,7 +22,7 @@ try:
   from optuna.storages.journal import JournalFileBackend
   from optuna.trial import TrialState
 except ImportError:
-  raise ConfigError('search=optuna needs Optuna: pip install "playground-run[optuna]".') from None
+  raise ConfigError(f"search=optuna needs Optuna: {install_command('optuna')}.") from None
 
 _SAMPLERS = {
   "tpe": lambda seed: optuna.samplers.TPESampler(seed=seed),

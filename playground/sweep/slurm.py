@@ -18,6 +18,7 @@ from pathlib import Path
 
 from playground.config.sweep_options import SlurmConfig
 from playground.errors import ConfigError, HardwareError
+from playground.extras import install_command
 from playground.interpreter import PYTHON
 from playground.settings import Plain
 from playground.sweep.folder import ENDED, STOP_FILE, Job, JobFolder, SweepDirectory
@@ -26,7 +27,7 @@ from playground.sweep.worker import COMMAND, Worker
 try:
   import submitit
 except ImportError:
-  raise ConfigError('launcher=slurm needs submitit: pip install "playground-run[slurm]".') from None
+  raise ConfigError(f"launcher=slurm needs submitit: {install_command('slurm')}.") from None
 
 SETTLED = tuple(status for status in ENDED if status not in ("preempted", "killed"))  # those Slurm may start again
 _SLURM_ID = re.compile(r"\d+(_\d+)?")  # no option of squeue or scancel

@@ -59,7 +59,7 @@ def test_a_gpu_that_jax_does_not_use(report, monkeypatch: pytest.MonkeyPatch, dr
   monkeypatch.setattr(module, "_nvidia", lambda: ("1 x NVIDIA H200", driver))
   code, text = report()
   assert code == 0  # the CPU still trains
-  assert "not used by JAX" in row(text, "GPU") and f'pip install "playground-run[{extra}]"' in row(text, "GPU")
+  assert "not used by JAX" in row(text, "GPU") and f"pip install -e '.[{extra}]'" in row(text, "GPU")
 
 
 def test_no_gl_says_how_to_get_it(report, monkeypatch: pytest.MonkeyPatch):

@@ -184,7 +184,7 @@ def test_one_sentence_each(
   truly = importlib.util.find_spec
   monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "viser" else truly(name, *rest))
   assert command("play", path, "--web") == 2
-  assert "This needs viser: pip install 'playground-run[web]'." in capsys.readouterr().err
+  assert "This needs viser: pip install -e '.[web]' in the checkout." in capsys.readouterr().err
 
 
 @pytest.mark.slow  # without a GPU the browser draws so slowly that beside other tests keys get lost
