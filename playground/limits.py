@@ -75,9 +75,9 @@ def count(low: int, high: float = 1e6) -> Limit:
   return Limit(low, high, whole=True)
 
 
-def span(low: float = 0, high: float = MOST) -> Limit:
+def span(low: float = 0) -> Limit:
   """A range [from, to]."""
-  return Limit(low, high, form="list", length=2, rising=True)
+  return Limit(low, form="list", length=2, rising=True)
 
 
 # Types of parameters of terms.

@@ -16,7 +16,7 @@ Classes of any other package are refused unless the user trusts it (`playground.
 import functools
 import inspect
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 from ml_collections import ConfigDict
 
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
   from playground.envs.base import Env
 
-DomainRandomizer: TypeAlias = "Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]"
 ALL_ENVS: tuple[str, ...]  # every task's name, read when asked for
 
 
@@ -117,12 +116,20 @@ def task_class(task: str) -> Callable[[ConfigDict], "Env"]:
   return cast("Callable[[ConfigDict], Env]", found)
 
 
-def get_domain_randomizer(name: str) -> "DomainRandomizer | None":
+class DomainRandomizer(Protocol):
+  """Draws models, as Brax's wrappers ask for them."""
+
+  def __call__(self, mjx_model: "mjx.Model", rng: "jax.Array") -> "tuple[mjx.Model, mjx.Model]":
+    """Returns the model with drawn fields, [N, ...], and the axes of `vmap` of all its fields."""
+    ...
+
+
+def get_domain_randomizer(name: str) -> DomainRandomizer | None:
   """The task's randomisation as Playground 0.2.0 gave it, or None if it has none.
 
   Returns:
-    A function `(mjx_model, rng [N]) -> (model, in_axes)`: the model with a leading axis N on every randomised field,
-    and the same structure with 0 at those fields and None elsewhere.
+    A function of a model and keys [N], which returns the model with a leading axis N on every randomised field, and the
+    same structure with 0 at those fields and None elsewhere.
   """
   from playground.randomization import domain_randomizer, model_fields
 
@@ -131,7 +138,7 @@ def get_domain_randomizer(name: str) -> "DomainRandomizer | None":
     return None
 
   @functools.cache
-  def randomizer() -> DomainRandomizer:
+  def randomizer() -> "Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]":
     return domain_randomizer(load(name).mj_model, events)
 
   return lambda mjx_model, rng: randomizer()(mjx_model, rng)

@@ -8,6 +8,7 @@ from dm_env import specs
 
 from playground.adapters.episodes import Episodes, Moment
 from playground.envs.base import PIXELS
+from playground.pytree import PyTree
 from playground.settings import Section
 
 
@@ -31,7 +32,7 @@ class DmEnv(dm_env.Environment):
     self._running = not (moment.terminated or moment.truncated)
     return _time_step(moment)
 
-  def observation_spec(self) -> specs.Array | dict[str, specs.Array]:  # pyright: ignore[reportIncompatibleMethodOverride]
+  def observation_spec(self) -> PyTree:
     sizes = self._episodes.env.observation_size
     if not isinstance(sizes, Mapping):
       return specs.Array((sizes,), np.float32, "observation")

@@ -35,7 +35,7 @@ _HEIGHT, _WIDTH = 480, 640
 _SEEDS = 2**31 - 1
 
 
-class GymEnv(gymnasium.Env[Arrays, np.ndarray]):
+class GymEnv(gymnasium.Env[PyTree, np.ndarray]):
   """One environment. Observations, rewards and ends of episodes are the task's, its metrics are the `info`."""
 
   metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # gymnasium's own declaration
@@ -70,12 +70,12 @@ class GymEnv(gymnasium.Env[Arrays, np.ndarray]):
     self.metadata = self.metadata | {"render_fps": round(1 / (env.dt * env.action_repeat))}
     self._renderer: mujoco.Renderer | None = None
 
-  def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Arrays, Info]:
+  def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[PyTree, Info]:
     super().reset(seed=seed)
     moment = self._episodes.reset(int(self.np_random.integers(_SEEDS)))
     return _entry(moment.obs, self._entry), moment.metrics
 
-  def step(self, action: np.ndarray) -> tuple[Arrays, float, bool, bool, Info]:
+  def step(self, action: np.ndarray) -> tuple[PyTree, float, bool, bool, Info]:
     moment = self._episodes.step(action)
     return _entry(moment.obs, self._entry), moment.reward, moment.terminated, moment.truncated, moment.metrics
 
@@ -130,7 +130,7 @@ def _open_renderer(model: mujoco.MjModel) -> mujoco.Renderer:
     gl_context.GLContext = chosen
 
 
-class GymVectorEnv(gymnasium.vector.VectorEnv[Arrays, np.ndarray, np.ndarray]):
+class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
   """A batch of environments in one program. An episode that has ended begins anew by itself, freshly drawn.
 
   That is in the next step, which takes no action of it, or (`AutoresetMode.SAME_STEP`) in the step that ends it: `info`
@@ -179,12 +179,12 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Arrays, np.ndarray, np.ndarray]):
     self._start, self._advance = jax.jit(start), jax.jit(advance)
     self._state: State | None = None
 
-  def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Arrays, Info]:
+  def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[PyTree, Info]:
     super().reset(seed=seed)
     state = self._state = self._start(self._key())
     return self._seen(state)
 
-  def step(self, actions: np.ndarray) -> tuple[Arrays, np.ndarray, np.ndarray, np.ndarray, Info]:
+  def step(self, actions: np.ndarray) -> tuple[PyTree, np.ndarray, np.ndarray, np.ndarray, Info]:
     assert self._state is not None, "reset before the first step"
     state, last = self._advance(self._state, np.asarray(actions, np.float32), self._key())
     self._state, (obs, info) = state, self._seen(state)
@@ -206,7 +206,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Arrays, np.ndarray, np.ndarray]):
   def _key(self) -> jax.Array:
     return jax.random.PRNGKey(int(self.np_random.integers(_SEEDS)))
 
-  def _seen(self, state: State) -> tuple[Arrays, Info]:
+  def _seen(self, state: State) -> tuple[PyTree, Info]:
     obs, metrics = jax.tree.map(np.array, (state.obs, state.metrics))
     return _entry(obs, self._entry), metrics
 

@@ -32,7 +32,7 @@ class Suite:
     """See `registry.config`."""
     return registry.config(env_name)
 
-  def get_domain_randomizer(self, env_name: str) -> "registry.DomainRandomizer | None":
+  def get_domain_randomizer(self, env_name: str) -> registry.DomainRandomizer | None:
     """See `registry.get_domain_randomizer`."""
     return registry.get_domain_randomizer(env_name)
 

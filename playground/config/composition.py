@@ -104,13 +104,13 @@ def compose_all(runs: Iterable[Sequence[str]], config_dir: Path | None = None) -
   return configs
 
 
-def compose_settings(overrides: Sequence[str], config_dir: Path | None = None) -> SweepSettings:
+def compose_settings(overrides: Sequence[str]) -> SweepSettings:
   """Composes what a sweep is told of itself: `sweep_dir`, `on_error`, and the sections `launcher` and `search`.
 
   Raises:
     ConfigError: as `compose`.
   """
-  roots = config_roots(config_dir)
+  roots = config_roots()
   parsed = [parse(text, roots) for text in overrides]
   config, _ = _hydra(group_overrides(parsed), roots, "sweep")
   resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], _plain(config))
@@ -157,7 +157,7 @@ def override_section(section: str, default: Section | ConfigDict, overrides: Sec
   return resolved[section]
 
 
-def from_saved(resolved: Section, config_dir: Path | None = None) -> RunConfig:
+def from_saved(resolved: Section) -> RunConfig:
   """Rebuilds the configuration of a run that an earlier version may have saved: keys it lacks get today's defaults.
 
   What a task chooses by name (reward terms, observations, noise) stays what it was. What only a command line can say
@@ -167,7 +167,7 @@ def from_saved(resolved: Section, config_dir: Path | None = None) -> RunConfig:
     ConfigError: a part is missing, has another type than its default or cannot work.
   """
   saved = from_dict(resolved)
-  roots = config_roots(config_dir)
+  roots = config_roots()
   chosen = [
     f"{group}={saved.choices[group]}"
     for group in _DEFAULTING

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
   class TaskConfig(EnvConfig, Mapping[str, Plain], ConfigDict):  # pyright: ignore[reportIncompatibleMethodOverride]
     """The section of a task: the settings that every task has (`EnvConfig`), and those of its own class."""
+
+    def __getattr__(self, name: str) -> Plain: ...
 else:
   TaskConfig = ConfigDict
 

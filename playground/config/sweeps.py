@@ -39,7 +39,7 @@ from playground.text import first_line, format_value
 _HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper")
 
 
-def expand(overrides: Sequence[str], config_dir: Path | None = None) -> list[str]:
+def expand(overrides: Sequence[str]) -> list[str]:
   """Spells out what `-m` is given: `sweep=<name>` becomes what its file says, a glob the options it stands for.
 
   What the command line says of a key replaces what the file says of it.
@@ -48,7 +48,7 @@ def expand(overrides: Sequence[str], config_dir: Path | None = None) -> list[str
     ConfigError: a sweep file that is none, a value that cannot be.
     UnknownNameError: no such sweep or option, or a glob that stands for none.
   """
-  roots = config_roots(config_dir)
+  roots = config_roots()
   given = [parse_with_hydra(text) for text in overrides if not is_hydras(text)]
   named = [override for override in given if override.key_or_group == "sweep"]
   if len(named) > 1 or any(override.is_sweep_override() for override in named):
@@ -59,7 +59,7 @@ def expand(overrides: Sequence[str], config_dir: Path | None = None) -> list[str
   return [*_checked(chosen, roots), *filter(is_hydras, overrides)]
 
 
-def listed_jobs(overrides: Sequence[str], config_dir: Path | None = None) -> list[list[str]]:
+def listed_jobs(overrides: Sequence[str]) -> list[list[str]]:
   """The `jobs` of the sweep file that `-m` is given, spelt out, without what the command line says otherwise.
 
   Raises:
@@ -72,7 +72,7 @@ def listed_jobs(overrides: Sequence[str], config_dir: Path | None = None) -> lis
   for override in (override for override in given if override.key_or_group == "sweep"):
     for text in _read(str(override.value()))[1]:
       parsed = [parse_with_hydra(part) for part in shlex.split(text)]
-      lines = _checked([o for o in parsed if o.key_or_group not in keys], config_roots(config_dir))
+      lines = _checked([o for o in parsed if o.key_or_group not in keys], config_roots())
       if whole := [*split(lines)[0], *filter(is_of_command, lines)]:
         raise ConfigError(f"{override.input_line}: {whole[0]} in its job {text!r} is of the whole sweep.")
       found.append(lines)
@@ -107,13 +107,13 @@ def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
   return settings, ours
 
 
-def command_lines(overrides: Sequence[str], config_dir: Path | None = None) -> list[str]:
+def command_lines(overrides: Sequence[str]) -> list[str]:
   """What `-m` is given that each job's command gets and the sweep's folder does not keep (`is_of_command`).
 
   Raises:
     ConfigError: as `expand`, and for several values.
   """
-  lines = [line for line in expand(overrides, config_dir) if is_of_command(line)]
+  lines = [line for line in expand(overrides) if is_of_command(line)]
   for line in lines:
     if parse_with_hydra(line).is_sweep_override():
       raise ConfigError(f"{line}: all jobs of a sweep have the same one.")

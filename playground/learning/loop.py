@@ -28,6 +28,7 @@ from playground.learning.trainer import Trainer, TrainState
 
 Metrics = dict[str, float]
 Draw = Callable[[], tuple[ModelFields, ModelFields]]  # randomised models, of the training and of the evaluation
+SAVE_EVERY_S = 300.0  # a state is kept at every evaluation, and at events when this long has passed since the last
 COMPILER = "compiler"  # name of the threads that compile
 
 
@@ -166,42 +167,36 @@ class SegmentResult:
   snapshot: TrainState | None = None
 
 
+@dataclasses.dataclass
 class Loop:
-  """One run: from a state at some event of the schedule to its end."""
+  """One run: from a state at some event of the schedule to its end.
 
-  def __init__(
-    self,
-    trainer: Trainer,
-    functions: CompiledFunctions,
-    events: list[ScheduleEvent],
-    seed: int,
-    callbacks: Callbacks,
-    save_every_s: float = 300.0,
-  ):
-    """Takes what there is to run.
+  Attributes:
+    trainer: of the run.
+    functions: the trainer's, compiled, and the models.
+    events: the schedule.
+    seed: of the run; evaluations and resets draw from it and the event they belong to, so they do not depend on where
+      the run was interrupted.
+    callbacks: called with rows, states to keep and for whether to stop.
+    train_s: device time of training alone.
+    first_update_s: that of one training step, by the first row.
+  """
 
-    Args:
-      trainer: of the run.
-      functions: the trainer's, compiled, and the models.
-      events: the schedule.
-      seed: of the run; evaluations and resets draw from it and the event they belong to, so they do not depend on
-        where the run was interrupted.
-      callbacks: called with rows, states to keep and for whether to stop.
-      save_every_s: a state is kept at every evaluation, and at events when this long has passed since the last.
-    """
-    self._trainer = trainer
-    self._functions = functions
-    self._events = events
-    self._callbacks = callbacks
-    self._save_every_s = save_every_s
-    self._init_key, self._eval_key, self._reset_key = jax.random.split(jax.random.PRNGKey(seed), 3)
-    self.train_s = 0.0  # device time of training alone
-    self.first_update_s: float | None = None
+  trainer: Trainer
+  functions: CompiledFunctions
+  events: list[ScheduleEvent]
+  seed: int
+  callbacks: Callbacks
+  train_s: float = 0.0
+  first_update_s: float | None = None
+
+  def __post_init__(self) -> None:
+    self._init_key, self._eval_key, self._reset_key = jax.random.split(jax.random.PRNGKey(self.seed), 3)
 
   def init(self, policy: Policy | None = None) -> TrainState:
     """Returns the state of a new run, which starts from a policy (host arrays) if there is one."""
-    placed = None if policy is None else self._trainer.place_policy(policy)
-    return self._functions.init(self._place(self._init_key), self._functions.model, placed)
+    placed = None if policy is None else self.trainer.place_policy(policy)
+    return self.functions.init(self._place(self._init_key), self.functions.model, placed)
 
   def run(self, state: TrainState, update: int | None = None) -> tuple[TrainState, bool]:
     """Runs to the end of the schedule, or until the callbacks say stop.
@@ -213,7 +208,7 @@ class Loop:
     Returns:
       The last state, and whether the schedule was completed.
     """
-    events = [event for event in self._events if update is None or event.update > update]
+    events = [event for event in self.events if update is None or event.update > update]
     at, reported = update or 0, None
     self._last_save = time.perf_counter()
     with ThreadPoolExecutor(1, thread_name_prefix="report") as reports:
@@ -222,50 +217,50 @@ class Loop:
         at = event.update
         if reported:
           reported.result()  # one row is in flight; what went wrong with it stops the run here
-        stop = agree(self._callbacks.should_stop()) and event is not events[-1]
+        stop = agree(self.callbacks.should_stop()) and event is not events[-1]
         if stop:
-          done.snapshot = self._functions.copy(state) if several() else state
+          done.snapshot = self.functions.copy(state) if several() else state
         reported = reports.submit(self._report, done)
         if stop:
           break
       if reported:
         reported.result()
-    return state, at == self._events[-1].update
+    return state, at == self.events[-1].update
 
   def _work(self, state: TrainState, event: ScheduleEvent, num_updates: int) -> tuple[TrainState, SegmentResult]:
     """Trains up to an event and does what it asks for; waits for the numbers, not for resets and copies."""
-    done = SegmentResult(event, num_updates * self._trainer.steps_per_update)
+    done = SegmentResult(event, num_updates * self.trainer.steps_per_update)
     if num_updates:
       start = time.perf_counter()
-      state, done.trained = self._functions.train(state, self._functions.model, np.int32(num_updates))
+      state, done.trained = self.functions.train(state, self.functions.model, np.int32(num_updates))
       jax.block_until_ready(done.trained)
       done.train_s = time.perf_counter() - start
       self.train_s += done.train_s
       self.first_update_s = self.first_update_s or done.train_s / num_updates
       if done.trained["nonfinite"] > 0:
-        capture = self._functions.copy(state).capture if several() else state.capture
-        action_size = self._trainer.env.action_size
-        done.captured = jax.device_get(capture).first(state.env_state, action_size, self._functions.model)
+        capture = self.functions.copy(state).capture if several() else state.capture
+        action_size = self.trainer.env.action_size
+        done.captured = jax.device_get(capture).first(state.env_state, action_size, self.functions.model)
     if event.evaluate:
       start = time.perf_counter()
-      policy = self._trainer.policy(state)
-      done.evaluated = self._functions.evaluate(policy, self._key(self._eval_key, event), self._functions.eval_model)
+      policy = self.trainer.policy(state)
+      done.evaluated = self.functions.evaluate(policy, self._key(self._eval_key, event), self.functions.eval_model)
       jax.block_until_ready(done.evaluated)
       done.eval_s = time.perf_counter() - start
     if event.reset:
-      state = self._functions.reset(state, self._key(self._reset_key, event), self._functions.model)
-    late = agree(time.perf_counter() - self._last_save > self._save_every_s)
-    due = late or event.evaluate or event is self._events[-1]
+      state = self.functions.reset(state, self._key(self._reset_key, event), self.functions.model)
+    late = agree(time.perf_counter() - self._last_save > SAVE_EVERY_S)
+    due = late or event.evaluate or event is self.events[-1]
     if due and event.update:
       # A copy, because the next training call takes the state's buffers over while this one is written to disk.
-      done.snapshot = self._functions.copy(state)
+      done.snapshot = self.functions.copy(state)
       self._last_save = time.perf_counter()
     return state, done
 
   def _report(self, done: SegmentResult) -> None:
     """Hands finished work to the callbacks."""
     row: Metrics = {}
-    step = done.event.update * self._trainer.steps_per_update
+    step = done.event.update * self.trainer.steps_per_update
     recording = None
     if done.trained is not None:
       report = {k: float(v) for k, v in jax.device_get(done.trained).items()}
@@ -275,12 +270,12 @@ class Loop:
       scores, recording = done.evaluated
       row |= {f"eval/{k}": float(v) for k, v in jax.device_get(scores).items()}
       row["time/eval_s"] = done.eval_s
-    self._callbacks.on_metrics(step, row, done.captured, recording)
+    self.callbacks.on_metrics(step, row, done.captured, recording)
     if done.snapshot is not None:
-      self._callbacks.on_save(done.event.update, step, done.snapshot, done.event is self._events[-1])
+      self.callbacks.on_save(done.event.update, step, done.snapshot, done.event is self.events[-1])
 
   def _key(self, key: jax.Array, event: ScheduleEvent) -> jax.Array:
     return self._place(jax.random.fold_in(key, event.update))
 
   def _place(self, key: jax.Array) -> jax.Array:
-    return put(key, self._trainer.mesh, P())
+    return put(key, self.trainer.mesh, P())

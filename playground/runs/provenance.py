@@ -5,6 +5,15 @@ import platform
 import subprocess
 from importlib import metadata
 from pathlib import Path
+from typing import TypedDict
+
+
+class GitState(TypedDict):
+  """The commit of a checkout, and whether files differ from it."""
+
+  commit: str
+  dirty: bool
+
 
 PACKAGES = (
   "playground-run",
@@ -36,7 +45,7 @@ def package_versions() -> dict[str, str | None]:
   return {"python": platform.python_version()} | {name: package_version(name) for name in PACKAGES}
 
 
-def git_state(root: Path = Path(__file__).parents[2]) -> dict[str, str | bool] | None:
+def git_state(root: Path = Path(__file__).parents[2]) -> GitState | None:
   """Returns {"commit", "dirty"} of the checkout that this package runs from, or None outside one."""
   # A wheel in a venv inside somebody's own repository must not report that repository's commit as ours.
   toplevel = _git(root, "rev-parse", "--show-toplevel")

@@ -112,7 +112,11 @@ def test_every_pool_is_tried() -> None:
 
 def test_pictures_alone_are_obs() -> None:
   sizes = {"state": (OBS,), "pixels/eye": (9, 8, 3)}
-  keys = {"policy_obs_key": "", "value_obs_key": "", "estimated_obs_key": "state"}  # of which the policy needs none
+  keys: Any = {
+    "policy_obs_key": "",
+    "value_obs_key": "",
+    "estimated_obs_key": "state",
+  }  # of which the policy needs none
   nets = ActorCritic(sizes, ACTIONS, NetworkConfig((8,), (4,), **keys, cnn=CNNS[0]))
   layers, normalization = nets.mlp(trained(nets)[0], nets.init_normalizer())
   model = policy_graph(layers, nets.policy_inputs, "swish", normalization, nets.cnn)

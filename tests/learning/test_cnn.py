@@ -190,6 +190,7 @@ def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
   trainer = Trainer(Seen(), config, make_mesh(1))
   state = trainer.init(jax.random.PRNGKey(0), {}, None)
   nets, policy = trainer.networks, jax.device_get(state.algorithm.params.policy)
+  assert isinstance(nets, ActorCritic)
   assert policy["params"]["estimator"]["kernel"].shape == (16, 2)
   obs = nets.select(state.env_state.obs)
   logits, estimate = nets.logits_and_estimate(policy, obs)

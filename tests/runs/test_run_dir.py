@@ -10,7 +10,6 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import ml_collections
 import numpy as np
 import pytest
 
@@ -23,7 +22,7 @@ CONFIG = {"seed": 1, "agent": {"learning_rate": 1e-5, "layers": (32, 32), "decay
 
 
 def test_config_and_overrides_survive_the_round_trip(tmp_path: Path):
-  RunDirectory.create(tmp_path / "a" / "run", ml_collections.ConfigDict(CONFIG), ["seed=1", "env=X"])
+  RunDirectory.create(tmp_path / "a" / "run", CONFIG, ["seed=1", "env=X"])
   run = RunDirectory.open(tmp_path / "a" / "run")
   assert run.config == {"seed": 1, "agent": {"learning_rate": 1e-5, "layers": [32, 32], "decay": None}}
   assert isinstance(run.config["agent"]["learning_rate"], float)

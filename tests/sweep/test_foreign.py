@@ -7,7 +7,7 @@ import pytest
 import ray
 import yaml
 
-from playground.config import compose_settings
+from playground.config.sweep_options import SlurmConfig
 from playground.errors import CheckpointError, ConfigError
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.plan import settings_of
@@ -53,7 +53,7 @@ def test_rays_workers_import_nothing_from_the_current_folder(tmp_path: Path, tra
 
 def test_slurms_jobs_import_nothing_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setattr("shutil.which", lambda name: f"/bin/{name}")  # sbatch and srun
-  launcher = SlurmLauncher(make_sweep(tmp_path / "sweep", 0), compose_settings(["launcher=slurm"]).launcher)
+  launcher = SlurmLauncher(make_sweep(tmp_path / "sweep", 0), SlurmConfig())
   assert re.search(r"python\S* -P -u -m submitit", launcher._executor._submitit_command_str)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from playground.config import compose_settings
+from playground.config.sweep_options import LocalConfig
 from playground.errors import ConfigError, HardwareError
 from playground.sweep import local
 from playground.sweep.local import LocalLauncher, make_slots, pick
@@ -114,4 +114,4 @@ def test_more_gpus_than_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     run(sweep)
   assert statuses(sweep) == {0: "queued"}
   with pytest.raises(HardwareError, match=r"launcher\.gpus=2, but this machine has 1\."):
-    LocalLauncher(sweep, compose_settings(["launcher.gpus=2"]).launcher)
+    LocalLauncher(sweep, LocalConfig(gpus=2))

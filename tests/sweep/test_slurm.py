@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import submitit
 
-from playground.config import compose_settings
+from playground.config.sweep_options import SlurmConfig
 from playground.errors import ConfigError, HardwareError
 from playground.sweep import slurm
 from playground.sweep.folder import Job
@@ -44,8 +44,7 @@ def test_jobs_go_through_submitit(tmp_path: Path, local: list[SlurmLauncher]) ->
 
 def test_a_preempted_job_saves_is_queued_again_and_resumes(tmp_path: Path, local: list[SlurmLauncher]) -> None:
   sweep = make_sweep(tmp_path / "sweep", 13)
-  settings = compose_settings(["launcher=slurm"])
-  launcher = slurm.SlurmLauncher(sweep, settings.launcher, STUB)
+  launcher = slurm.SlurmLauncher(sweep, SlurmConfig(), STUB)
   (job,) = sweep.jobs
   assert launcher.start(job)
   until = time.monotonic() + 40
@@ -75,7 +74,7 @@ def test_submitting_without_waiting(tmp_path: Path, local: list[SlurmLauncher]) 
 
 
 def test_what_sbatch_is_told() -> None:
-  config = compose_settings(["launcher=slurm", "launcher.partition=gpu", "launcher.minutes=90"]).launcher
+  config = SlurmConfig(partition="gpu", minutes=90)
   told = slurm_parameters(config, Job("a", [], {}, needs=2))
   assert (told["gpus_per_node"], told["time"], told["mem"], told["partition"]) == (2, 90, "32GB", "gpu")
   assert told["signal_delay_s"] > config.grace
