@@ -94,7 +94,7 @@ def _check(config: "RunConfig") -> None:
   """
   if config.resolved["run_dir"] is not None:
     RunDirectory(str(config.run_dir)).must_be_new()
-  print(f"Checking the stages {', '.join(stage_folders(config.resolved['curriculum']))}")
+  print(f"Checking the stages {', '.join(stage_folders(config.curriculum))}")
   hardware = setup(config.hardware)
   before: tuple[str, dict[str, object]] | None = None
   for stage, name in zip(config.stages, stage_folders(config.curriculum), strict=True):
