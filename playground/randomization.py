@@ -70,9 +70,7 @@ _OPERATIONS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 }
 _DISTRIBUTIONS: dict[str, Callable[[jax.Array, tuple[int, ...], float, float], jax.Array]] = {
   "uniform": lambda key, shape, lo, hi: jax.random.uniform(key, shape, minval=lo, maxval=hi),
-  "log_uniform": lambda key, shape, lo, hi: jnp.exp(
-    jax.random.uniform(key, shape, minval=math.log(lo), maxval=math.log(hi))
-  ),
+  "log_uniform": lambda key, shape, lo, hi: jnp.exp(_DISTRIBUTIONS["uniform"](key, shape, math.log(lo), math.log(hi))),
   "normal": lambda key, shape, mean, std: mean + std * jax.random.normal(key, shape),
   "bernoulli": lambda key, shape, mean, _: jax.random.bernoulli(key, mean, shape),
 }
@@ -124,17 +122,7 @@ class Randomizer:
   """
 
   def __init__(self, mj_model: mujoco.MjModel, events: Mapping[str, Any], mode: str = "startup"):
-    """Binds events to a model, whose present values are the nominal ones.
-
-    Args:
-      mj_model: the model.
-      events: a task's `env.events`, of which those of func `model_field` and this mode count.
-      mode: `startup` or `reset`.
-
-    Raises:
-      ConfigError: an event that is invalid, with its key.
-      UnknownNameError: a key, field, target, operation or distribution that does not exist.
-    """
+    """Binds those of `env.events` of func `model_field` and this mode to a model, whose values are the nominal ones."""
     self._draws = [
       _bind(mj_model, term, f"env.events.{name}.params") for name, term in model_fields(events, mode).items()
     ]
@@ -162,11 +150,7 @@ class Randomizer:
 
 
 def model_fields(events: Mapping[str, Any] | None, mode: str = "startup") -> dict[str, ModelField]:
-  """Returns the enabled events of func `model_field` and a mode by name, checked as far as possible without a model.
-
-  Raises:
-    ConfigError, UnknownNameError: an event of that func that is invalid, of either mode.
-  """
+  """Returns the enabled events of func `model_field` and a mode by name, checked as far as possible without a model."""
   found = {}
   for name, entry in (events or {}).items():
     if entry is None or not is_model_field(name, entry):
@@ -212,29 +196,22 @@ def _bind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> _Draw:
   _check_kind(mj_model, term, key)
   if term.field in _LINKED:
     if term.column is not None:
-      raise ConfigError(
-        f"{key}.column={format_value(term.column)}: field {term.field!r} has no columns, leave the key out."
-      )
+      shown = f"{key}.column={format_value(term.column)}"
+      raise ConfigError(f"{shown}: field {term.field!r} has no columns, leave the key out.")
     if term.field in _SCALED_ONLY and term.operation != "scale":
       raise ConfigError(f"{key}.operation={term.operation!r}: field {term.field!r} can only be scaled.")
-    slots = [
-      _Slot(field, (rows,) if column is None else (rows, np.array(column)), sign)
-      for field, column, sign in _LINKED[term.field]
-    ]
-    return _Draw(term, tuple(slots), (len(rows),))
+    index = lambda column: (rows,) if column is None else (rows, np.array(column))
+    slots = tuple(_Slot(field, index(column), sign) for field, column, sign in _LINKED[term.field])
+    return _Draw(term, slots, (len(rows),))
   shape = getattr(mj_model, term.field).shape
   width = shape[1] if len(shape) == 2 else 0
-  if term.column is None:
-    columns = list(range(width))
-  else:
-    columns = [term.column] if isinstance(term.column, int) else list(term.column)
-    if not all(column < width for column in columns):
-      allowed = f"columns 0 to {width - 1}" if width else "no columns, leave the key out"
-      raise ConfigError(f"{key}.column={format_value(term.column)}: field {term.field!r} has {allowed}.")
-  index = np.ix_(rows, np.array(columns)) if width else (rows,)
-  if term.operation == "rotate":
-    return _Draw(term, (_Slot(term.field, index, 1.0),), (len(rows),))
-  return _Draw(term, (_Slot(term.field, index, 1.0),), (len(rows), len(columns)) if width else (len(rows),))
+  columns = np.atleast_1d(np.arange(width) if term.column is None else term.column)
+  if (columns >= width).any():
+    allowed = f"columns 0 to {width - 1}" if width else "no columns, leave the key out"
+    raise ConfigError(f"{key}.column={format_value(term.column)}: field {term.field!r} has {allowed}.")
+  index = np.ix_(rows, columns) if width else (rows,)
+  drawn = (len(rows),) if term.operation == "rotate" or not width else (len(rows), len(columns))
+  return _Draw(term, (_Slot(term.field, index, 1.0),), drawn)
 
 
 def _check_kind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> None:
@@ -286,8 +263,7 @@ def _rows(mj_model: mujoco.MjModel, term: ModelField, key: str) -> np.ndarray:
       raise ConfigError(f"{key}.target='joints' needs a field of joints (jnt_*, dof_*, qpos*), not {term.field!r}.")
     chosen = [s for s, t in zip(spans, mj_model.jnt_type, strict=True) if t != mujoco.mjtJoint.mjJNT_FREE]
   else:
-    ids = {mujoco.mj_id2name(mj_model, kind, i): i for i in range(count)}
-    ids.pop(None, None)
+    ids = {name: i for i in range(count) if (name := mujoco.mj_id2name(mj_model, kind, i))}
     targets = [term.target] if isinstance(term.target, str) else list(dict.fromkeys(term.target))
     for name in targets:
       if name not in ids:

@@ -63,12 +63,7 @@ class Env(abc.ABC):
   def __init__(self, config: Any, mj_model: mujoco.MjModel):
     """Sets the time step and puts the model on the device.
 
-    Args:
-      config: the task's ConfigDict: `ctrl_dt` and `sim_dt`, s, and `playground.envs.options.EnvConfig`.
-      mj_model: the compiled model.
-
-    Raises:
-      ConfigError: the control step is not a multiple of the physics step, or the backend is unknown.
+    `config` is the task's ConfigDict: `ctrl_dt` and `sim_dt`, s, and `playground.envs.options.EnvConfig`.
     """
     self.config = config
     self.dt: float = config.ctrl_dt
@@ -164,11 +159,7 @@ def newest_picture(env: Env, obs: Observation) -> jax.Array | None:
 
 
 def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
-  """Resolves `impl: auto`; `renders` is whether the task sees through a camera, which only Warp renders.
-
-  Raises:
-    ConfigError: unknown name, Warp asked for where it is not installed or cannot run, or another asked to render.
-  """
+  """Resolves `impl: auto`; `renders` is whether the task uses vision, which only Warp renders. Raises ConfigError."""
   if impl == "auto":
     impl = auto_impl(cuda_impl, renders, jax.default_backend() == "gpu")
   if impl not in ("jax", "warp"):

@@ -18,9 +18,7 @@ class VisionConfig:
 
   enable: Annotated[bool, "whether the task observes pixels"] = False
   camera: Annotated[str | None, "name of one of the model's cameras"] = None
-  image: Annotated[
-    Literal["rgb", "gray", "depth", "segmentation"], "segmentation is a geom's id and 1, 0 for nothing"
-  ] = "rgb"
+  image: Annotated[Literal["rgb", "gray", "depth", "segmentation"], "segmentation: geom id + 1, 0 is nothing"] = "rgb"
   width: Annotated[int, count(1, 4096), "pixels"] = 64
   height: Annotated[int, count(1, 4096), "pixels"] = 64
   frames: Annotated[int, count(1, 1000), "this image and the ones before it, newest last"] = 1
@@ -36,14 +34,10 @@ class EnvConfig:
 
   episode_length: Annotated[int, count(1, 2**24), "control steps"] = 1000
   action_repeat: Annotated[int, count(1, 1000), "control steps that take the same action"] = 1
-  impl: Annotated[Literal["auto", "jax", "warp"], "backend of physics; auto: cuda_impl on an NVIDIA GPU, else jax"] = (
-    "auto"
-  )
+  impl: Annotated[Literal["auto", "jax", "warp"], "physics; auto: cuda_impl on an NVIDIA GPU, else jax"] = "auto"
   cuda_impl: Annotated[str, "what auto is on an NVIDIA GPU: the faster backend as measured"] = "jax"
   naconmax_per_env: Annotated[int, count(0), "Warp: contacts of one environment, on average over the batch"] = 0
-  naccdmax_per_env: Annotated[
-    int | None, count(0), "Warp: of these, those of the convex collision routines; null: as many"
-  ] = None
+  naccdmax_per_env: Annotated[int | None, count(0), "Warp: of these, by convex collision; null: as many"] = None
   njmax: Annotated[int, count(0), "Warp: constraint rows of one environment"] = 0
   rewards: Annotated[TERMS, "reward terms by name (docs/add-a-reward.md)"] = dataclasses.field(default_factory=dict)
   terminations: Annotated[TERMS, "termination terms by name"] = dataclasses.field(default_factory=dict)
@@ -61,12 +55,8 @@ class TermsConfig:
   observation_order: Annotated[
     Mapping[str, Sequence[str]], "by group: terms that come first in its vector; the others follow as they are listed"
   ] = dataclasses.field(default_factory=dict)
-  reward_total: Annotated[
-    Literal["sum", "product"], "product: sum of the terms of positive weight * exp(0.2 * sum of the others)"
-  ] = "sum"
-  reward_clip: Annotated[
-    Sequence[float] | None, span(-1e9), "range that a step's reward is clipped to; null is none"
-  ] = None
+  reward_total: Annotated[Literal["sum", "product"], "product: sum of gains * exp(0.2 * sum of costs)"] = "sum"
+  reward_clip: Annotated[Sequence[float] | None, span(-1e9), "range of a step's reward; null is any"] = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,14 +10,8 @@ import mujoco
 from flax import struct
 
 from playground.envs.base import Env, State
+from playground.mdp import managers
 from playground.mdp.context import Robot, StepContext
-from playground.mdp.managers import (
-  CommandManager,
-  EventManager,
-  ObservationManager,
-  RewardManager,
-  TerminationManager,
-)
 from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
 from playground.randomization import Randomizer
 
@@ -57,30 +51,24 @@ class Task(Env):
   episode_info = ("last_act", "last_last_act", "observation_buffers")
 
   def __init__(self, config: Any, spec: mujoco.MjSpec):
-    """Compiles the scene and binds the terms.
+    """Compiles the scene and binds the terms; raises ConfigError where a value is invalid or a name does not exist.
 
-    Args:
-      config: the task's ConfigDict: that of `Env`, `observations` and `playground.envs.options.TermsConfig`.
-      spec: the scene.
-
-    Raises:
-      UnknownNameError: a term, parameter or object of the model that does not exist.
-      ConfigError: a value that is invalid.
+    `config` is that of `Env`, `observations` and `playground.envs.options.TermsConfig`.
     """
     self.spec = spec
     mj_model = spec.compile()
     self.prepare_model(mj_model, config)
-    self.rewards = RewardManager(config.rewards)
-    self.terminations = TerminationManager(config.terminations)
-    self.observations = ObservationManager(
+    self.rewards = managers.RewardManager(config.rewards)
+    self.terminations = managers.TerminationManager(config.terminations)
+    self.observations = managers.ObservationManager(
       config.observations, config.noise_level, config.observation_frames, config.observation_order
     )
     if any(not term.func.__module__.startswith("playground.") for term in self.terms()):
       self.derived = DERIVED_FIELDS  # another package's term may read any of them
     super().__init__(config, mj_model)
     self.robot = self.make_robot(mj_model, config)
-    self.commands = CommandManager(config.get("commands"), self)
-    self.events = EventManager(config.get("events"), self)
+    self.commands = managers.CommandManager(config.get("commands"), self)
+    self.events = managers.EventManager(config.get("events"), self)
     if isinstance(self.robot, Robot):
       for term in (*self.terms(), *self.events.resets):
         self.robot.check_names(term.params, f"{term.key}.params")
@@ -173,10 +161,8 @@ class Task(Env):
     """
     add = lambda values: sum(values, jnp.zeros(()))
     if self._reward_total == "product":
-      gains, costs = (
-        add(rewards[t.name] for t in self.rewards.terms if (t.options.weight > 0) == positive)
-        for positive in (True, False)
-      )
+      signed = lambda gain: add(rewards[t.name] for t in self.rewards.terms if (t.options.weight > 0) == gain)
+      gains, costs = signed(True), signed(False)
       reward = gains * jnp.exp(0.2 * costs) * self.dt
     else:
       reward = add(rewards.values()) * self.dt

@@ -51,19 +51,23 @@ class Wrapper:
 
 
 class Vectorize(Wrapper):
-  """Runs N copies of a task: `reset(keys [N])`, `step(state, actions [N, action_size])`, each on its own model."""
+  """Runs N copies of a task: `reset(keys [N])`, `step(state, actions [N, action_size])`, each on its own model.
 
-  def __init__(self, env: Env):
+  `fields` are the models of callers that pass none.
+  """
+
+  def __init__(self, env: Env, fields: ModelFields | None = None):
     super().__init__(env)
     self._reset_one, self._step_one = env.jitted
+    self._fields = fields or {}
     # On MJX's own backend nothing depends on the batch's size, and one trace serves all sizes.
     self._axis = WORLDS if env.impl == "warp" else None
 
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
-    return jax.vmap(self._reset_one, axis_name=self._axis)(rng, dict(model or {}))
+    return jax.vmap(self._reset_one, axis_name=self._axis)(rng, dict(model or self._fields))
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    return jax.vmap(self._step_one, axis_name=self._axis)(state, action, dict(model or {}))
+    return jax.vmap(self._step_one, axis_name=self._axis)(state, action, dict(model or self._fields))
 
 
 class FiniteGuard(Wrapper):
@@ -254,25 +258,7 @@ def wrap_for_training(env: Env, *, full_reset: bool = False) -> AutoReset:
 
 def wrap_for_evaluation(env: Env) -> Episode:
   """As for training, but an episode that ends stays ended."""
-  return _episodes(env, env.episode_length, env.action_repeat)
-
-
-def _episodes(env: Env, length: int, action_repeat: int) -> Episode:
-  return Episode(FiniteGuard(Vectorize(env)), length, action_repeat)
-
-
-class _FixedModels(Wrapper):
-  """Binds a batch of randomised models to a vectorised environment, for trainers that pass none."""
-
-  def __init__(self, env: Any, fields: ModelFields | None):
-    super().__init__(env)
-    self._fields = fields
-
-  def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
-    return self.env.reset(rng, self._fields if model is None else model)
-
-  def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    return self.env.step(state, action, self._fields if model is None else model)
+  return Episode(FiniteGuard(Vectorize(env)), env.episode_length, env.action_repeat)
 
 
 def wrap_for_brax_training(
@@ -284,20 +270,12 @@ def wrap_for_brax_training(
 ) -> Wrapper:
   """Wraps a task for Brax's own trainers (`ppo.train(wrap_env_fn=wrap_for_brax_training)`).
 
-  Args:
-    env: a task.
-    episode_length: control steps after which an episode is truncated.
-    action_repeat: control steps for each action.
-    randomization_fn: from the device model to (model with a leading axis N on the randomised fields, tree of the same
-      structure with 0 at those fields and None elsewhere), as `registry.get_domain_randomizer` gives it with its keys
-      bound.
-    full_reset: see `AutoReset`.
-
-  Returns:
-    An environment with batched `reset(keys [N])` and `step(state, actions [N, action_size])`.
+  `randomization_fn` takes the device model and returns (model with a leading axis N on the randomised fields, tree of
+  the same structure with 0 at those fields and None elsewhere), as `registry.get_domain_randomizer` gives it with its
+  keys bound.
   """
   fields = None if randomization_fn is None else _batched_fields(*randomization_fn(env.mjx_model))
-  return _FixedModels(AutoReset(_episodes(env, episode_length, action_repeat), full_reset), fields)
+  return AutoReset(Episode(FiniteGuard(Vectorize(env, fields)), episode_length, action_repeat), full_reset)
 
 
 def _batched_fields(model: mjx.Model, in_axes: mjx.Model) -> dict[str, jax.Array]:

@@ -27,16 +27,10 @@ class Robot:
   """
 
   def __init__(self, mj_model: mujoco.MjModel, joints: Sequence[str], sensors: Mapping[str, Any] | None = None):
-    """Looks sensors up.
-
-    Args:
-      mj_model: the compiled scene.
-      joints: names of the joints.
-      sensors: names that terms read for the model's sensors, or for several of them, one behind the other.
+    """Looks names up; `sensors` are those that terms read for the model's, or for several of them behind each other.
 
     Raises:
-      UnknownNameError: the model has no sensor of that name.
-      ConfigError: a list of sensors is empty.
+      ConfigError: the model has no sensor of that name, or a list of sensors is empty.
     """
     self.mj_model = mj_model
     self.joint_names = tuple(joints)
@@ -66,14 +60,9 @@ class Robot:
     return data.sensordata[self.rows(name)]
 
   def find_joints(self, joints: str | Sequence[str], key: str = "joints") -> np.ndarray:
-    """Returns the indices of joints, in the order of `joint_names`.
+    """Returns the indices of joints, in the order of `joint_names`; raises UnknownNameError if one matches no joint.
 
-    Args:
-      joints: a group of `joint_groups`, a regular expression that matches whole names, or several of them.
-      key: the configuration key that holds them.
-
-    Raises:
-      UnknownNameError: one that matches no joint.
+    `joints` is a group of `joint_groups`, a regular expression that matches whole names, or several of them.
     """
     found: set[int] = set()
     for name in (joints,) if isinstance(joints, str) else joints:
@@ -86,11 +75,9 @@ class Robot:
     return np.array(sorted(found))
 
   def check_names(self, params: Mapping[str, Any], key: str) -> None:
-    """Raises UnknownNameError where parameters of a term name parts that the robot or its scene does not have.
+    """Raises UnknownNameError where `params` of a term name parts that the robot or its scene does not have.
 
-    Args:
-      params: of the term; `joints`, `sensor`, `sensors`, `body`, `site` and `geom` count.
-      key: that of `params` in the configuration.
+    Those are `joints`, `sensor`, `sensors`, `body`, `site` and `geom`.
     """
     if "joints" in params:
       self.find_joints(params["joints"], f"{key}.joints")
@@ -172,11 +159,7 @@ class StepContext:
     return self.carried("command")
 
   def carried(self, name: str) -> jax.Array:
-    """Returns an entry of `info`.
-
-    Raises:
-      ConfigError: the task does not have that entry.
-    """
+    """Returns an entry of `info`; raises ConfigError if the task does not have it."""
     if name not in self.info:
       raise ConfigError(
         f"A term of env.rewards or env.observations reads info[{name!r}], which this task does not have: it needs a "

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
-from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul
+from mujoco.mjx._src.math import axis_angle_to_quat, normalize, quat_mul
 
 from playground.errors import ConfigError
 from playground.limits import MOST, AtLeast0, Share, Span, Vector, count, span
@@ -91,6 +91,48 @@ def reset_to_keyframe(
   pose = env.robot.keyframe(keyframe).at[:2].set(initial.qpos[:2])
   qvel = jnp.where(chosen, 0.0, initial.qvel)
   return initial.replace(qpos=jnp.where(chosen, pose, initial.qpos), qvel=qvel)
+
+
+def reset_body_uniform(
+  key: jax.Array, env: "Task", initial: "InitialState", body: str, reach: Vector
+) -> "InitialState":
+  """Moves a free body by U[-reach, reach) along x, y and z, m."""
+  place = env.robot.free_joint(body)
+  return initial.replace(qpos=initial.qpos.at[place].add(_uniform_vector(key, [-r for r in reach], reach, 3)))
+
+
+def reset_goal_uniform(
+  key: jax.Array,
+  env: "Task",
+  initial: "InitialState",
+  low: Vector,
+  high: Vector,
+  turn: AtLeast0 = 0.0,
+  at_least: Vector | None = None,
+) -> "InitialState":
+  """Draws the goal's position U[low, high), m, then raised to `at_least`, and turns it by U[0, turn) rad.
+
+  The entries of the turn's axis are uniform, so that it points rather to a cube's corners, as in Playground 0.2.0, for
+  which the published settings are.
+  """
+  place_key, axis_key, angle_key = jax.random.split(key, 3)
+  goal = _uniform_vector(place_key, low, high, 3)
+  goal = goal if at_least is None else jnp.maximum(goal, jnp.array(at_least))
+  axis = normalize(jax.random.uniform(axis_key, (3,), minval=-1.0, maxval=1.0))
+  quat = axis_angle_to_quat(axis, jax.random.uniform(angle_key, maxval=turn))
+  return initial.replace(mocap_pos=goal[None], mocap_quat=quat[None])
+
+
+def reset_joints_uniform(
+  key: jax.Array, env: "Task", initial: "InitialState", low: Sequence[float], high: Sequence[float]
+) -> "InitialState":
+  """Adds U[low, high) rad to each joint of the arm, within its range; the servos hold it there."""
+  robot = env.robot
+  joints = initial.qpos[robot.qpos] + _uniform_vector(key, low, high, len(robot.joint_names))
+  joints = jnp.clip(joints, *robot.joint_range)
+  ctrl = robot.init_ctrl if initial.ctrl is None else initial.ctrl
+  qpos = initial.qpos.at[robot.qpos].set(joints)
+  return initial.replace(qpos=qpos, ctrl=ctrl.at[robot.servos].set(joints))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -339,3 +381,11 @@ def horizontal(key: jax.Array) -> jax.Array:
 
 def _uniform(key: jax.Array, reach: Span, shape: tuple[int, ...] = ()) -> jax.Array:
   return jax.random.uniform(key, shape, minval=reach[0], maxval=reach[1])
+
+
+def _uniform_vector(key: jax.Array, low: Sequence[float], high: Sequence[float], size: int) -> jax.Array:
+  if not len(low) == len(high) == size or any(a > b for a, b in zip(low, high, strict=True)):
+    raise ConfigError(
+      f"env.events: low={list(low)} and high={list(high)} must be {size} numbers each, none above high."
+    )
+  return jax.random.uniform(key, (size,), minval=jnp.array(low), maxval=jnp.array(high))

@@ -40,15 +40,11 @@ class LeggedRobot(Robot):
   qvel = slice(6, None)
 
   def __init__(self, mj_model: mujoco.MjModel, config: Any):
-    """Looks the names up.
-
-    Args:
-      mj_model: the compiled scene.
-      config: `env.robot`.
+    """Looks the names of `env.robot` up.
 
     Raises:
-      UnknownNameError: the model has no object of that name.
-      ConfigError: the model's joints come in another order, or a list has not one entry for each foot or joint.
+      ConfigError: the model lacks one, its joints come in another order, or a list has not one entry for each foot or
+        joint.
     """
     joints = [mj_model.joint(i).name for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
@@ -105,11 +101,7 @@ class LeggedRobot(Robot):
       self.find("key", params["keyframe"], f"{key}.keyframe")
 
   def gait(self, name: str) -> list[float]:
-    """Returns the feet's phases at the start of a gait, rad; raises UnknownNameError if the robot has none of the name.
-
-    Raises:
-      ConfigError: it has not one phase for each foot.
-    """
+    """Returns the feet's phases at the start of a gait, rad; raises ConfigError if there is not one for each foot."""
     phases = lookup(self._gaits, name, "env.commands.gait.params.modes")
     if len(phases) != len(self.feet):
       raise ConfigError(f"env.robot.gaits.{name} must hold {len(self.feet)} phases, one for each foot.")
@@ -118,18 +110,13 @@ class LeggedRobot(Robot):
   def foot_sensors(self, data: PhysicsData, key: str) -> jax.Array:
     """Returns the readings of the feet's sensors, shape [feet, 3]; raises ConfigError if the robot has none.
 
-    Args:
-      data: the physics.
-      key: `foot_linvel` (world velocities, m/s), `foot_pos` (positions in the frame of the base site, m), `foot_force`
-        (force between foot and leg in the foot site's frame, N).
+    `key` is `foot_linvel` (world velocities, m/s), `foot_pos` (positions in the frame of the base site, m) or
+    `foot_force` (force between foot and leg in the foot site's frame, N).
     """
     return data.sensordata[self._present(key, self._foot_rows[key])]
 
   def touching(self, data: PhysicsData, group: str) -> jax.Array:
-    """Returns which contacts of a group there are, bool, shape [contacts].
-
-    Groups are `self_contact` and `fatal_contact` of the robot's YAML, and those of `add_contact_group`.
-    """
+    """Returns which contacts of a group (`contact_groups`) there are, bool, shape [contacts]."""
     return data.sensordata[self._present(group, self.contact_groups[group])] > 0
 
   def _present(self, key: str, found: np.ndarray) -> np.ndarray:

@@ -26,11 +26,7 @@ class RewardManager:
   """Weighted reward terms."""
 
   def __init__(self, section: Mapping[str, Any]):
-    """Binds `env.rewards`.
-
-    Raises:
-      ConfigError, UnknownNameError: see `terms.bind`; also a condition or weight that is invalid.
-    """
+    """Binds `env.rewards`; raises as `terms.bind`."""
     terms = bind("rewards", section)
     for term in terms:
       for name, value in (term.options.when or {}).items():
@@ -85,17 +81,7 @@ class ObservationManager:
     frames: int = 1,
     order: Mapping[str, Any] | None = None,
   ):
-    """Binds `env.observations`.
-
-    Args:
-      section: terms by group.
-      noise_level: factor on all noise; 0 is none.
-      frames: the group `state` holds that of so many steps, newest first; 0 before the episode began.
-      order: by group, the terms that come first in its vector; the others follow in the order of the section.
-
-    Raises:
-      ConfigError, UnknownNameError: see `terms.bind`; also a key of a term with an invalid value.
-    """
+    """Binds `env.observations`; raises as `terms.bind`. The other arguments are those of `TermsConfig`."""
     self._level = noise_level
     self._frames = frames
     self.groups: dict[str, list[Term]] = {}
@@ -113,15 +99,9 @@ class ObservationManager:
       raise ConfigError(f"env.observations.{ACTOR} is missing or empty: the policy would read nothing.")
 
   def compute(self, c: StepContext, key: jax.Array, buffers: Info | None = None) -> tuple[Any, Info]:
-    """Observes.
+    """Returns the observation and the buffers for the next step; `buffers` is None at the start of an episode.
 
-    Args:
-      c: the present step.
-      key: random key of noise and delays.
-      buffers: those that the step before returned; None at the start of an episode.
-
-    Returns:
-      The observation, a dict of vectors by group or one vector where `state` is the only group, and the buffers.
+    The observation is a dict of vectors by group, or one vector where `state` is the only group.
     """
     past: Info = {}
     obs: dict[str, jax.Array] = {}
@@ -194,11 +174,10 @@ def _bind_observation(group: str, name: str, entry: Any, noisy: list[str]) -> Te
   term = bind_one("observations", key, name, entry)
   if term.options.noise is None:
     return term
-  if (
-    not isinstance(term.options.noise, dict) or len(term.options.noise) != 1 or not set(term.options.noise) <= {*_NOISE}
-  ):
-    raise ConfigError(f"{key}.noise={term.options.noise!r} must have one of the keys {', '.join(_NOISE)}.")
-  kind, size = next(iter(term.options.noise.items()))
+  noise = term.options.noise
+  if not isinstance(noise, dict) or len(noise) != 1 or not set(noise) <= {*_NOISE}:
+    raise ConfigError(f"{key}.noise={noise!r} must have one of the keys {', '.join(_NOISE)}.")
+  kind, size = next(iter(noise.items()))
   if kind == "same_as" and size not in noisy:
     raise UnknownNameError(f"{key}.noise.{kind}={size} is no term with noise above it.{nearest(str(size), noisy)}")
   if kind != "same_as" and not at_least_0().each.allows(size):
@@ -264,11 +243,7 @@ class EventManager:
   """
 
   def __init__(self, section: Mapping[str, Any], env: Any):
-    """Binds `env.events`.
-
-    Raises:
-      ConfigError, UnknownNameError: see `terms.bind`; also an unknown mode, or a function of another mode.
-    """
+    """Binds `env.events`; raises as `terms.bind`."""
     self.resets: list[Term] = []
     self._intervals: list[Any] = []
     for name, entry in (section or {}).items():

@@ -36,17 +36,7 @@ class Manipulator(Robot):
   """
 
   def __init__(self, mj_model: mujoco.MjModel, keyframe: str, joints: str = ".*", sensors: Any = None):
-    """Looks the names up.
-
-    Args:
-      mj_model: the compiled scene.
-      keyframe: its start.
-      joints: regular expression of the names of the joints; free ones are not among them.
-      sensors: see `Robot`.
-
-    Raises:
-      UnknownNameError: the model has no keyframe or sensor of that name.
-    """
+    """Looks the names up; `joints` is a regular expression of the names of the joints, free ones excepted."""
     hinges = [i for i in range(mj_model.njnt) if mj_model.jnt_type[i] != mujoco.mjtJoint.mjJNT_FREE]
     self.joint_ids = np.array([i for i in hinges if re.fullmatch(joints, mj_model.joint(i).name)])
     super().__init__(mj_model, [mj_model.joint(i).name for i in self.joint_ids], sensors)
@@ -67,7 +57,6 @@ class ArmRobot(Manipulator):
   """
 
   def __init__(self, mj_model: mujoco.MjModel, keyframe: str, joints: str):
-    """Looks the names up; see `Manipulator`."""
     super().__init__(mj_model, keyframe, joints)
     self.default_pose = jnp.clip(self.default_pose, *self.joint_range)
     self.init_qpos = self.init_qpos.at[self.qpos].set(self.default_pose)
@@ -101,16 +90,7 @@ class Hand(Manipulator):
   """
 
   def __init__(self, mj_model: mujoco.MjModel, config: Any):
-    """Looks the names up.
-
-    Args:
-      mj_model: the compiled scene.
-      config: `env.robot`: `sensors` holds lists of the scene's sensors by the name that terms read.
-
-    Raises:
-      UnknownNameError: the model has no sensor of that name.
-      ConfigError: a list of names is empty.
-    """
+    """Looks the names of `env.robot` up."""
     super().__init__(mj_model, "home", sensors=config.sensors)
     self.has_servos = mj_model.nu == len(self.joint_names)
     self.cube: int = mj_model.body("cube").id

@@ -45,15 +45,10 @@ def sensed_pose(
   level: float,
   turn: Callable[[jax.Array, jax.Array, float], jax.Array] = turn_at_random,
 ) -> Pose:
-  """Returns a tracker's reading of a pose (paper, Appendix C.4).
+  """Returns a tracker's reading of a pose (paper, Appendix C.4); `level` is a factor on all noise.
 
-  Args:
-    key: random key.
-    pose: the exact one.
-    config: `pos`: m, uniform in +- on each axis; `angle`: rad, largest turn, about a random axis; `injection`: with
-      this probability the reading has nothing to do with the pose: within +- 0.5 m, in any orientation.
-    level: factor on all of them.
-    turn: turns an orientation at random by at most an angle in rad: (key, orientation, angle) -> orientation.
+  `config` has `pos` (m, uniform in +- on each axis), `angle` (rad, largest turn, about a random axis) and `injection`:
+  with this probability the reading has nothing to do with the pose: within +- 0.5 m, in any orientation.
   """
   pos_key, quat_key, wrong_key, wrong_pos_key, wrong_quat_key = jax.random.split(key, 5)
   offset = jax.random.uniform(pos_key, (3,), minval=-1.0, maxval=1.0)

@@ -34,13 +34,7 @@ from playground.text import format_value
 from playground.trust import trusted_object
 
 # Modules whose public functions and classes are the registered terms of a kind.
-MODULES = {
-  "rewards": ("playground.mdp.rewards", "playground.mdp.manipulation_rewards"),
-  "observations": ("playground.mdp.observations", "playground.mdp.manipulation_observations"),
-  "terminations": ("playground.mdp.terminations", "playground.mdp.manipulation_terminations"),
-  "commands": ("playground.mdp.commands",),
-  "events": ("playground.mdp.events", "playground.mdp.manipulation_events"),
-}
+MODULES = {kind: f"playground.mdp.{kind}" for kind in ("rewards", "observations", "terminations", "commands", "events")}
 # Classes whose properties and methods that return an array are registered observation terms, too.
 CONTEXTS = {
   "playground.mdp.context": ("StepContext",),
@@ -82,11 +76,10 @@ class Term(NamedTuple):
 def registered(kind: str) -> dict[str, Callable[..., Any]]:
   """Functions and classes of a kind (a key of `MODULES`) by name."""
   found: dict[str, Callable[..., Any]] = {}
-  for name in MODULES[kind]:
-    module = importlib.import_module(name)
-    for key, value in vars(module).items():
-      if not key.startswith("_") and callable(value) and getattr(value, "__module__", None) == name:
-        found[_snake_case(key) if isinstance(value, type) else key] = value
+  module = importlib.import_module(MODULES[kind])
+  for key, value in vars(module).items():
+    if not key.startswith("_") and callable(value) and getattr(value, "__module__", None) == module.__name__:
+      found[_snake_case(key) if isinstance(value, type) else key] = value
   return _of_contexts() | found if kind == "observations" else found
 
 
@@ -111,15 +104,10 @@ def _reader(getter: Callable[..., Any], is_method: bool) -> Callable[..., Any]:
 
 
 def bind(kind: str, section: Mapping[str, Any] | None) -> list[Term]:
-  """Binds the terms of a section, in its order; null entries are left out.
-
-  Args:
-    kind: a key of `MODULES`, and of `env` in the config.
-    section: entry by term name.
+  """Binds the terms of `env.<kind>`, in their order; null entries are left out.
 
   Raises:
-    UnknownNameError: a key, function or parameter that does not exist.
-    ConfigError: an entry that is no mapping, a missing key or parameter, or a value of the wrong type.
+    ConfigError: an unknown or missing key, function or parameter, or a value of the wrong type.
   """
   entries = {name: entry for name, entry in (section or {}).items() if entry is not None}
   return [bind_one(kind, f"env.{kind}.{name}", name, entry) for name, entry in entries.items()]
@@ -153,12 +141,7 @@ def bind_one(kind: str, key: str, name: str, entry: Any) -> Term:
 
 
 def find(kind: str, name: str, key: str) -> Callable[..., Any]:
-  """Returns the registered function or the one that `module:function` names.
-
-  Raises:
-    UnknownNameError: no function of that name is registered.
-    ConfigError: `module:function` does not exist, or its package is not trusted (`playground.trust`).
-  """
+  """Returns the registered function or the one that `module:function` names; raises ConfigError if there is none."""
   table = registered(kind)
   if name in table:
     return table[name]
@@ -178,8 +161,7 @@ def check_params(func: Callable[..., Any], given: Any, key: str, skip: int = 1) 
   """Returns keyword arguments of a function, after its first `skip`, as plain values; null is the argument's default.
 
   Raises:
-    UnknownNameError: an argument that the function does not have.
-    ConfigError: a missing argument, a number that is not finite, or a value of another type than annotated.
+    ConfigError: an unknown or missing argument, or a value that its annotation does not allow.
   """
   if not hasattr(given, "items"):
     raise ConfigError(f"{key}={given!r} is no mapping of parameters.")
@@ -212,12 +194,7 @@ def _annotation(func: Callable[..., Any], argument: inspect.Parameter) -> Any:
 
 
 def _checked(key: str, value: Any, hint: Any) -> Any:
-  """Returns a value, whole numbers as floats where the annotation says float; unknown annotations say nothing.
-
-  Raises:
-    UnknownNameError: it is none of the names of a `Literal`.
-    ConfigError: it is not of the annotated type or outside its `Limit`.
-  """
+  """Returns a value, whole numbers as floats where the annotation says float; raises ConfigError if it must not be."""
   kinds = [kind for kind in (typing.get_args(hint) if _is_union(hint) else (hint,)) if kind is not type(None)]
   if typing.get_origin(hint) is typing.Literal and value not in (known := typing.get_args(hint)):
     raise UnknownNameError(f"{key}={value!r} is unknown: choose from {', '.join(known)}.{nearest(str(value), known)}")

@@ -8,6 +8,7 @@ the same for both backends.
 
 import contextlib
 import copy
+import dataclasses
 import io
 from typing import Any
 
@@ -21,16 +22,6 @@ from playground.physics.warp_kernels import Building, dismiss, quiet_warp
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
 
-# What the next step depends on. Everything else in `mjx.Data` follows from these.
-STATE_FIELDS = (
-  "time", "qpos", "qvel", "act", "history", "ctrl", "qacc_warmstart", "qfrc_applied", "xfrc_applied", "eq_active",
-  "mocap_pos", "mocap_quat",
-)  # fmt: skip
-# What observations, rewards and terminations may read besides.
-DERIVED_FIELDS = (
-  "qacc", "sensordata", "actuator_force", "qfrc_actuator", "xpos", "xquat", "xmat", "xipos", "xanchor", "site_xpos",
-  "site_xmat", "geom_xpos", "geom_xmat", "subtree_com", "cvel", "ten_length",
-)  # fmt: skip
 # What follows forward dynamics in a step.
 _INTEGRATE = {
   mujoco.mjtIntegrator.mjINT_EULER: mjx.euler,
@@ -39,7 +30,7 @@ _INTEGRATE = {
 }
 
 WORLDS = "worlds"  # the axis of the batch of environments, for `jax.vmap(axis_name=...)`: Warp's buffers grow with it
-_FEW = 64  # environments that few need not be like the average: they get the buffers of so many
+_FEW = 64  # a batch smaller than this gets the buffers of so many environments: its mean may be above the average
 
 
 class BufferUse(struct.PyTreeNode):
@@ -101,6 +92,13 @@ class PhysicsData(struct.PyTreeNode):
   buffers: BufferUse | None = None
 
 
+_FIELDS = [field for field in dataclasses.fields(PhysicsData) if field.name != "buffers"]
+# What the next step depends on: everything else in `mjx.Data` follows from these.
+STATE_FIELDS = tuple(field.name for field in _FIELDS if field.default is dataclasses.MISSING)
+# What observations, rewards and terminations may read besides.
+DERIVED_FIELDS = tuple(field.name for field in _FIELDS if field.default is None)
+
+
 class Physics:
   """A compiled model on one backend, with the two operations tasks need: `forward` and `step`."""
 
@@ -110,9 +108,7 @@ class Physics:
     *,
     impl: str = "jax",
     derived: tuple[str, ...] = DERIVED_FIELDS,
-    naconmax_per_env: int | None = None,
-    naccdmax_per_env: int | None = None,
-    njmax: int | None = None,
+    **buffers: int | None,
   ):
     """Puts the model on the device.
 
@@ -120,19 +116,15 @@ class Physics:
       mj_model: the compiled model; its `opt.timestep` is the physics step in seconds.
       impl: 'jax' or 'warp'.
       derived: the names out of `DERIVED_FIELDS` that the task reads.
-      naconmax_per_env: Warp only, contacts to allocate for each environment of a batch, which share them all. The batch
-        is the axis named `WORLDS` of the `jax.vmap` around.
-      naccdmax_per_env: Warp only, likewise contacts of the convex collision routines; as many if None.
-      njmax: Warp only, constraint rows to allocate for each environment.
+      naconmax_per_env, naccdmax_per_env, njmax: Warp's buffers, see `EnvConfig`. The environments of a batch, the axis
+        `WORLDS` of the `jax.vmap` around, share the contacts.
     """
     self.mj_model = mj_model
     self.impl = impl
     self.derived = derived
     self._forward = mjx.forward if impl == "warp" else jax.jit(mjx.forward)  # most of all tracing: done once
     self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, _device(), impl=impl)
-    self._naconmax_per_env = naconmax_per_env
-    self._naccdmax_per_env = naccdmax_per_env
-    self._njmax = njmax
+    self._buffers = buffers
 
   def without_dynamics(self) -> "Physics":
     """The same, but `forward` computes nothing: for `jax.eval_shape`, which then takes a fraction of the time."""
@@ -145,7 +137,7 @@ class Physics:
     if self.impl != "warp" or jax.default_backend() != "gpu":
       dismiss()
       return None
-    return Building(self.mj_model, self._njmax)
+    return Building(self.mj_model, self._buffers.get("njmax"))
 
   def make(self, **fields: jax.Array) -> PhysicsData:
     """Returns the model's default state with `fields` replaced; derived fields are those of fresh data."""
@@ -189,15 +181,11 @@ class Physics:
     if self.impl == "jax":
       return mjx.make_data(self.mj_model, _device(), impl="jax")
     worlds = max(_batch_size(), _FEW)
-    shared = lambda each: None if each is None else each * worlds
-    return mjx.make_data(
-      self.mj_model,
-      _device(),
-      impl="warp",
-      naconmax=shared(self._naconmax_per_env),
-      naccdmax=shared(self._naccdmax_per_env),
-      njmax=self._njmax,
-    )
+    sizes: dict[str, Any] = {"njmax": self._buffers.get("njmax")}
+    for name in ("naconmax", "naccdmax"):
+      each = self._buffers.get(f"{name}_per_env")
+      sizes[name] = each and each * worlds
+    return mjx.make_data(self.mj_model, _device(), impl="warp", **sizes)
 
   def _full(self, data: PhysicsData) -> mjx.Data:
     return self._template().replace(**{name: getattr(data, name) for name in STATE_FIELDS})

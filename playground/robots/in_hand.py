@@ -24,12 +24,8 @@ def build_in_hand_scene(robot: Any) -> mujoco.MjSpec:
       sites `grasp_site` and `<finger>_tip`; of its `cube` `half_size` (m), `mass` (kg, spread evenly) and `start`
       (position in the keyframe, m).
 
-  Returns:
-    The scene, to edit further or `compile()`.
-
   Raises:
-    UnknownNameError: there is no such file, or it lacks the keyframe or the site.
-    ConfigError: MuJoCo cannot read it, or `start` has not three numbers.
+    ConfigError: the file is missing or invalid, lacks keyframe or site, or `start` has not three numbers.
   """
   if len(robot.cube.start) != 3:
     raise ConfigError(f"env.robot.cube.start={list(robot.cube.start)} must be three numbers: x, y and z in m.")

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 from playground.robots.terrain import add_terrain
@@ -33,29 +34,17 @@ _ROUGH = 0.05
 
 
 def configured_scene(config: Any) -> mujoco.MjSpec:
-  """Returns the scene that a task's config describes under `robot` and `scene`.
-
-  `scene` holds `terrain`, `terrain_params` (the terrain's arguments) and `collision`.
-  """
+  """Returns the scene that a task's config describes under `robot` and `scene`."""
   scene, robot = config.scene, config.robot
-  return build_scene(
-    robot.mjcf,
-    terrain=scene.terrain,
-    parameters=dict(scene.terrain_params or {}),
-    collision=scene.collision,
-    floor_contacts=tuple(robot.floor_contacts),
-  )
+  ground = {"terrain": scene.terrain, "parameters": dict(scene.terrain_params or {})}
+  return build_scene(robot.mjcf, **ground, collision=scene.collision, floor_contacts=tuple(robot.floor_contacts))
 
 
 def find_mjcf(mjcf: str) -> Path:
-  """Returns the path of a robot's MJCF.
+  """Returns the path of a robot's MJCF; raises UnknownNameError if there is no such file.
 
-  Args:
-    mjcf: `my_robot/my_robot.xml`, a file in an importable package (which is not imported), the path of a file, or the
-      name of one of our robots.
-
-  Raises:
-    UnknownNameError: there is no such file.
+  `mjcf` is `my_robot/my_robot.xml`, a file in an importable package (which is not imported), the path of a file, or the
+  name of one of our robots.
   """
   ours = {path.stem: path for path in sorted(ROBOTS.glob("*/*.xml")) if path.stem == path.parent.name}
   if mjcf in ours:
@@ -74,12 +63,7 @@ def find_mjcf(mjcf: str) -> Path:
 
 
 def read_mjcf(mjcf: str) -> mujoco.MjSpec:
-  """Reads a robot's MJCF; see `find_mjcf`.
-
-  Raises:
-    UnknownNameError: there is no such file.
-    ConfigError: MuJoCo cannot read it.
-  """
+  """Reads a robot's MJCF, see `find_mjcf`; raises ConfigError where MuJoCo cannot."""
   path = find_mjcf(mjcf)
   try:
     return mujoco.MjSpec.from_file(str(path))
@@ -105,12 +89,8 @@ def build_scene(
     floor_contacts: geoms that get a contact sensor `<geom>_floor_found` (above 0 while the geom touches the floor),
       in this order, after the robot's own sensors, but before the first of contacts between its parts and what follows.
 
-  Returns:
-    The scene, to edit further or `compile()`.
-
   Raises:
-    UnknownNameError: no such file, terrain, parameter, collision variant or geom.
-    ConfigError: an invalid MJCF or parameter, or a collision variant that the robot has no geoms for.
+    ConfigError: an invalid MJCF or parameter, an unknown name, or a collision variant that the robot has no geoms for.
   """
   activate = lookup(COLLISIONS, collision, "env.scene.collision")
   spec = read_mjcf(mjcf)
@@ -187,13 +167,9 @@ def load(part: str) -> mujoco.MjSpec:
 
 
 def attach(spec: mujoco.MjSpec, part: str, *, frame: str = "", prefix: str = "") -> None:
-  """Puts a part into a scene, with its actuators, equality constraints and contact excludes, under the names it has.
+  """Puts a part into a scene, at a frame of it or at its origin, with all that belongs to the part.
 
-  Args:
-    spec: the scene.
-    part: as in `load`. None of its names, those of default classes and materials included, may be in the scene already.
-    frame: of the scene, where the part's own origin comes to lie; the world's origin without.
-    prefix: of the part's names in the scene.
+  None of the part's names, those of default classes and materials included, may be in the scene already.
   """
   where = spec.frame(frame) if frame else spec.worldbody.add_frame()
   keys = [(key.name, {field: list(getattr(key, field)) for field in _OF_KEYFRAMES}) for key in spec.keys]
@@ -210,14 +186,9 @@ def attach(spec: mujoco.MjSpec, part: str, *, frame: str = "", prefix: str = "")
 
 
 def add_contact_sensor(spec: mujoco.MjSpec, geom: str, other: str, *, name: str = "", data: str = "found") -> None:
-  """Adds a sensor of the deepest contact between two geoms.
+  """Adds a sensor `<geom>_<other>_<data>` of the deepest contact between two geoms.
 
-  Args:
-    spec: the scene.
-    geom: from which the normal points.
-    other: to which it points.
-    name: of the sensor, `<geom>_<other>_<data>` without.
-    data: `found` (above 0 while they touch) or `normal` (3 numbers, zeros while they do not).
+  `data` is `found` (above 0 while they touch) or `normal` (3 numbers from `geom` to `other`, zeros while they do not).
   """
   field = {"found": mujoco.mjtConDataField.mjCONDATA_FOUND, "normal": mujoco.mjtConDataField.mjCONDATA_NORMAL}[data]
   spec.add_sensor(
@@ -261,6 +232,25 @@ def add_studio_floor(spec: mujoco.MjSpec, height: float = 0.0, **properties: Any
   add_studio(spec)
   plane, at = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, height]
   spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 0.05], pos=at, material=GROUND, **properties)
+
+
+def set_gains(
+  mj_model: mujoco.MjModel,
+  kp: float | Sequence[float] | None = None,
+  kv: float | Sequence[float] | None = None,
+  damping: float | Sequence[float] | None = None,
+) -> None:
+  """Sets the gains of every position servo of a robot, in place; None leaves those of the MJCF.
+
+  A servo's torque is kp * (ctrl - q) - kv * qd, clipped to its range; each hinge itself adds -damping * qd.
+  """
+  if kp is not None:
+    mj_model.actuator_gainprm[:, 0] = kp
+    mj_model.actuator_biasprm[:, 1] = -np.asarray(kp)
+  if kv is not None:
+    mj_model.actuator_biasprm[:, 2] = -np.asarray(kv)
+  if damping is not None:
+    mj_model.dof_damping[6:] = damping
 
 
 COLLISIONS: dict[str, Callable[[mujoco.MjSpec], None]] = {

@@ -22,20 +22,9 @@ _GUARDED = ("left_finger_pad", "right_finger_pad", "hand_capsule")
 
 
 def build_tabletop(name: str) -> mujoco.MjSpec:
-  """Builds a scene.
-
-  Args:
-    name: a key of `TABLETOPS`.
-
-  Returns:
-    The scene, to edit further or `compile()`. The ground is the geom `floor`; targets are mocap bodies.
-
-  Raises:
-    UnknownNameError: no such scene.
-  """
-  return lookup(
-    TABLETOPS, name, "env.scene"
-  )().copy()  # a copy does not repeat, when compiled, the warning that `attach` silences
+  """Returns a scene of `TABLETOPS`. The ground is the geom `floor`; targets are mocap bodies."""
+  # A copy does not repeat, when compiled, the warning that `attach` silences.
+  return lookup(TABLETOPS, name, "env.scene")().copy()
 
 
 def _panda() -> mujoco.MjSpec:

@@ -4,19 +4,21 @@ A terrain is a function of `TERRAINS`. It adds the geom `floor` to a scene and r
 robots start (m, at most; the flat ground's height is 0). Its keyword arguments are its parameters, in metres.
 """
 
-import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
 
-from playground.errors import ConfigError, UnknownNameError, lookup, nearest
+from playground.errors import ConfigError, lookup
+from playground.limits import SEED, Positive, count
+from playground.mdp.terms import check_params
 
 HALF_EXTENT = 10.0  # m, of the square
 POINTS = 256  # a side: 0.078 m apart
 START = 1.0  # m: feet touch the ground first within this half-extent of the origin
 _BASE = 1.0  # m of solid ground below the lowest point
+Seed = Annotated[int, SEED]
 
 
 def flat(spec: mujoco.MjSpec) -> float:
@@ -26,41 +28,40 @@ def flat(spec: mujoco.MjSpec) -> float:
 
 
 def rough(
-  spec: mujoco.MjSpec, *, seed: int = 0, elevation: float = 0.05, wavelength: float = 0.5, octaves: int = 3
+  spec: mujoco.MjSpec,
+  *,
+  seed: Seed = 0,
+  elevation: Positive = 0.05,
+  wavelength: Positive = 0.5,
+  octaves: Annotated[int, count(1, 16)] = 3,
 ) -> float:
   """Perlin noise (paper: appendix "Locomotion", rough terrain).
 
-  Args:
-    spec: the scene.
-    seed: of the noise.
-    elevation: m, from the lowest point to the highest.
-    wavelength: m, of the broadest bumps.
-    octaves: number of layers; each has half the wavelength and half the height of the one before.
+  `elevation` is from the lowest point to the highest, `wavelength` that of the broadest bumps. Each of the `octaves`
+  has half the wavelength and half the height of the one before.
   """
-  _check_positive("rough", elevation=elevation, wavelength=wavelength, octaves=octaves)
   rng = np.random.default_rng(seed)
   cells = 2 * HALF_EXTENT / wavelength
   noise = sum(0.5**i * _perlin(rng, max(1, round(cells * 2**i))) for i in range(octaves))
   return _add_height_field(spec, _stretch(np.asarray(noise), elevation))
 
 
-def white_noise(spec: mujoco.MjSpec, *, seed: int = 0, elevation: float = 0.05) -> float:
+def white_noise(spec: mujoco.MjSpec, *, seed: Seed = 0, elevation: Positive = 0.05) -> float:
   """Independent heights of 256 levels: what Playground 0.2.0 takes for rough terrain, from a file that has no name."""
-  _check_positive("white_noise", elevation=elevation)
   levels = np.random.default_rng(seed).integers(0, 256, (POINTS, POINTS))
   return _add_height_field(spec, _stretch(levels, elevation))
 
 
-def stairs(spec: mujoco.MjSpec, *, step_height: float = 0.1, step_width: float = 0.4, platform: float = 2.0) -> float:
+def stairs(
+  spec: mujoco.MjSpec, *, step_height: float = 0.1, step_width: Positive = 0.4, platform: Positive = 2.0
+) -> float:
   """Square rings of steps about a platform in the middle, risers 0.08 m deep; a negative `step_height` leads down."""
-  _check_positive("stairs", step_width=step_width, platform=platform)
   steps = np.ceil(np.maximum(_distance() - platform / 2, 0) / step_width)
   return _add_height_field(spec, step_height * steps)
 
 
-def slope(spec: mujoco.MjSpec, *, gradient: float = 0.2, platform: float = 2.0) -> float:
+def slope(spec: mujoco.MjSpec, *, gradient: float = 0.2, platform: Positive = 2.0) -> float:
   """Four ramps about a platform in the middle; a negative `gradient` (rise over run) leads down."""
-  _check_positive("slope", platform=platform)
   return _add_height_field(spec, gradient * np.maximum(_distance() - platform / 2, 0))
 
 
@@ -70,14 +71,9 @@ TERRAINS: dict[str, Callable[..., float]] = {
 
 
 def add_terrain(spec: mujoco.MjSpec, name: str, parameters: Mapping[str, Any]) -> float:
-  """Calls a terrain of `TERRAINS` with its parameters checked; raises ConfigError or UnknownNameError."""
+  """Calls a terrain of `TERRAINS` with its parameters checked; raises ConfigError."""
   terrain = lookup(TERRAINS, name, "env.scene.terrain")
-  known = list(inspect.signature(terrain).parameters)[1:]
-  for key in parameters:
-    if key not in known:
-      has = f"takes {', '.join(known)}" if known else "takes no parameters"
-      raise UnknownNameError(f"{key!r} is no parameter of terrain={name}, which {has}.{nearest(key, known)}")
-  return terrain(spec, **parameters)
+  return terrain(spec, **check_params(terrain, parameters, "env.scene.terrain_params"))
 
 
 def _add_floor(spec: mujoco.MjSpec, *classes: str, **shape: Any) -> None:
@@ -128,9 +124,3 @@ def _perlin(rng: np.random.Generator, cells: int) -> np.ndarray:
     return height * np.abs(1 - i - blend)[:, None] * np.abs(1 - j - blend)
 
   return seen_from(0, 0) + seen_from(0, 1) + seen_from(1, 0) + seen_from(1, 1)
-
-
-def _check_positive(terrain: str, **parameters: float) -> None:
-  for name, value in parameters.items():
-    if not value > 0:
-      raise ConfigError(f"{name}={value} of terrain={terrain} must be above 0.")

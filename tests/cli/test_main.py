@@ -97,7 +97,7 @@ def test_list_needs_no_jax():
     ),
     (
       ["PandaPickCubeCartesian"],
-      ["gripper_pos 3 site gripper Position of a site", "site_pos playground/mdp/manipulation_observations.py:"],
+      ["gripper_pos 3 site gripper Position of a site", "site_pos playground/mdp/manipulators.py:"],
     ),
     (["CartpoleBalance", "--num-views", "2", "env.impl=jax"], ["backend jax"]),
     (

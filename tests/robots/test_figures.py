@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from playground.robots.gains import set_gains
+from playground.robots.scene import set_gains
 from playground.robots.tabletop import build_tabletop
 from tests.robots.figures import (
   Scene,

@@ -9,8 +9,7 @@ import pytest
 from ml_collections import ConfigDict
 
 from playground.mdp.legged import LeggedRobot
-from playground.robots.gains import set_gains
-from playground.robots.scene import build_scene
+from playground.robots.scene import build_scene, set_gains
 from tests.robots.figures import robot_config
 
 BALANCED = ("go1", "spot", "barkour", "h1", "op3")

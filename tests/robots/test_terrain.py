@@ -119,11 +119,11 @@ def test_cylinders_of_the_full_collision_variants_stand_on_height_fields() -> No
   ("terrain", "parameters", "message"),
   [
     ("rogh", {}, r"env\.scene\.terrain: 'rogh' is unknown; choose from flat, .*Did you mean 'rough'\?"),
-    ("stairs", {"step_hight": 1}, r"'step_hight' is no parameter of terrain=stairs.*Did you mean 'step_height'\?"),
-    ("flat", {"seed": 1}, "'seed' is no parameter of terrain=flat, which takes no parameters"),
+    ("stairs", {"step_hight": 1}, r"terrain_params\.step_hight does not exist: stairs .*Did you mean 'step_height'\?"),
+    ("flat", {"seed": 1}, r"env\.scene\.terrain_params\.seed does not exist: flat takes no parameters"),
     ("stairs", {"step_height": 0}, "no heights: choose terrain=flat"),
-    ("slope", {"platform": 0}, "platform=0 of terrain=slope must be above 0"),
-    ("rough", {"wavelength": -1.0}, "wavelength=-1.0 of terrain=rough must be above 0"),
+    ("slope", {"platform": 0}, r"terrain_params\.platform=0 must be a number above 0"),
+    ("rough", {"wavelength": -1.0}, r"terrain_params\.wavelength=-1\.0 must be a number above 0"),
   ],
 )
 def test_refusals(terrain: str, parameters: dict[str, Any], message: str) -> None:
@@ -147,7 +147,7 @@ def test_terrain_is_chosen_by_its_short_name() -> None:
 
 
 def test_parameters_are_those_of_the_terrain() -> None:
-  with pytest.raises(ConfigError, match="'step_height' is no parameter of terrain=rough"):
+  with pytest.raises(ConfigError, match=r"terrain_params\.step_height does not exist: rough takes"):
     ground("terrain=rough", "env.scene.terrain_params={step_height: 0.05}")
 
 

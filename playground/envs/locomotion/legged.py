@@ -12,8 +12,7 @@ from playground.errors import ConfigError, lookup
 from playground.mdp.context import StepContext
 from playground.mdp.legged import LeggedContext, LeggedRobot
 from playground.physics.backend import PhysicsData, mjx
-from playground.robots.gains import set_gains
-from playground.robots.scene import configured_scene
+from playground.robots.scene import configured_scene, set_gains
 
 # What an action is added to: the joints' default pose, their position, or their target in the step before.
 _ACTION_BASES: dict[str, Callable[[LeggedRobot, PhysicsData], jax.Array]] = {
@@ -39,15 +38,7 @@ class LeggedTask(Task):
   }
 
   def __init__(self, config: Any):
-    """Builds the scene and binds the terms.
-
-    Args:
-      config: the task's ConfigDict (`configs/env/joystick.yaml`, `getup.yaml`, ...) with the robot under `robot`.
-
-    Raises:
-      UnknownNameError: a term, robot, terrain or object that does not exist.
-      ConfigError: a value that is invalid.
-    """
+    """Builds the scene and binds the terms; `config` is that of `configs/env/joystick.yaml`, `getup.yaml`, ..."""
     super().__init__(config, self.scene(config))
     self._action_base = lookup(_ACTION_BASES, config.action_base, "env.action_base")
     self._action_scale: float = config.action_scale

@@ -38,12 +38,8 @@ class TabletopTask(Task):
     """Builds the scene and binds the terms.
 
     Args:
-      config: the task's ConfigDict: that of `Task`, `scene` (`playground.robots.tabletop`), `action_scale`, `keyframe`,
-        `success_distance` and, where terms read them, `success_angle`, `object` and `gripper`.
-
-    Raises:
-      UnknownNameError: a term, parameter or object of the model that does not exist.
-      ConfigError: a value that is invalid.
+      config: that of `Task`, `scene` (`playground.robots.tabletop`), `action_scale`, `keyframe`, `success_distance`
+        and, where terms read them, `success_angle`, `object` and `gripper`.
     """
     self.object, self.gripper = config.get("object"), config.get("gripper")
     super().__init__(config, build_tabletop(config.scene))

@@ -1,12 +1,10 @@
 """Hand a box over from one hand to the other."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from playground.envs.base import State
 from playground.envs.manipulation.arm import Bimanual, ProgressTask
 from playground.mdp.manipulators import ArmContext
 from playground.physics.backend import PhysicsData, mjx
@@ -38,11 +36,8 @@ class HandOver(ProgressTask, Bimanual):
 
   def bonus(self, c: ArmContext, potential: jax.Array) -> jax.Array:
     left_x = c.site_pos("left/gripper")[0]
-    return _HOLDING_RATE * potential * _beyond(-left_x, 0.0) * _beyond(c.object_pos[0], 0.1)
-
-  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
-    state = super().post_step(data, info, action)
-    return state.replace(reward=state.reward - _DROP_COST * dropped(ArmContext(self, data, info, action)))
+    holding = _HOLDING_RATE * potential * _beyond(-left_x, 0.0) * _beyond(c.object_pos[0], 0.1)
+    return holding - _DROP_COST * dropped(c)
 
   def at_goal(self, c: ArmContext) -> jax.Array:
     return super().at_goal(c) & (c.site_pos("left/gripper")[0] < 0)

@@ -36,15 +36,7 @@ class HandTask(Task):
   derived = ("sensordata", "actuator_force", "qfrc_actuator")
 
   def __init__(self, config: Any):
-    """Builds the scene and binds the terms.
-
-    Args:
-      config: the task's ConfigDict (`configs/env/_in_hand.yaml` and those that build on it), the hand under `robot`.
-
-    Raises:
-      UnknownNameError: a term, hand, sensor or object that does not exist.
-      ConfigError: a value that is invalid.
-    """
+    """Builds the scene and binds the terms; `config` is that of `configs/env/_in_hand.yaml`."""
     super().__init__(config, self.scene(config))
     self._action_base = lookup(_ACTION_BASES, config.action_base, "env.action_base")
     self._action_scale = np.asarray(config.action_scale)

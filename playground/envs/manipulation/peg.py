@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from playground.envs.manipulation.arm import Bimanual
 from playground.limits import AtLeast0
-from playground.mdp.manipulation_rewards import joint_deviation_tolerance, site_body_distance_tolerance
 from playground.mdp.manipulators import ArmContext
+from playground.mdp.rewards import joint_deviation_tolerance, site_body_distance_tolerance
 from playground.mdp.tolerance import tolerance
 
 _IN_LINE = 0.005  # m off the socket's axis, within which the peg slides in

@@ -53,11 +53,7 @@ class PushCube(ArmTask):
   }
 
   def __init__(self, config: Any):
-    """Builds the scene. `config`: see `configs/env/PandaRobotiqPushCube.yaml`.
-
-    Raises:
-      ConfigError: a curriculum whose lists differ in length.
-    """
+    """Builds the scene. `config`: see `configs/env/PandaRobotiqPushCube.yaml`."""
     if len(config.curriculum.distance) != len(config.curriculum.angle):
       raise ConfigError("env.curriculum.distance and env.curriculum.angle must have an entry for each level.")
     super().__init__(config)

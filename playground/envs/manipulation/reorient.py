@@ -43,7 +43,7 @@ class Reorient(HandTask):
   episode_info = (*HandTask.episode_info, "goal_spin", "steps_since_success", "success_count", "stuck")
 
   def __init__(self, config: Any):
-    """Builds the task, as `HandTask`, from `configs/env/LeapCubeReorient.yaml`."""
+    """Builds the scene. `config`: see `configs/env/LeapCubeReorient.yaml`."""
     super().__init__(config)
     self._goal_pos = jnp.array(self.mj_model.key("home").mpos)
     self._min_turn: float = config.goal.min_turn
@@ -108,10 +108,7 @@ def success(c: HandContext) -> jax.Array:
 def new_spin(key: jax.Array, min_turn: float, dt: float) -> jax.Array:
   """Returns a goal's angular velocity in its own frame right after it was reached, rad/s [3].
 
-  Args:
-    key: random key.
-    min_turn: rad that it turns by in the end, at least.
-    dt: control step, s.
+  In the end the goal has turned by `min_turn` rad at least.
   """
   low, high = _SPIN
   spin = jax.random.uniform(key, (3,), minval=low, maxval=high)

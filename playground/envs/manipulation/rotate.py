@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.manipulation.in_hand import HandTask
-from playground.mdp.manipulation_rewards import cube_ang_vel_z
 from playground.mdp.manipulators import HandContext
+from playground.mdp.rewards import cube_ang_vel_z
 
 
 class RotateZ(HandTask):

@@ -28,14 +28,9 @@ JOINT_RANGE = jnp.array([_LOWER, _UPPER])  # rad, lower and upper
 
 
 def forward_kinematics(q: jax.Array, tip: float = TIP) -> tuple[jax.Array, jax.Array]:
-  """Where joint angles put the hand.
+  """Returns position of the tip [3], m, and rotation matrix of the hand [3, 3], in the frame of the arm's base.
 
-  Args:
-    q: shape [7], rad.
-    tip: m beyond joint 6's axis, along the hand.
-
-  Returns:
-    Position of the tip [3], m, and rotation matrix of the hand [3, 3], both in the frame of the arm's base.
+  `q` are joint angles [7], rad; `tip` is m beyond joint 6's axis, along the hand.
   """
   pos, rot = jnp.zeros(3), jnp.eye(3)
   for i in range(7):
@@ -49,12 +44,10 @@ def inverse_kinematics(pos: jax.Array, rot: jax.Array, q7: jax.Array, near: jax.
   """Joint angles that put the hand's tip at a pose.
 
   Args:
-    pos: of the tip [3], m, in the frame of the arm's base.
-    rot: rotation matrix of the hand [3, 3].
+    pos, rot, tip: as `forward_kinematics` has them.
     q7: angle of joint 7, rad.
     near: joint angles [7], rad, that say which of four solutions to take: the one with joint 2 on its side of zero and
       joint 5 on its side of a quarter turn. Where joint 1 is free (the upper arm is vertical), it is as in `near`.
-    tip: as in `forward_kinematics`.
 
   Returns:
     Angles [7], rad, which may lie outside `JOINT_RANGE` (see `within_limits`); joint 4 is at or below -0.47, where the
