@@ -7,20 +7,19 @@ says how its vector mirrors, with `playground.mdp.options.mirrors_as`. Sensors c
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
 import numpy as np
 
+from playground.envs.base import Env
+from playground.envs.task import Task
 from playground.errors import ConfigError
 from playground.mdp.legged import LeggedRobot
 from playground.mdp.managers import ACTOR
 from playground.mdp.options import MirrorKind
 from playground.mdp.terms import Term
-
-if TYPE_CHECKING:
-  from playground.envs.base import Env
 
 _SIGNS: dict[str, list[float]] = {
   "same": [1.0],
@@ -50,14 +49,14 @@ class Mirror(NamedTuple):
   action: Reflection
 
 
-def mirror_of(env: "Env") -> Mirror:
+def mirror_of(env: Env) -> Mirror:
   """Returns the mirror of a task.
 
   Raises:
     ConfigError: the task's robot has none, or an observation term does not say how it mirrors.
   """
   task: Any = env.unwrapped
-  if not isinstance(getattr(task, "robot", None), LeggedRobot):
+  if not isinstance(task, Task) or not isinstance(task.robot, LeggedRobot):
     raise ConfigError("only tasks of robots on legs have a left-right mirror, and this task has no such robot.")
   joints, feet = joint_reflection(task.robot), _feet_reflection(task.robot)
   groups: dict[str, Reflection] = {}
