@@ -180,6 +180,17 @@ KEYS = jnp.stack([jax.random.PRNGKey(seed) for seed in range(BATCH)])
 _ROWS = {"data/sensordata": "sensor", "data/site_xpos": "site", "data/site_xmat": "site"}
 
 
+def _shapes(env: Any) -> State:
+  """Shapes of what a reset returns, which do not depend on the dynamics."""
+  physics = env.physics
+  env.physics = still = physics.without_dynamics()
+  del still.forward, still.step  # which are compiled, see `compiled_task`
+  try:
+    return jax.eval_shape(env.reset, KEYS[0])
+  finally:
+    env.physics = physics
+
+
 def load_task(name: str, overrides: Mapping[str, Any] | None = None) -> Any:
   """Builds a task (typed Any, since tests look into it); `{"action_scale": 0}` overrides its config."""
   return playground.load(name, overrides=overrides)
@@ -224,7 +235,7 @@ class Golden:
     for key in self._arrays.keys() & _ROWS.keys():
       self._arrays[key] = self._our_rows(self._arrays[key], _ROWS[key], header["model"])
     self.actions = jnp.array(self._arrays.pop("action"))
-    self._ours = jax.eval_shape(self.env.reset, KEYS[0])
+    self._ours = _shapes(self.env)
     self._default = self.env.physics.make()
     states: State = jax.tree_util.tree_map_with_path(self._recorded, self._ours)
     # Tied to a device as what the task computes is, else its program would be compiled again.

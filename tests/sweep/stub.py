@@ -19,8 +19,6 @@ seed = int((run / "config.yaml").read_text()) if again else int(given["seed"])
 facts = {"pid": os.getpid(), "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"), "cores": sorted(os.sched_getaffinity(0))}
 PLACE = ("XLA_PYTHON_CLIENT_MEM_FRACTION", "WANDB_RUN_GROUP", "CUDA_MPS_PIPE_DIRECTORY")
 facts |= {name: os.environ.get(name) for name in PLACE}
-with (run / "starts.jsonl").open("a") as file:
-  file.write(json.dumps(facts | {"began": time.time(), "again": again}) + "\n")
 
 
 def status(word: str, reason: str = "") -> None:
@@ -33,17 +31,21 @@ def save(*_: object) -> None:
   sys.exit(143)
 
 
+if seed == 11:
+  signal.signal(signal.SIGTERM, signal.SIG_IGN)
+if seed == 13 and not again:
+  signal.signal(signal.SIGTERM, save)
 status("running")
+with (run / "starts.jsonl").open("a") as file:  # whoever reads it may send a signal
+  file.write(json.dumps(facts | {"began": time.time(), "again": again}) + "\n")
 if seed == 10 or (seed == 14 and not again):
   print("Traceback …\nValueError: out of luck")
   sys.exit(1)
 if seed == 11:
-  signal.signal(signal.SIGTERM, signal.SIG_IGN)
   time.sleep(60)
 if seed == 12:
   os.kill(os.getpid(), signal.SIGKILL)
 if seed == 13 and not again:
-  signal.signal(signal.SIGTERM, save)
   time.sleep(60)
 if seed == 15:
   time.sleep(1.5)

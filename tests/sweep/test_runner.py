@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import time
 from pathlib import Path
 
 import pandas as pd
@@ -25,12 +24,12 @@ def alive(pid: int) -> bool:
 
 def test_whatever_ends_a_job_the_others_go_on(tmp_path: Path) -> None:
   sweep = make_sweep(tmp_path / "sweep", 10, 11, 12, 0, 1)
-  assert run(sweep, "launcher.timeout=1.5", "launcher.grace=0.5") == 3
+  assert run(sweep, "launcher.timeout=5", "launcher.grace=0.5") == 3
   assert statuses(sweep) == {10: "failed", 11: "timeout", 12: "killed", 0: "finished", 1: "finished"}
   reasons = [state.reason for state in sweep.states().values()]
   assert reasons[:3] == [
     "exit code 1: ValueError: out of luck",
-    "took longer than launcher.timeout=1.5 s",
+    "took longer than launcher.timeout=5 s",
     "killed by SIGKILL, perhaps for want of memory",
   ]
   assert not alive(starts(sweep)[11][0]["pid"])
@@ -81,7 +80,6 @@ def test_an_interrupt_saves_and_starts_nothing_more(tmp_path: Path, signum: int,
   folders = [sweep.folder(job).path for job in sweep.jobs]
   slots = min(2, len(os.sched_getaffinity(0)))
   wait_for(lambda: sum((folder / "starts.jsonl").is_file() for folder in folders) == slots)
-  time.sleep(0.3)  # let the jobs listen
   process.send_signal(signum)
   assert process.wait(30) == code
   states = [state.status for state in sweep.states().values()]
@@ -95,7 +93,6 @@ def test_a_second_interrupt_kills(tmp_path: Path) -> None:
   sweep = make_sweep(tmp_path / "sweep", 11)
   process = controller(sweep, "launcher.grace=60")
   wait_for(lambda: bool(starts(sweep)[11]))
-  time.sleep(0.3)
   process.send_signal(signal.SIGINT)
   wait_for(lambda: "asked to stop" in output(sweep))
   process.send_signal(signal.SIGINT)

@@ -51,7 +51,6 @@ def test_a_preempted_job_saves_is_queued_again_and_resumes(tmp_path: Path, local
   while not starts(sweep)[13]:
     assert time.monotonic() < until
     time.sleep(0.05)
-  time.sleep(0.3)  # let it listen
   for process in ("job_pid", "pid"):  # as Slurm does, for submitit to handle; some tell every process of a job
     os.kill(sweep.folder(job).record[process], signal.SIGUSR2)
   while launcher.busy(job):
