@@ -17,7 +17,7 @@ GROUPS = ("hardware", "debug", "randomization", "robot", "terrain")  # overrides
 OVERRIDES = "overrides"  # the field that takes overrides, where a command has one
 
 
-def option(default: Any, what: str) -> Any:
+def option(default: T, what: str) -> T:
   """A field with a default and a line of help."""
   return dataclasses.field(default=default, metadata={"help": what})
 
@@ -57,7 +57,7 @@ def parse(command: str, options: type[T], arguments: Sequence[str]) -> T:
   return options(**values)
 
 
-def check_amounts(options: Any) -> None:
+def check_amounts(options: object) -> None:
   """Raises ConfigError for amounts that cannot be, by the names that all commands have for them."""
   given = vars(options)
   for name in ("seconds", "minutes"):
@@ -84,7 +84,7 @@ def help_of(options: type) -> list[str]:
   return [f"  {shown[field.name]:{width}}{field.metadata['help']}" for field in fields]
 
 
-def _read(key: str, text: str, kind: Any) -> Any:
+def _read(key: str, text: str, kind: Any) -> object:
   """The value of a key; `kind` is a type, one or None, or a tuple of one kind of item."""
   choices = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
   if type(None) in choices and text == "null":
@@ -97,7 +97,7 @@ def _read(key: str, text: str, kind: Any) -> Any:
   return _item(key, text, kind)
 
 
-def _item(key: str, text: str, kind: type) -> Any:
+def _item(key: str, text: str, kind: type) -> object:
   words = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
   try:
     value = text if kind is str else yaml.safe_load(text)

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from playground.benchmark.arguments import option
 from playground.benchmark.jobs import Measurement, probe, run_jobs
@@ -38,7 +37,7 @@ class Throughput(OfTasks):
 
   name = "throughput"
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
+  def jobs(self, devices: int) -> list[Measurement]:
     seeds = list(range(1, self.seeds + 1))
     return [self.on_one_device(self.job("training", task, seeds=seeds)) for task in self.chosen()]
 
@@ -51,7 +50,7 @@ class Startup(OfTasks):
   alone = True
   sets_devices = False
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
+  def jobs(self, devices: int) -> list[Measurement]:
     last = {"quantity": "start_to_first_update_s", "setting": " ".join((*self.overrides, "warm"))}
     jobs = [self.job("runs:startup", task) for task in self.chosen()]
     return [dataclasses.replace(job, last=last) for job in jobs]
@@ -65,7 +64,7 @@ class Scaling(OfTasks):
 
   name = "scaling"
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
+  def jobs(self, devices: int) -> list[Measurement]:
     jobs = []
     for task in self.chosen():
       for count in self.num_envs:
@@ -81,7 +80,7 @@ class Breakdown(OfTasks):
 
   name = "breakdown"
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
+  def jobs(self, devices: int) -> list[Measurement]:
     last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, "part=update"))}
     jobs = [self.on_one_device(self.job("breakdown", task)) for task in self.chosen()]
     return [dataclasses.replace(job, last=last) for job in jobs]
@@ -112,7 +111,7 @@ class Pixels(OfTasks):
       if not self.configured(task).env.vision.enable:
         raise ConfigError(f"{task} sees nothing: add env.vision.enable=true env.vision.camera=<name>.")
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
+  def jobs(self, devices: int) -> list[Measurement]:
     jobs = []
     until = "pixels" if self.compared else "update"  # simulators are compared without policies
     for task in self.chosen():
@@ -146,10 +145,10 @@ class Topology(OfRuns):
       if kind not in ("fixed", "scaled"):
         raise ConfigError(f"hyperparameters={kind} must be fixed, scaled or both.")
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
-    counts = self.devices or [2**i for i in range(facts["devices"].bit_length())]
-    if max(counts) > facts["devices"]:
-      raise ConfigError(f"devices={list(counts)}: this machine has {facts['devices']}.")
+  def jobs(self, devices: int) -> list[Measurement]:
+    counts = self.devices or [2**i for i in range(devices.bit_length())]
+    if max(counts) > devices:
+      raise ConfigError(f"devices={list(counts)}: this machine has {devices}.")
     seeds = list(range(1, self.seeds + 1))
     rates, runs = [], []
     for task in self.chosen():
@@ -179,7 +178,7 @@ class Chain(Measuring):
     if not compose([f"experiment={self.experiment}", *self.overrides]).stages:
       raise ConfigError(f"experiment={self.experiment} is no chain: choose one that ends in _chain.")
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
+  def jobs(self, devices: int) -> list[Measurement]:
     agent = compose([f"experiment={self.experiment}", *self.overrides]).agent_name
     arguments = {"experiment": self.experiment, "overrides": list(self.overrides)}
     arguments |= {"runs": self.runs, "again": self.rerun}
@@ -215,7 +214,9 @@ class BesidePeer(OfTasks):
       raise ConfigError(f"agent={self.agent}: {self.name} is of {' or '.join(self.agents)}.")
     check_peer(self.peer, self.peer_python, self.peer_path, self.peer_menagerie)
 
-  def peer_job(self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: Any) -> Measurement:
+  def peer_job(
+    self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: object
+  ) -> Measurement:
     """A measurement of the peer; overrides are of our run and do not reach it."""
     peer = {"name": self.peer, "python": self.peer_python, "path": self.peer_path, "menagerie": self.peer_menagerie}
     columns = self.columns(task, self.agent, setting, PEERS[self.peer].label)
@@ -231,7 +232,7 @@ class Compare(BesidePeer):
   name = "compare"
   alone = True
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
+  def jobs(self, devices: int) -> list[Measurement]:
     jobs = []
     for task in self.chosen():
       for turn in range(1, self.repeats + 1):
@@ -261,7 +262,7 @@ class Learning(BesidePeer, OfRuns):
     if self.agent == "sac" and (others := set(self.chosen()) - set(tasks_of("dm_control"))):
       raise ConfigError(f"agent=sac: the package trains SAC on DM Control alone, not {', '.join(sorted(others))}.")
 
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
+  def jobs(self, devices: int) -> list[Measurement]:
     jobs = []
     for task in self.chosen():
       for seed in range(1, self.seeds + 1):
@@ -285,7 +286,7 @@ def run(command: Measuring) -> int:
   command.check()
   table = Table(Path(command.out) if command.out else RESULTS / f"{command.name}.csv")
   hardware = [text for text in command.overrides if text.startswith("hardware")]
-  facts = probe(hardware, command.gpus)
-  jobs = command.jobs(facts)  # says what does not fit, before anything else is said
-  print(f"{facts['devices']} x {facts['device']}; {facts['versions']}")
+  devices, facts = probe(hardware, command.gpus)
+  jobs = command.jobs(devices)  # says what does not fit, before anything else is said
+  print(f"{devices} x {facts['device']}; {facts['versions']}")
   return run_jobs(jobs, table, facts, command)

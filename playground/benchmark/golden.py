@@ -5,7 +5,6 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -62,12 +61,14 @@ def run(options: Options) -> int:
   chosen = [lookup(runs, name, "only") for name in options.only] or list(runs.values())
   jobs = [measurement(each, options) for each in chosen]
   table = Table(Path(options.out or "results/benchmarks/golden.csv"))
-  facts = probe([text for text in options.overrides if text.startswith("hardware")], options.gpus)
-  print(f"{facts['devices']} x {facts['device']}; {facts['versions']}")
+  devices, facts = probe([text for text in options.overrides if text.startswith("hardware")], options.gpus)
+  print(f"{devices} x {facts['device']}; {facts['versions']}")
   earlier = len(table.rows())
   code = run_jobs(jobs, table, facts, options)
   rows = table.rows(earlier if options.rerun else 0)
-  outside = [name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job, facts))]
+  outside = [
+    name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job, facts["device"]))
+  ]
   if outside:
     print(f"error: outside of their windows: {', '.join(each.name for each in outside)}.", file=sys.stderr)
   return code or (1 if outside else 0)
@@ -101,10 +102,10 @@ def setting(overrides: Sequence[str], metric: str) -> str:
   return " ".join((*overrides, f"metric={metric}"))
 
 
-def values(rows: Sequence[Mapping[str, str]], job: Measurement, facts: Mapping[str, Any]) -> dict[str, float]:
+def values(rows: Sequence[Mapping[str, str]], job: Measurement, device: str) -> dict[str, float]:
   """The newest value of each metric of a run on this device."""
   metrics = dict(zip(job.arguments["settings"], job.arguments["metrics"], strict=True))
-  same = {"benchmark": "golden", "task": job.columns["task"], "quantity": QUANTITY, "device": facts["device"]}
+  same = {"benchmark": "golden", "task": job.columns["task"], "quantity": QUANTITY, "device": device}
   own = [row for row in rows if row["setting"] in metrics and all(row[key] == text for key, text in same.items())]
   return {metrics[row["setting"]]: float(row["value"]) for row in own}
 
@@ -132,7 +133,7 @@ def read(path: Path) -> dict[str, dict[str, Golden]]:
   }
 
 
-def _golden(place: str, name: str, entry: Any) -> Golden:
+def _golden(place: str, name: str, entry: object) -> Golden:
   if not isinstance(entry, dict) or set(entry) != set(_KEYS):
     raise ConfigError(f"{place} must have the keys {', '.join(_KEYS)}.")
   overrides, metrics = entry["run"], entry["metrics"]
@@ -144,8 +145,9 @@ def _golden(place: str, name: str, entry: Any) -> Golden:
   return Golden(name, tuple(overrides), windows, str(entry["from"]))
 
 
-def _window(place: str, window: Any) -> tuple[float, float]:
-  numbers = isinstance(window, list) and all(type(x) in (int, float) and math.isfinite(x) for x in window)
-  if not numbers or len(window) != 2 or window[0] > window[1]:
+def _window(place: str, window: object) -> tuple[float, float]:
+  ends = window if isinstance(window, list) else []
+  numbers = all(type(x) in (int, float) and math.isfinite(x) for x in ends)
+  if not numbers or len(ends) != 2 or ends[0] > ends[1]:
     raise ConfigError(f"{place}={window} must be two numbers, the least and the most.")
-  return float(window[0]), float(window[1])
+  return float(ends[0]), float(ends[1])

@@ -47,9 +47,9 @@ class Measurement:
   columns: Mapping[str, str]
   last: Mapping[str, str]
 
-  def left(self, table: Table, facts: Mapping[str, Any]) -> "Measurement | None":
+  def left(self, table: Table, device: str) -> "Measurement | None":
     """The part that the table does not have for this device yet; None if there is none."""
-    row = {"device": facts["device"], **self.columns, **self.last}
+    row = {"device": device, **self.columns, **self.last}
     if "seeds" not in self.arguments:
       return None if table.has(row) else self
     seeds = [seed for seed in self.arguments["seeds"] if not table.has(row | {"seed": seed})]
@@ -133,8 +133,10 @@ def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int
     return code, rows
 
 
-def probe(overrides: Sequence[str], gpus: Sequence[int]) -> dict[str, Any]:
-  """The device and the versions that measurements will have, found in a process of its own: this one holds no device.
+def probe(overrides: Sequence[str], gpus: Sequence[int]) -> tuple[int, dict[str, str]]:
+  """The number of devices that measurements will have, and their columns `device` and `versions`.
+
+  Asks a process of its own, for this one holds no device.
 
   Raises:
     HardwareError: the device cannot be used.
@@ -147,22 +149,22 @@ def probe(overrides: Sequence[str], gpus: Sequence[int]) -> dict[str, Any]:
     sys.exit(code)
   if code:
     raise HardwareError(rows.reasons["000"])
-  return {"devices": int(found[0]["value"]), "device": found[0]["device"], "versions": found[0]["versions"]}
+  return int(found[0]["value"]), {name: found[0][name] for name in ("device", "versions")}
 
 
-def run_jobs(measurements: Sequence[Measurement], table: Table, facts: Mapping[str, Any], plan: Plan) -> int:
+def run_jobs(measurements: Sequence[Measurement], table: Table, facts: Mapping[str, str], plan: Plan) -> int:
   """Runs what the table does not have yet.
 
   Returns:
     0 when all is there, 1 when something failed, 3 when the time was up before, 130 or 143 when interrupted.
   """
-  todo = [left for each in measurements if (left := each if plan.rerun else each.left(table, facts))]
+  todo = [left for each in measurements if (left := each if plan.rerun else each.left(table, facts["device"]))]
   if len(todo) < len(measurements):
     there = len(measurements) - len(todo)
     print(f"{there} of {len(measurements)} are in {table.path} already (rerun=true measures them again).")
   remarks = [f"{plan.workers} processes at once, one timed at a time on a device"] if plan.workers > 1 else []
   remarks += ["caches of earlier runs" if plan.cache else "cold caches", " ".join(plan.note.split())]
-  shared = {"device": facts["device"], "versions": facts["versions"], "commit": plan.commit or commit_of(git_state())}
+  shared = {**facts, "commit": plan.commit or commit_of(git_state())}
 
   def add(measurement: Measurement, row: Row) -> None:
     conditions = "; ".join(part for part in (row.get("conditions", ""), *remarks) if part)

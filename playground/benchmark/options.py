@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 from playground.benchmark.arguments import check_amounts, option
 from playground.benchmark.jobs import Measurement, Plan
@@ -33,8 +32,8 @@ class Measuring(Plan, abc.ABC):
   alone = False  # whether no other measurement may run at the same time
 
   @abc.abstractmethod
-  def jobs(self, facts: dict[str, Any]) -> list[Measurement]:
-    """The measurements on a machine of these `facts` (`jobs.probe`)."""
+  def jobs(self, devices: int) -> list[Measurement]:
+    """The measurements on a machine with so many devices."""
 
   def check(self) -> None:
     """Raises PlaygroundError for invalid options, before anything expensive."""
@@ -94,7 +93,7 @@ class OfTasks(Measuring):
     self.configured(task, *setting)  # a number that does not fit is said here
     return setting
 
-  def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: Any) -> Measurement:
+  def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: object) -> Measurement:
     """A measurement with the overrides of `setting`."""
     overrides = [*self.overrides, *setting]
     arguments = {"task": task, "agent": self.agent, "overrides": overrides, "seconds": self.seconds, **arguments}

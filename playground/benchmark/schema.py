@@ -73,7 +73,7 @@ class Table:
       _end_last_row(file)
       self._rows = list(_rows_of(file))
 
-  def add(self, row: Mapping[str, Any]) -> None:
+  def add(self, row: Mapping[str, object]) -> None:
     """Appends a row; columns it does not name are empty.
 
     Raises:
@@ -92,7 +92,7 @@ class Table:
       file.write(line.getvalue().encode())
     self._rows.append(full)
 
-  def has(self, wanted: Mapping[str, Any]) -> bool:
+  def has(self, wanted: Mapping[str, object]) -> bool:
     """Whether there is a row with these columns."""
     texts = {name: str(value) for name, value in wanted.items()}
     return any(all(row[name] == text for name, text in texts.items()) for row in self._rows)

@@ -7,7 +7,6 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from playground.collector import uncollected
 
@@ -15,7 +14,7 @@ ROW = "ROW "  # a line with a row begins with it; other lines are the libraries'
 CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")
 
 
-class Facts(dict[str, Any]):
+class Facts(dict[str, object]):
   """Columns that all rows of a measurement share, and the function that emits one.
 
   Attributes:
@@ -24,7 +23,7 @@ class Facts(dict[str, Any]):
 
   lock: str | None = None
 
-  def emit(self, quantity: str, value: float, unit: str, **columns: Any) -> None:
+  def emit(self, quantity: str, value: float, unit: str, **columns: object) -> None:
     row = {"quantity": quantity, "value": float(f"{value:.6g}"), "unit": unit, **self, **columns}
     print("\n" + ROW + json.dumps(row), flush=True)  # a library may have left a line unfinished
 
@@ -54,7 +53,7 @@ def main() -> None:
     sys.exit(2)
 
 
-def _stand_by(task: str, agent: str, overrides: Sequence[str], **_: Any) -> None:
+def _stand_by(task: str, agent: str, overrides: Sequence[str], **_: object) -> None:
   """Starts the process that compiles Warp's kernels, as `playground-run` does."""
   from playground.config import compose
   from playground.envs.options import impl_on_gpu

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 from rich.console import Console
@@ -11,6 +10,7 @@ from rich.table import Table
 
 from playground import config as configs
 from playground import registry
+from playground.deploy.contract import Contract
 from playground.deploy.menu import Menu
 from playground.deploy.policy import ActingPolicy, ExportedPolicy
 from playground.deploy.scripted import ScriptedPolicy, build_task
@@ -204,7 +204,7 @@ def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
   return Menu(given if given == run.parent else run, trained, lambda said: console.print(said, soft_wrap=True))
 
 
-def _table(contract: Mapping[str, Any], episodes: int, scores: Mapping[str, float]) -> Table:
+def _table(contract: Contract, episodes: int, scores: Mapping[str, float]) -> Table:
   """Scores, beside those of the last evaluation in training."""
   origin = contract["origin"]
   trained = origin["evaluation"]

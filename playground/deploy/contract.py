@@ -12,10 +12,11 @@ from playground.config import format_value
 from playground.deploy.graph import OUTPUT, input_names
 from playground.envs.base import PIXELS, Env, State
 from playground.errors import CheckpointError
-from playground.mdp.options import OPTIONS
+from playground.mdp.options import OPTIONS, ObservationOptions
 from playground.settings import plain
 
 FORMAT = "playground-policy/3"
+Contract = dict[str, Any]  # what YAML has of it, and of the `env` section in it
 
 _VALUES = {
   "rgb": "red, green and blue, 0 to 255",
@@ -29,12 +30,12 @@ _FAR = 1e6  # an action beyond all limits
 
 def describe_policy(
   env: Env,
-  env_config: Mapping[str, Any],
+  env_config: Contract,
   task: str,
-  origin: Mapping[str, Any],
+  origin: Mapping[str, object],
   inputs: Mapping[str, tuple[int, ...]],
   state: State,
-) -> dict[str, Any]:
+) -> Contract:
   """Writes the contract down.
 
   Args:
@@ -83,7 +84,7 @@ def describe_policy(
   return plain(contract)
 
 
-def check_contract(contract: Any) -> None:
+def check_contract(contract: Contract) -> None:
   """Checks what is read of a contract, which anybody may have written or changed: the types and what they must hold.
 
   Raises:
@@ -116,7 +117,9 @@ def check_contract(contract: Any) -> None:
       raise CheckpointError(f"command={format_value(told)} must have its minimum below its maximum.")
 
 
-def _check(node: Any, key: str, holds: Callable[[Any], Any], what: str, at: str = "", optional: bool = False) -> None:
+def _check(
+  node: object, key: str, holds: Callable[[Any], object], what: str, at: str = "", optional: bool = False
+) -> None:
   """Raises CheckpointError unless the value of a dotted key is as it must be."""
   parent, name = None, ""
   for name in key.split("."):
@@ -127,19 +130,19 @@ def _check(node: Any, key: str, holds: Callable[[Any], Any], what: str, at: str 
     raise CheckpointError(f"{at}{key}={format_value(node)} must be {what}.")
 
 
-def _names(node: Mapping[Any, Any]) -> bool:
+def _names(node: Mapping[object, object]) -> bool:
   return all(isinstance(name, str) for name in node)
 
 
-def _counts(value: Any) -> bool:
+def _counts(value: object) -> bool:
   return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
   return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _observation(env: Env, group: str) -> list[dict[str, Any]]:
+def _observation(env: Env, group: str) -> list[dict[str, object]]:
   """Each term of an observation group in its order: name, where it begins, its length, and what a controller must know.
 
   `scale` multiplies the term; `noise` (with the noise level in it), `delay` and `history` are there where the task has
@@ -149,7 +152,7 @@ def _observation(env: Env, group: str) -> list[dict[str, Any]]:
   bound = {term.name: term for term in observations.groups.get(group, ())} if observations else {}
   rows, start = [], 0
   for name, size in env.observation_parts.get(group, {}).items():
-    row: dict[str, Any] = {"name": name, "start": start, "size": size, "scale": 1.0}
+    row: dict[str, object] = {"name": name, "start": start, "size": size, "scale": 1.0}
     if name in bound:
       row |= _options(bound[name].options, env.config.noise_level)
       row["what"] = first_docstring_line(bound[name].func)
@@ -160,33 +163,33 @@ def _observation(env: Env, group: str) -> list[dict[str, Any]]:
   return rows
 
 
-def _options(options: Any, noise_level: float) -> dict[str, Any]:
+def _options(options: ObservationOptions, noise_level: float) -> dict[str, object]:
   """Scale, clip, noise, delay and history of an observation term; None where it has none."""
-  noise = options.noise and dict(options.noise)
-  for kind in {"uniform", "gaussian"} & set(noise or ()):
+  noise = dict(options.noise or {})
+  for kind in {"uniform", "gaussian"} & set(noise):
     noise[kind] = (noise_level * np.asarray(noise[kind])).tolist()
   return {
     "scale": 1.0 if options.scale is None else options.scale,
     "clip": options.clip,
-    "noise": noise,
+    "noise": noise or None,
     "delay": options.delay,
     "history": options.history if options.history > 1 else None,
   }
 
 
-def first_docstring_line(func: Callable[..., Any]) -> str:
+def first_docstring_line(func: Callable[..., object]) -> str:
   """The first line of a function's docstring; "" if it has none."""
   return next(iter((func.__doc__ or "").strip().splitlines()), "")
 
 
-def _commands(config: Mapping[str, Any]) -> dict[str, Any]:
+def _commands(config: Contract) -> Contract:
   """Parameters of the commands `velocity` (as `command`) and `gait`, where the task has them."""
   terms = config.get("commands") or {}
   found = {key: (terms.get(name) or {}).get("params") for key, name in (("command", "velocity"), ("gait", "gait"))}
   return {key: params for key, params in found.items() if params}
 
 
-def _camera(env: Env, entry: str) -> dict[str, Any]:
+def _camera(env: Env, entry: str) -> dict[str, object]:
   """What `env.vision` shows: the channels in their order, what a value says, and where the camera is."""
   vision = env.config.vision
   camera = env.mj_model.camera(vision.camera)
@@ -204,7 +207,7 @@ def _camera(env: Env, entry: str) -> dict[str, Any]:
   }
 
 
-def _delays(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _delays(config: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
   """The delays that the task simulates, by dotted key."""
   for key, value in config.items():
     if key in OPTIONS:  # an observation term's delay is in its row
@@ -215,7 +218,7 @@ def _delays(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
       yield f"{prefix}{key}", value
 
 
-def _action(env: Env, config: Mapping[str, Any], state: State) -> dict[str, Any]:
+def _action(env: Env, config: Contract, state: State) -> dict[str, object]:
   """How an action becomes `ctrl`: base + scale * action, where the task's own `action_to_ctrl` agrees."""
   base = config.get("action_base", "last_target" if "action_scale" in config else "zero")
   scale = np.asarray(config.get("action_scale", 1.0))
@@ -223,7 +226,7 @@ def _action(env: Env, config: Mapping[str, Any], state: State) -> dict[str, Any]
   held, size = control(np.zeros(env.action_size)), env.action_size
   low, high = (control(np.full(size, sign * _FAR)) for sign in (-1, 1))
   tried = np.linspace(-0.2, 0.3, size)
-  law: dict[str, Any] = {"class": config["task"], "law": None}
+  law: dict[str, object] = {"class": config["task"], "law": None}
   if held.shape == tried.shape and np.allclose(control(tried), np.clip(held + scale * tried, low, high), atol=1e-5):
     law |= {"law": "ctrl = base + scale * action", "base": base, "scale": scale}
     if base in _CONSTANT_BASES:
@@ -233,7 +236,7 @@ def _action(env: Env, config: Mapping[str, Any], state: State) -> dict[str, Any]
   return law
 
 
-def _home(mj_model: mujoco.MjModel, config: Mapping[str, Any]) -> tuple[str, np.ndarray]:
+def _home(mj_model: mujoco.MjModel, config: Contract) -> tuple[str, np.ndarray]:
   """The configuration that poses are told from, and what it is called."""
   keyframes = [mj_model.key(i).name for i in range(mj_model.nkey)]
   if not keyframes:
@@ -243,7 +246,7 @@ def _home(mj_model: mujoco.MjModel, config: Mapping[str, Any]) -> tuple[str, np.
   return f"keyframe {name}", mj_model.key(name).qpos
 
 
-def _actuators(mj_model: mujoco.MjModel, home: tuple[str, np.ndarray]) -> list[dict[str, Any]]:
+def _actuators(mj_model: mujoco.MjModel, home: tuple[str, np.ndarray]) -> list[dict[str, object]]:
   """Each actuator in the order of the actions, with its joint where it has one.
 
   A position servo's force is kp * (ctrl - q) - kv * qd; the joint's own damping comes on top.
@@ -251,7 +254,7 @@ def _actuators(mj_model: mujoco.MjModel, home: tuple[str, np.ndarray]) -> list[d
   rows = []
   for i in range(mj_model.nu):
     gain, bias = mj_model.actuator_gainprm[i], mj_model.actuator_biasprm[i]
-    row: dict[str, Any] = {"name": mj_model.actuator(i).name}
+    row: dict[str, object] = {"name": mj_model.actuator(i).name}
     limits = [mj_model.actuator_forcerange[i]] if mj_model.actuator_forcelimited[i] else []
     if mj_model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
       joint = mj_model.joint(mj_model.actuator_trnid[i, 0])

@@ -3,12 +3,12 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 from rich.console import Console
 
+from playground.deploy.contract import Contract
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.trained import export_policy, load_exact, record
 from playground.errors import PlaygroundError
@@ -76,11 +76,11 @@ def check_parity(exported: ExportedPolicy, obs: Mapping[str, np.ndarray], action
   return error
 
 
-def _yaml(contract: Mapping[str, Any]) -> str:
+def _yaml(contract: Contract) -> str:
   return yaml.safe_dump(contract, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
 
 
-def _summary(contract: Mapping[str, Any], count: int, error: float, micros: np.ndarray) -> str:
+def _summary(contract: Contract, count: int, error: float, micros: np.ndarray) -> str:
   policy, rate = contract["policy"], contract["rate_hz"]
   shapes = [row["shape"][1:] for row in policy["inputs"]]
   seen = [f"{s[0]} numbers" if len(s) == 1 else f"pictures of {' x '.join(map(str, s))}" for s in shapes]

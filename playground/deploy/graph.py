@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Collection, Mapping
-from typing import Any
 
 import numpy as np
 import onnx
@@ -12,6 +11,7 @@ from playground.deploy.operations import ACTIVATIONS, Chain, see
 from playground.envs.base import PIXELS
 from playground.errors import ConfigError
 from playground.learning.cnn import CNNConfig, cnn_name
+from playground.pytree import PyTree
 
 INPUT, OUTPUT = "obs", "continuous_actions"
 # Old enough for the runtimes on robots' computers; the first that has LayerNormalization.
@@ -28,7 +28,7 @@ def input_names(entries: Collection[str]) -> dict[str, str]:
 
 
 def policy_graph(
-  params: Mapping[str, Any],
+  params: Mapping[str, PyTree],
   inputs: Mapping[str, tuple[int, ...]],
   activation: str,
   normalization: tuple[np.ndarray, np.ndarray] | None,

@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 import onnx
+from numpy.typing import ArrayLike
 from onnx import TensorProto, helper, numpy_helper
 
 from playground.learning.cnn import NORM_EPSILON, CNNConfig, pixel_places
+from playground.pytree import PyTree
 
 
 class Chain:
@@ -18,7 +20,7 @@ class Chain:
     self.nodes: list[onnx.NodeProto] = []
     self.weights: list[onnx.TensorProto] = []
 
-  def constant(self, array: Any) -> str:
+  def constant(self, array: ArrayLike) -> str:
     """Stores an array as float32 and returns its name."""
     name = f"weight_{len(self.weights)}"
     self.weights.append(numpy_helper.from_array(np.asarray(array, np.float32), name))
@@ -50,7 +52,7 @@ def _gelu(graph: Chain) -> None:
   graph.apply("Mul", graph.constant(0.5))
 
 
-ACTIVATIONS: dict[str, Callable[[Chain], Any]] = {
+ACTIVATIONS: dict[str, Callable[[Chain], None]] = {
   "swish": _swish,
   "relu": lambda graph: graph.apply("Relu"),
   "elu": lambda graph: graph.apply("Elu"),
@@ -114,7 +116,7 @@ def _mean_of_picture(graph: Chain) -> None:
   graph.apply("ReduceMean", axes=[2])
 
 
-def see(graph: Chain, params: Mapping[str, Any], cnn: CNNConfig, size: list[int]) -> None:
+def see(graph: Chain, params: Mapping[str, PyTree], cnn: CNNConfig, size: list[int]) -> None:
   """From a picture [1, H, W, C] uint8 of a size (H, W) to its features [1, F]."""
   same = {"auto_pad": "SAME_UPPER"}  # on both sides, one more below and on the right: XLA's way, too
   graph.apply("Cast", to=TensorProto.FLOAT)

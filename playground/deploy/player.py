@@ -1,7 +1,6 @@
 """A policy that acts for as long as somebody watches: its task step by step, and what the watcher does to it."""
 
 import time
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +91,9 @@ class Player:
     """Sleeps for what is left of a decision that began at `began` (`time.perf_counter()`)."""
     time.sleep(max(0.0, began + self.period - time.perf_counter()))
 
-  def _driven_step(self, state: State, action: Any, force: Any, command: Any, driven: Any) -> State:
+  def _driven_step(
+    self, state: State, action: jax.Array, force: jax.Array, command: jax.Array, driven: jax.Array
+  ) -> State:
     info = state.info
     if self.takes_commands:
       info = info | {_COMMAND: jnp.where(driven, command, info[_COMMAND])}

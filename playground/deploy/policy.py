@@ -4,28 +4,30 @@ import hashlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import numpy as np
 import yaml
 
-from playground.deploy.contract import FORMAT, check_contract
+from playground.deploy.contract import FORMAT, Contract, check_contract
 from playground.envs.base import Observation
 from playground.errors import CheckpointError
 from playground.extras import need
+
+Seen = Observation | np.ndarray | Mapping[str, np.ndarray]  # by a policy: observations with any leading axes
 
 
 class ActingPolicy(Protocol):
   """What acts in a player or an evaluation: an exported policy, or a script."""
 
-  contract: Mapping[str, Any]
+  contract: Contract
 
-  def actions(self, obs: Any) -> np.ndarray:
+  def actions(self, obs: Seen) -> np.ndarray:
     """Actions in [-1, 1], [..., action_size], for a task's observations with any leading axes."""
     ...
 
-  def act(self, policy: Any, obs: Observation, key: jax.Array) -> jax.Array:
+  def act(self, policy: object, obs: Observation, key: jax.Array) -> jax.Array:
     """The same from within jitted code, as evaluations call a policy."""
     ...
 
@@ -33,7 +35,7 @@ class ActingPolicy(Protocol):
 class ExportedPolicy:
   """Maps an observation to an action, as the contract says."""
 
-  def __init__(self, model: bytes, contract: Mapping[str, Any]):
+  def __init__(self, model: bytes, contract: Contract):
     """Takes the ONNX model and what `playground.deploy.contract` says of it.
 
     Raises:
@@ -87,7 +89,7 @@ class ExportedPolicy:
     except CheckpointError as error:
       raise CheckpointError(f"{path}: {error}") from None
 
-  def actions(self, obs: Any) -> np.ndarray:
+  def actions(self, obs: Seen) -> np.ndarray:
     """Actions in [-1, 1], [..., action_size], for a task's observations with any leading axes: one inference each."""
     feeds, entries = {}, self._read(obs)
     for row in self.contract["policy"]["inputs"]:
@@ -97,7 +99,7 @@ class ExportedPolicy:
     out = np.concatenate([one(*values) for values in zip(*feeds.values(), strict=True)])
     return out.reshape(*self._batch(entries), -1)
 
-  def act(self, policy: Any, obs: Observation, key: jax.Array) -> jax.Array:
+  def act(self, policy: object, obs: Observation, key: jax.Array) -> jax.Array:
     """The same from within jitted code, as evaluations call a policy."""
     del policy, key
     entries = self._read(obs)
@@ -114,12 +116,12 @@ class ExportedPolicy:
       seconds.append(time.perf_counter() - began)
     return np.array(seconds)
 
-  def _read(self, obs: Any) -> dict[str, Any]:
+  def _read(self, obs: Seen) -> dict[str, np.ndarray | jax.Array]:
     """The entries that the actor reads; an observation that is one vector counts as `state`."""
     entries = obs if isinstance(obs, Mapping) else {"state": obs}
     return {row["entry"]: entries[row["entry"]] for row in self.contract["policy"]["inputs"]}
 
-  def _batch(self, entries: Mapping[str, Any]) -> tuple[int, ...]:
+  def _batch(self, entries: Mapping[str, np.ndarray | jax.Array]) -> tuple[int, ...]:
     """Leading axes of entries."""
     row = self.contract["policy"]["inputs"][0]
     shape = np.shape(entries[row["entry"]])

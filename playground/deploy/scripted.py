@@ -8,6 +8,8 @@ import numpy as np
 
 from playground import registry
 from playground.config import compose, config_dict
+from playground.deploy.contract import Contract
+from playground.deploy.policy import Seen
 from playground.envs.base import Env, Observation
 from playground.envs.c_physics import on_c_physics
 from playground.envs.options import sees
@@ -33,23 +35,23 @@ class ScriptedPolicy:
     self._sizes = env.observation_size
     self._generator = np.random.default_rng(seed)
     velocity: Any = (env.config.get("commands") or {}).get("velocity") or {}
-    self.contract: Mapping[str, Any] = {
+    self.contract: Contract = {
       "task": task,
       "origin": {"steps": 0, "evaluation": None},
       "command": dict(velocity.get("params") or {}),
     }
 
-  def actions(self, obs: Any) -> np.ndarray:
+  def actions(self, obs: Seen) -> np.ndarray:
     """Actions [..., action_size] for observations with any leading axes."""
     shape = (*self._batch(obs), self._action_size)
     return (self._scale * self._generator.uniform(-1, 1, shape)).astype(np.float32)
 
-  def act(self, policy: Any, obs: Observation, key: jax.Array) -> jax.Array:
+  def act(self, policy: object, obs: Observation, key: jax.Array) -> jax.Array:
     """The same from within jitted code, as evaluations call a policy."""
     del policy
     return self._scale * jax.random.uniform(key, (*self._batch(obs), self._action_size), minval=-1.0)
 
-  def _batch(self, obs: Any) -> tuple[int, ...]:
+  def _batch(self, obs: Seen) -> tuple[int, ...]:
     """Leading axes of observations."""
     if not isinstance(obs, Mapping):
       return np.shape(obs)[:-1]

@@ -1,15 +1,13 @@
 """A run's policy with its task on C MuJoCo: what is exported, and played."""
 
 import hashlib
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
 from playground import registry
-from playground.config import config_dict
+from playground.config import Section, config_dict
 from playground.deploy.contract import describe_policy
 from playground.deploy.graph import policy_graph
 from playground.deploy.policy import ExportedPolicy
@@ -47,7 +45,7 @@ def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[s
     return batch.step(state, action), ({entry: seen[entry] for entry in networks.policy_inputs}, action)
 
   @jax.jit
-  def roll(key: jax.Array) -> Any:
+  def roll(key: jax.Array) -> tuple[State, tuple[dict[str, jax.Array], jax.Array]]:
     return jax.lax.scan(decide, batch.reset(jax.random.split(key, num_envs)), None, decisions)
 
   state, (obs, actions) = roll(jax.random.PRNGKey(0))
@@ -73,7 +71,7 @@ def export_policy(trained: LoadedPolicy, state: State | None = None) -> Exported
     "evaluation": _newest_evaluation(trained),
   }
   state = jax.jit(trained.env.reset)(jax.random.PRNGKey(0)) if state is None else state
-  config: Mapping[str, Any] = trained.config.resolved["env"]
+  config = trained.config.resolved["env"]
   contract = describe_policy(trained.env, config, trained.task, origin, inputs, state)
   contract["policy"]["sha256"] = hashlib.sha256(content).hexdigest()
   return ExportedPolicy(content, contract)
@@ -92,12 +90,12 @@ def _newest_evaluation(trained: LoadedPolicy) -> dict[str, float]:
   return {"steps": int(last.step)} | scores
 
 
-def load_on_c_physics(task: str, config: Any) -> Env:
+def load_on_c_physics(task: str, config: Section) -> Env:
   """Builds a task on C MuJoCo.
 
   Raises:
     ConfigError: it sees pictures, and MuJoCo-Warp, which renders them, is not installed.
   """
-  config = config_dict(config)
-  config.impl = "warp" if sees(config) else "jax"  # whose model is the smallest to build; it is not simulated
-  return on_c_physics(registry.load(task, config=config))
+  own: Section = config_dict(config)
+  own.impl = "warp" if sees(own) else "jax"  # whose model is the smallest to build; it is not simulated
+  return on_c_physics(registry.load(task, config=own))

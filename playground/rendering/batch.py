@@ -15,9 +15,12 @@ import jax.numpy as jnp
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.physics.backend import Physics, PhysicsData, mjx
+from playground.pytree import PyTree
 from playground.rendering.video import camera_names
 
 Pictures = dict[str, jax.Array]
+Context = Any  # of MuJoCo-Warp, which names no type of it
+Rendered = tuple[dict[str, Pictures], jax.Array]  # by camera; and a zero that is there only when they are
 _KINDS = ("rgb", "depth", "segmentation")
 
 
@@ -72,7 +75,7 @@ class BatchRenderer:
       raise ConfigError("Nothing to render: name a camera and a kind of picture.")
     self.view = view
     self._physics = physics
-    self._contexts: dict[tuple[Any, ...], Any] = {}
+    self._contexts: dict[tuple[object, ...], list[Context]] = {}
 
   def render(self, model: mjx.Model, data: PhysicsData) -> tuple[dict[str, Pictures], PhysicsData]:
     """Renders one environment as it is at this moment.
@@ -95,18 +98,18 @@ class BatchRenderer:
     pictures, token = jax.tree.map(lambda x: x[0], self._draw(lenses, shared, model, batch))
     return pictures, data.replace(time=data.time + token)
 
-  def _draw(self, lenses: bool, own: mjx.Model, model: mjx.Model, data: PhysicsData) -> Any:
+  def _draw(self, lenses: bool, own: mjx.Model, model: mjx.Model, data: PhysicsData) -> Rendered:
     """What `_render` returns, of a batch [N] of states; `own` says which of the model's fields have that axis, too."""
 
     @jax.custom_batching.custom_vmap
-    def draw(model: mjx.Model, data: PhysicsData) -> Any:
+    def draw(model: mjx.Model, data: PhysicsData) -> Rendered:
       axes = jax.tree.map(lambda is_own: 0 if is_own else None, own)
       contexts = self._contexts_of(len(data.time), lenses)
       branches = [jax.vmap(partial(self._render, context), (axes, 0)) for context in contexts]
       return jax.lax.switch(_place(), branches, model, data) if len(branches) > 1 else branches[0](model, data)
 
     @draw.def_vmap
-    def widen(count: int, mapped: Any, model: mjx.Model, data: PhysicsData) -> Any:
+    def widen(count: int, mapped: PyTree, model: mjx.Model, data: PhysicsData) -> Rendered:
       # A map over a batch is a larger batch: what both of them share stays shared.
       size = data.time.shape[-1]
 
@@ -125,7 +128,7 @@ class BatchRenderer:
 
     return draw(model, data)
 
-  def _render(self, context: Any, model: mjx.Model, data: PhysicsData) -> tuple[dict[str, Pictures], jax.Array]:
+  def _render(self, context: Context, model: mjx.Model, data: PhysicsData) -> Rendered:
     """The pictures, and a zero that is there only when they are."""
     handle = context.pytree()
     full = mjx.refit_bvh(model, self._physics.present(model, data), handle)
@@ -148,7 +151,7 @@ class BatchRenderer:
     token: Any = full._impl._jax_token  # pyright: ignore[reportOptionalMemberAccess]
     return pictures, token.sum().astype(data.time.dtype)
 
-  def _contexts_of(self, size: int, lenses: bool) -> list[Any]:
+  def _contexts_of(self, size: int, lenses: bool) -> list[Context]:
     """The renderer's buffers for a batch, on every device that the function being traced runs on.
 
     Of GPUs one context has the buffers of each. To Warp there is but one CPU: where JAX divides it into several

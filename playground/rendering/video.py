@@ -18,7 +18,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from playground.files import need_file, replacing
 from playground.interpreter import PYTHON
 from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
 
+if TYPE_CHECKING:
+  import mujoco
+
 MAX_FPS = 50.0
 _TRIES = 100
 # Names of cameras that look on from where a task is seen best; the swimmer's is tracking1.
@@ -34,7 +37,7 @@ _CAMERAS = ("track", "tracking", "tracking1", "fixed", "side", "front", "back", 
 
 
 def render_video(
-  mj_model: Any,
+  mj_model: "mujoco.MjModel",
   qpos: np.ndarray,
   out_path: str | Path,
   *,
@@ -126,14 +129,14 @@ def need_place(video: str | None, camera: str | None = None) -> Path | None:
   return path
 
 
-def need_camera(model: Any, name: str | None, option: str) -> None:
+def need_camera(model: "mujoco.MjModel", name: str | None, option: str) -> None:
   """Raises UnknownNameError, which names the option that it is of, for a camera that the model has not; None is any."""
   if name is not None and name not in (names := camera_names(model)):
     have = ", ".join(names) or "none"
     raise UnknownNameError(f"{option}={name} is no camera of the model; it has {have}.{nearest(name, names)}")
 
 
-def camera_names(model: Any) -> list[str]:
+def camera_names(model: "mujoco.MjModel") -> list[str]:
   """Names of the model's cameras."""
   return [name for i in range(model.ncam) if (name := model.camera(i).name)]
 
@@ -143,7 +146,7 @@ def frame_stride(dt: float) -> int:
   return max(1, math.ceil(1 / (MAX_FPS * dt) - 1e-6))
 
 
-def _pack(mj_model: Any, qpos: np.ndarray, **arrays: Any) -> bytes:
+def _pack(mj_model: "mujoco.MjModel", qpos: np.ndarray, **arrays: Any) -> bytes:
   """A trajectory `qpos` [T, nq], its model and what else is not None, as the bytes of an .npz file."""
   import mujoco
 
@@ -234,7 +237,7 @@ def enlarged(picture: np.ndarray, height: int) -> np.ndarray:
   return np.broadcast_to(picture, (height, width, 3))
 
 
-def choose_camera(model: Any, name: str | None = None) -> Any:
+def choose_camera(model: "mujoco.MjModel", name: str | None = None) -> "str | mujoco.MjvCamera":
   """Returns the named camera, or the best one the model offers for looking at it from outside."""
   import mujoco
 
@@ -249,7 +252,7 @@ def choose_camera(model: Any, name: str | None = None) -> Any:
   return view
 
 
-def follow(view: Any, model: Any) -> None:
+def follow(view: "mujoco.MjvCamera", model: "mujoco.MjModel") -> None:
   """Has a free camera (an MjvCamera) follow a robot that walks; on others it stays as it is."""
   import mujoco
 
@@ -258,7 +261,7 @@ def follow(view: Any, model: Any) -> None:
     view.distance = min(view.distance, 3.0)  # terrain makes the model's extent, and so the default, huge
 
 
-def walks(model: Any) -> bool:
+def walks(model: "mujoco.MjModel") -> bool:
   """Whether to follow what moves first: a robot that walks out of the picture, but no free object on a table."""
   import mujoco
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -18,7 +17,7 @@ from playground.rendering.video import camera_names
 _GAP = 2  # pixels between two views
 
 
-def save_views(env: Env, events: Mapping[str, Any], path: str | Path, count: int = 16, seed: int = 0) -> Path:
+def save_views(env: Env, events: Mapping[str, object], path: str | Path, count: int = 16, seed: int = 0) -> Path:
   """Writes `count` views as one picture.
 
   Args:
@@ -43,7 +42,7 @@ def save_views(env: Env, events: Mapping[str, Any], path: str | Path, count: int
     raise ConfigError(f"The task sees nothing: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
   model = Randomizer(env.mj_model, events).sample_batch(jax.random.split(model_key, count))
-  state: Any = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)
+  state = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)
   page = sheet(np.asarray(newest_picture(env, state.obs)))
   path.parent.mkdir(parents=True, exist_ok=True)
   with replacing(path) as temporary:

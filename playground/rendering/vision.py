@@ -10,6 +10,7 @@ from playground.envs.base import PIXELS, Env, State
 from playground.envs.wrappers import Wrapper
 from playground.errors import ConfigError, nearest
 from playground.physics.backend import PhysicsData, mjx
+from playground.pytree import PyTree
 from playground.rendering.batch import BatchRenderer, View
 from playground.rendering.video import camera_names
 from playground.text import format_value
@@ -94,7 +95,7 @@ class Vision(Wrapper):
     return jax.random.uniform(key, minval=self._brightness[0], maxval=self._brightness[1])
 
   def _render(
-    self, data: PhysicsData, info: Mapping[str, Any], model: mjx.Model | None
+    self, data: PhysicsData, info: Mapping[str, PyTree], model: mjx.Model | None
   ) -> tuple[jax.Array, PhysicsData]:
     """Renders the present image, [height, width, channels] uint8; returns also the state to go on with."""
     shown: Any = self.env.model_of(info, self._warp_model if model is None else model)

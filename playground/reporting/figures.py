@@ -4,7 +4,10 @@ import io
 import math
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+  from matplotlib.figure import Figure
 
 COLOURS = ("#2f6db5", "#d1762f", "#5a9e57", "#b5479a", "#8a6d3b", "#777777")
 Points = Sequence[tuple[float, float]]
@@ -18,7 +21,7 @@ class Curve(NamedTuple):
   half_width: Sequence[float] | None = None
 
 
-def _figure(size: tuple[float, float], draw: Callable[[Any], None], kind: str = "svg") -> bytes:
+def _figure(size: tuple[float, float], draw: "Callable[[Figure], None]", kind: str = "svg") -> bytes:
   import matplotlib
   from matplotlib.figure import Figure  # not pyplot: no global state, no display
 
@@ -26,12 +29,11 @@ def _figure(size: tuple[float, float], draw: Callable[[Any], None], kind: str = 
     figure = Figure(figsize=size, layout="constrained")
     draw(figure)
     buffer = io.BytesIO()
-    how: dict[str, Any] = {"metadata": {"Date": None}} if kind == "svg" else {"dpi": 130}
-    figure.savefig(buffer, format=kind, **how)
+    figure.savefig(buffer, format=kind, dpi=130, metadata={"Date": None} if kind == "svg" else {})
   return buffer.getvalue()
 
 
-def _svg(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
+def _svg(size: tuple[float, float], draw: "Callable[[Figure], None]") -> str:
   return _figure(size, draw).decode()
 
 
@@ -48,7 +50,7 @@ def _height(names: Collection[str], least: float) -> float:
 def lines(title: str, series: Mapping[str, Points], x: str, y: str, log: bool = False) -> str:
   """Lines over one pair of axes."""
 
-  def draw(figure: Any) -> None:
+  def draw(figure: "Figure") -> None:
     axes = figure.subplots()
     for colour, (name, points) in zip(COLOURS * len(series), series.items(), strict=False):
       axes.plot(
@@ -69,7 +71,7 @@ def curves(panels: Mapping[str, Mapping[str, Curve]], x: str, y: str, kind: str 
   columns = min(4, len(panels))
   rows = math.ceil(len(panels) / columns)
 
-  def draw(figure: Any) -> None:
+  def draw(figure: "Figure") -> None:
     cells = figure.subplots(rows, columns, squeeze=False).flat
     for (title, group), axes in zip(panels.items(), cells, strict=False):
       for colour, (name, curve) in zip(COLOURS * len(group), group.items(), strict=False):
@@ -92,7 +94,7 @@ def curves(panels: Mapping[str, Mapping[str, Curve]], x: str, y: str, kind: str 
 def bars(title: str, groups: Mapping[str, Mapping[str, float]], x: str) -> str:
   """Bars side by side, a group of them a line of text."""
 
-  def draw(figure: Any) -> None:
+  def draw(figure: "Figure") -> None:
     axes = figure.subplots()
     names = list(dict.fromkeys(name for group in groups.values() for name in group))
     height = 0.8 / len(names)
@@ -110,7 +112,7 @@ def bars(title: str, groups: Mapping[str, Mapping[str, float]], x: str) -> str:
 def stacked(title: str, bars: Mapping[str, Mapping[str, float]], x: str) -> str:
   """Bars made of parts."""
 
-  def draw(figure: Any) -> None:
+  def draw(figure: "Figure") -> None:
     axes = figure.subplots()
     names = list(dict.fromkeys(name for parts in bars.values() for name in parts))
     left = dict.fromkeys(bars, 0.0)

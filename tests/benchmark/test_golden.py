@@ -15,7 +15,7 @@ from playground.benchmark.schema import Table
 from playground.config.files import shipped
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError
 
-FACTS = {"devices": 1, "device": "CPU", "versions": "1"}
+FACTS = {"device": "CPU", "versions": "1"}
 ONE = """
 cpu:
   pole:
@@ -69,7 +69,7 @@ def test_exit_codes(
       table.add({**shared, "setting": text, "value": 20 if "length" in text else value})
     return ended
 
-  monkeypatch.setattr(golden, "probe", lambda *_: FACTS)
+  monkeypatch.setattr(golden, "probe", lambda *_: (1, FACTS))
   monkeypatch.setattr(golden, "run_jobs", measure)
   options = Options(table=write(tmp_path), out=str(tmp_path / "rows.csv"))
   assert run(options) == code

@@ -152,7 +152,7 @@ def test_more_workers_than_gpus_take_turns_at_each(tmp_path: Path):
 
 
 def test_all_of_a_topology_takes_turns_at_the_machine(tmp_path: Path):
-  of_it = Topology(tasks=("CartpoleBalance",), num_timesteps=5000, seeds=1, workers=3).jobs({"devices": 2})
+  of_it = Topology(tasks=("CartpoleBalance",), num_timesteps=5000, seeds=1, workers=3).jobs(2)
   assert {job.measure for job in of_it} == {"training", "runs:whole"}
   path = tmp_path / "rows.csv"
   jobs = [dataclasses.replace(job, measure="lock") for job in of_it]
@@ -162,7 +162,7 @@ def test_all_of_a_topology_takes_turns_at_the_machine(tmp_path: Path):
 
 
 def test_the_machine_is_asked_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch):
-  assert probe([], ()) == {"devices": 2, "device": "a device", "versions": "1.0"}
+  assert probe([], ()) == (2, {"device": "a device", "versions": "1.0"})
   monkeypatch.setattr(jobs, "Measurement", lambda _, *rest: Measurement("user", *rest))
   with pytest.raises(HardwareError, match="that cannot be"):
     probe([], ())

@@ -195,7 +195,7 @@ def test_a_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
 
 
 def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytest.MonkeyPatch):
-  own = Learning(tasks=("CheetahRun", "HopperHop"), seeds=2, backends=("jax", "warp"), peer_python="py").jobs({})
+  own = Learning(tasks=("CheetahRun", "HopperHop"), seeds=2, backends=("jax", "warp"), peer_python="py").jobs(1)
   assert [(job.columns["task"], job.arguments["seeds"], job.measure) for job in own] == [
     (task, [seed], measure)
     for task in ("CheetahRun", "HopperHop") for seed in (1, 2) for measure in ("runs:whole", "peer:whole", "peer:whole")
@@ -207,7 +207,7 @@ def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytes
   assert all(job.last == {"quantity": "final_return"} for job in own)
 
   given = Learning(tasks=("CheetahRun",), num_timesteps=5000, overrides=("env.impl=jax",))
-  ours, peer = given.jobs({})
+  ours, peer = given.jobs(1)
   assert ours.columns["setting"] == "env.impl=jax agent.num_timesteps=5000"
   told = ["env.impl=jax", "agent.num_timesteps=5000"]
   overrides = [*told, "hardware.devices=1"]
@@ -238,7 +238,7 @@ def test_sac_is_compared_in_learning_alone(monkeypatch: pytest.MonkeyPatch):
   monkeypatch.setattr(commands, "check_peer", lambda *_: None)
   learning = Learning(tasks=("CheetahRun",), agent="sac")
   learning.check()
-  ours, peer = learning.jobs({})
+  ours, peer = learning.jobs(1)
   assert (ours.arguments["agent"], ours.columns["agent"]) == ("sac_v020", "sac_v020")
   assert (peer.arguments["agent"], peer.columns["agent"]) == ("sac", "sac")
   with pytest.raises(ConfigError, match=r"compare is of ppo"):
@@ -255,8 +255,8 @@ def test_topology_has_all_devices_and_may_have_several_workers():
 
 def test_topology_trains_whole_runs_after_the_rates():
   rates = Topology(tasks=("CheetahRun",), seeds=2, overrides=("env.impl=jax",))
-  both = dataclasses.replace(rates, num_timesteps=5000).jobs({"devices": 2})
-  assert both[:3] == rates.jobs({"devices": 2}) and {job.measure for job in both[3:]} == {"runs:whole"}
+  both = dataclasses.replace(rates, num_timesteps=5000).jobs(2)
+  assert both[:3] == rates.jobs(2) and {job.measure for job in both[3:]} == {"runs:whole"}
   settings = [f"env.impl=jax {text} agent.num_timesteps=5000" for text in TOPOLOGIES]
   assert [(job.columns["setting"], job.arguments["seeds"]) for job in both[3:]] == [
     (setting, [seed]) for setting in settings for seed in (1, 2)
@@ -269,9 +269,9 @@ def test_topology_trains_whole_runs_after_the_rates():
 
 
 def test_whole_runs_that_were_stopped_go_on_where_they_are_missing(tmp_path: Path):
-  jobs = Topology(tasks=("CheetahRun",), seeds=2, devices=(1,), num_timesteps=5000).jobs({"devices": 1})
+  jobs = Topology(tasks=("CheetahRun",), seeds=2, devices=(1,), num_timesteps=5000).jobs(1)
   table, facts = Table(tmp_path / "rows.csv"), {"device": "a device"}
-  left = lambda: [(job.measure, job.arguments["seeds"]) for each in jobs if (job := each.left(table, facts))]
+  left = lambda: [(job.measure, job.arguments["seeds"]) for each in jobs if (job := each.left(table, "a device"))]
   whole = {**jobs[1].columns, **facts, "seed": 1}
   table.add({**whole, "quantity": "training_steps_per_s", "value": 1.0})
   assert left() == [("training", [1, 2]), ("runs:whole", [1]), ("runs:whole", [2])], (

@@ -20,13 +20,13 @@ CHECKOUT = Path(__file__).parents[2]
 
 
 def test_every_size_and_number_is_a_job_under_the_papers_conditions() -> None:
-  jobs = Pixels(sizes=(64, 128), num_envs=(1024, 4096)).jobs({})
+  jobs = Pixels(sizes=(64, 128), num_envs=(1024, 4096)).jobs(1)
   assert [job.columns["task"] for job in jobs] == ["CartpoleBalanceVision"] * 4 + ["PandaPickCubeCartesianVision"] * 4
   setting = "env.ctrl_dt=0.04 env.episode_length=75 env.vision.width=64 env.vision.height=64 agent.num_envs=4096"
   assert jobs[1].columns["setting"] == f"{setting} agent.batch_size=512"
   assert jobs[1].last["setting"] == f"{setting} agent.batch_size=512 part=update"
   assert "randomization=panda_vision" in jobs[-1].arguments["overrides"]
-  (compared,) = Pixels(sizes=(80,), compared=True).jobs({})
+  (compared,) = Pixels(sizes=(80,), compared=True).jobs(1)
   assert compared.columns["setting"].startswith(f"env.ctrl_dt={1 / 60} env.sim_dt={1 / 120}")
   assert compared.last["setting"].endswith("part=pixels")
 

@@ -78,36 +78,35 @@ def test_help(command: Command, capsys: pytest.CaptureFixture[str]):
 
 def test_what_does_not_fit_the_machine_or_the_task_is_said_before_anything_is_compiled():
   with pytest.raises(ConfigError, match=r"^devices=\[1, 4\]: this machine has 2\.$"):
-    commands.Topology(tasks=("CartpoleBalance",), devices=(1, 4)).jobs({"devices": 2})
+    commands.Topology(tasks=("CartpoleBalance",), devices=(1, 4)).jobs(2)
   with pytest.raises(ConfigError, match=r"agent\.num_envs=3"):
-    commands.Scaling(tasks=("CartpoleBalance",), num_envs=(3,)).jobs({})
+    commands.Scaling(tasks=("CartpoleBalance",), num_envs=(3,)).jobs(1)
   commands.Startup(tasks=("CartpoleBalance",), overrides=("hardware.devices=1",)).check()
 
 
 def test_what_does_not_fit_the_machine_is_all_that_is_said(
   command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-  monkeypatch.setattr(commands, "probe", lambda *_: {"devices": 1, "device": "a device", "versions": ""})
+  monkeypatch.setattr(commands, "probe", lambda *_: (1, {"device": "a device", "versions": ""}))
   assert command("topology", "tasks=CartpoleBalance", "devices=4", f"out={tmp_path / 'rows.csv'}") == 2
   captured = capsys.readouterr()
   assert captured.out == "" and captured.err == "error: devices=[4]: this machine has 1.\n"
 
 
 def test_commands_stand_for_jobs():
-  facts = {"devices": 4, "device": "a device", "versions": ""}
-  throughput = commands.Throughput(suite="all", seeds=2).jobs(facts)
+  throughput = commands.Throughput(suite="all", seeds=2).jobs(4)
   assert len(throughput) == len(set(map(str, throughput))) >= 40
   assert all(job.arguments["seeds"] == [1, 2] and not job.columns["setting"] for job in throughput)
 
-  settings = [job.columns["setting"] for job in commands.Topology(tasks=("CartpoleBalance",)).jobs(facts)]
+  settings = [job.columns["setting"] for job in commands.Topology(tasks=("CartpoleBalance",)).jobs(4)]
   assert [text.split()[0] for text in settings] == [f"hardware.devices={n}" for n in (1, 2, 2, 4, 4)]
   assert settings[-1] == "hardware.devices=4 hardware.scale_envs=true"
 
-  scaling = commands.Scaling(tasks=("CartpoleBalance",), num_envs=(1024, 65536)).jobs(facts)
+  scaling = commands.Scaling(tasks=("CartpoleBalance",), num_envs=(1024, 65536)).jobs(4)
   assert [job.measure for job in scaling] == ["environment", "training"] * 2
   assert scaling[-1].columns["setting"] == "agent.num_envs=65536 agent.batch_size=2048"
 
-  turns = commands.Compare(tasks=("CartpoleBalance",), repeats=2).jobs(facts)
+  turns = commands.Compare(tasks=("CartpoleBalance",), repeats=2).jobs(4)
   assert [(job.measure, job.arguments["seeds"]) for job in turns] == [
     (who, [turn]) for turn in (1, 2) for who in ("training", "peer:rates", "peer:rates")
   ]

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +9,16 @@ import numpy as np
 
 from playground import registry
 from playground.config import compose
+from playground.envs.base import State
 from playground.envs.wrappers import wrap_for_training
 from playground.hardware.mesh import make_mesh
 from playground.learning.trainer import Trainer
 from playground.physics.backend import mjx
+from playground.pytree import PyTree
 
 jax.config.update("jax_platforms", "cpu")
 
-Timed = Callable[[], Any]  # does its work and waits for it
+Timed = Callable[[], object]  # does its work and waits for it
 Pair = tuple[Timed, Timed]  # ours and the reference, both compiled
 LENGTH = 20  # control steps of one call
 
@@ -28,12 +29,12 @@ def env_step(task: str, num_envs: int) -> Pair:
   wrapped = wrap_for_training(env)
 
   @jax.jit
-  def ours(state: Any) -> Any:
+  def ours(state: State) -> State:
     action = jnp.zeros((num_envs, env.action_size))
     return jax.lax.scan(lambda s, _: (wrapped.step(s, action, {}), None), state, None, LENGTH)[0]
 
   @jax.jit
-  def plain(data: Any) -> Any:
+  def plain(data: mjx.Data) -> mjx.Data:
     step = jax.vmap(lambda d: mjx.step(env.mjx_model, d))
     return jax.lax.scan(lambda d, _: (step(d), None), data, None, LENGTH * env.n_substeps)[0]
 
@@ -56,7 +57,7 @@ def training_step(agent: str, overrides: tuple[str, ...], layers: tuple[int, int
   state = trainer.init(jax.random.PRNGKey(0), {}, None)
   state, _ = trainer.train(state, {}, np.int32(trainer.config.prefill_updates))
 
-  def ours() -> Any:
+  def ours() -> PyTree:
     nonlocal state
     state, metrics = trainer.train(state, {}, np.int32(1))
     return jax.block_until_ready(metrics)
@@ -71,7 +72,7 @@ def training_step(agent: str, overrides: tuple[str, ...], layers: tuple[int, int
   return ours, _waits(partial(products, x), weights)
 
 
-def _waits(function: Callable[[Any], Any], argument: Any) -> Callable[[], Any]:
+def _waits(function: Callable[[PyTree], PyTree], argument: PyTree) -> Timed:
   return lambda: jax.block_until_ready(function(argument))
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +10,11 @@ from playground.benchmark.measures.machine import used_memory
 from playground.benchmark.measures.subject import Subject, alone, emit_peak, num_updates, rate, told
 from playground.benchmark.worker import Facts
 from playground.envs.base import PIXELS
-from playground.envs.wrappers import Vectorize, wrap_for_training
+from playground.envs.wrappers import ModelFields, Vectorize, Wrapper, wrap_for_training
 from playground.learning.rollout import Environments, unroll
-from playground.physics.backend import WORLDS
+from playground.learning.trainer import TrainState
+from playground.physics.backend import WORLDS, PhysicsData
+from playground.pytree import PyTree
 
 PARTS = {  # in the order they are added
   "physics": "MJX alone under a constant ctrl",
@@ -28,7 +29,8 @@ TURNS = 3
 LENGTH = 20  # control steps of one call, where the algorithm has no unrolls
 
 # (carry, model fields, key) -> (carry, what else must be computed)
-Run = Callable[[Any, Any, jax.Array], tuple[Any, Any]]
+Run = Callable[[PyTree, ModelFields, jax.Array], tuple[PyTree, PyTree]]
+Step = Callable[[PyTree, ModelFields, jax.Array], PyTree]
 
 
 def measure(
@@ -49,7 +51,7 @@ def measure(
     subject = Subject.build(facts, task, agent, overrides)
     trainer, state = subject.trainer, subject.trainer.init(subject.key(0), subject.model, None)
     length = getattr(trainer.config, "unroll_length", LENGTH)
-    calls: dict[str, tuple[Callable[[int], Any], int]] = {}
+    calls: dict[str, tuple[Callable[[int], PyTree], int]] = {}
     wanted = list(PARTS)[: list(PARTS).index(until) + 1]
     for part, (run, carry, repeat) in _rolls(subject, state, length).items():
       if part in wanted:
@@ -64,17 +66,19 @@ def measure(
         for part, (call, steps) in calls.items():
           best[part] = max(best[part], rate(call, steps, seconds / TURNS)[0])
   emit_peak(facts)
-  facts["conditions"] += f"; parts added one by one, best of {TURNS} turns of {seconds / TURNS:.1f} s"
+  facts["conditions"] = (
+    f"{facts['conditions']}; parts added one by one, best of {TURNS} turns of {seconds / TURNS:.1f} s"
+  )
   for part, speed in best.items():
     facts.emit("seconds_per_step", 1 / speed, "s", setting=" ".join((*told(overrides), f"part={part}")))
 
 
-def _repeat(subject: Subject, run: Run, carry: Any) -> Callable[[int], Any]:
+def _repeat(subject: Subject, run: Run, carry: PyTree) -> Callable[[int], PyTree]:
   """A function that does `run` a number of times, each time on from where it was."""
   run = jax.jit(run, donate_argnums=0)
   carry = jax.tree.map(jnp.copy, carry)  # parts begin in the same state, and each takes its carry's buffers over
 
-  def call(count: int) -> Any:
+  def call(count: int) -> PyTree:
     nonlocal carry
     other = None
     for i in range(count):
@@ -84,11 +88,11 @@ def _repeat(subject: Subject, run: Run, carry: Any) -> Callable[[int], Any]:
   return call
 
 
-def _train(subject: Subject, state: Any) -> Callable[[int], Any]:
+def _train(subject: Subject, state: TrainState) -> Callable[[int], PyTree]:
   """A function that does a number of training steps that learn."""
   trainer = subject.trainer
 
-  def call(count: int) -> Any:
+  def call(count: int) -> PyTree:
     nonlocal state
     state, metrics = trainer.train(state, subject.model, num_updates(count))
     return metrics
@@ -97,7 +101,7 @@ def _train(subject: Subject, state: Any) -> Callable[[int], Any]:
   return call
 
 
-def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, Any, int]]:
+def _rolls(subject: Subject, state: TrainState, length: int) -> dict[str, tuple[Run, PyTree, int]]:
   """The parts up to the update: what runs `length` steps, what it carries, control steps that each counts for."""
   trainer, env = subject.trainer, subject.trainer.env
   task, repeat, num_envs = env.unwrapped, env.action_repeat, trainer.config.num_envs
@@ -106,16 +110,19 @@ def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, An
   def random_actions(key: jax.Array) -> jax.Array:
     return jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
 
-  def act(carry: Any, model: Any, key: jax.Array) -> Any:
+  def by_chance(env: Wrapper) -> Step:
+    return lambda state, model, key: env.step(state, random_actions(key), model)
+
+  def act(carry: PyTree, model: ModelFields, key: jax.Array) -> PyTree:
     state, policy = carry  # carried along, for what a function merely refers to is compiled into it
     return env.step(state, trainer.act(policy, state.obs, key, False), model), policy
 
-  def advance(data: Any, fields: Any) -> Any:
+  def advance(data: PhysicsData, fields: dict[str, jax.Array]) -> PhysicsData:
     model = task.mjx_model.tree_replace(fields) if fields else task.mjx_model
     return task.physics.step(model, data, data.ctrl, task.n_substeps)
 
-  def scan(step: Callable[[Any, Any, jax.Array], Any]) -> Run:
-    def run(carry: Any, model: Any, key: jax.Array) -> tuple[Any, Any]:
+  def scan(step: Step) -> Run:
+    def run(carry: PyTree, model: ModelFields, key: jax.Array) -> tuple[PyTree, PyTree]:
       return jax.lax.scan(lambda c, k: (step(c, model, k), None), carry, jax.random.split(key, length))
 
     return run
@@ -126,13 +133,12 @@ def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, An
     jnp.zeros((num_envs, env.action_size)),
     subject.model,
   )
-  by_chance: Callable[[Any], Any] = lambda env: lambda s, model, key: env.step(s, random_actions(key), model)
-  seeing: dict[str, tuple[Run, Any, int]] = {"episodes": (scan(by_chance(env)), state.env_state, repeat)}
+  seeing: dict[str, tuple[Run, PyTree, int]] = {"episodes": (scan(by_chance(env)), state.env_state, repeat)}
   if any(key.startswith(PIXELS) for key in trainer.networks.select(state.env_state.obs)):
     blind = wrap_for_training(task)
     first = jax.jit(blind.reset)(jax.random.split(subject.key(0), num_envs), subject.model)
     seeing = {"episodes": (scan(by_chance(blind)), first, repeat), "pixels": seeing["episodes"]}
-  rolls: dict[str, tuple[Run, Any, int]] = {
+  rolls: dict[str, tuple[Run, PyTree, int]] = {
     "physics": (scan(lambda data, model, key: jax.vmap(advance, axis_name=WORLDS)(data, dict(model))), stepped.data, 1),
     "task": (scan(by_chance(bare)), stepped, 1),
     **seeing,
@@ -140,7 +146,7 @@ def _rolls(subject: Subject, state: Any, length: int) -> dict[str, tuple[Run, An
   }
   if hasattr(trainer.config, "unroll_length"):  # the algorithm learns from whole rollouts
 
-    def store(carry: Any, model: Any, key: jax.Array) -> tuple[Any, Any]:
+    def store(carry: PyTree, model: ModelFields, key: jax.Array) -> tuple[PyTree, PyTree]:
       before, capture, policy = carry
       normalizer = policy.normalizer if trainer.config.normalize_observations else None
       envs = Environments(before, capture, model, {}, env)

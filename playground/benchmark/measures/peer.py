@@ -4,6 +4,7 @@ import json
 import math
 import os
 import subprocess
+from collections.abc import Mapping
 from typing import Any
 
 from playground.benchmark.measures.machine import used_memory
@@ -58,7 +59,7 @@ def whole(
   emit_result(facts, result, RESULT, seed=seed)
 
 
-def drive(facts: Facts, peer: dict[str, str], job: dict[str, Any]) -> dict[str, Any]:
+def drive(facts: Facts, peer: dict[str, str], job: Mapping[str, object]) -> dict[str, Any]:
   """Runs a job in the peer's driver, and fills in the facts that its rows share.
 
   Args:

@@ -8,7 +8,6 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -86,7 +85,7 @@ def chain(facts: Facts, experiment: str, overrides: list[str], runs: str, again:
     run_training([f"resume={run.path}"] if begun else new)
   for stage in [*run.summary["stages"], {**run.summary, "name": "all"}]:
     manifest = (run if stage["name"] == "all" else RunDirectory(run.path / stage["folder"])).manifest
-    columns: dict[str, Any] = {"seed": seed, "setting": " ".join((*overrides, f"stage={stage['name']}"))}
+    columns: dict[str, object] = {"seed": seed, "setting": " ".join((*overrides, f"stage={stage['name']}"))}
     columns |= facts_of(manifest) if manifest else {}
     if git := manifest.get("git"):
       columns["commit"] = commit_of(git)
@@ -122,14 +121,18 @@ def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
     raise RunFailedError(f"playground-run ended with code {process.returncode}: {why}")
 
 
-def facts_of(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def facts_of(manifest: Mapping[str, object]) -> dict[str, object]:
   """Columns of a row, from a run's manifest."""
   precision = f"physics {manifest['matmul_precision']}, networks {manifest['network_precision']}"
   return {"backend": manifest["impl"], "devices": manifest["num_devices"], "precision": precision}
 
 
 def emit_returns(
-  facts: Facts, evaluations: Iterable[Sequence[Any]], setting: Sequence[str], seed: int, quantity: str = "return"
+  facts: Facts,
+  evaluations: Iterable[tuple[float, float, float]],
+  setting: Sequence[str],
+  seed: int,
+  quantity: str = "return",
 ) -> None:
   """A row for each evaluation: (steps trained, mean return, seconds into the run)."""
   for step, score, seconds in evaluations:
@@ -137,11 +140,11 @@ def emit_returns(
     facts.emit(quantity, score, "", **columns, conditions=f"{facts['conditions']}; after {seconds:.1f} s")
 
 
-def emit_result(facts: Facts, result: Mapping[str, Any], quantities: Sequence[str], **columns: Any) -> None:
+def emit_result(facts: Facts, result: Mapping[str, float | None], quantities: Sequence[str], **columns: object) -> None:
   """A row for each quantity that the result of a run has, in their order."""
   for quantity in quantities:
-    if result.get(quantity) is not None:
-      facts.emit(quantity, result[quantity], _UNITS.get(quantity, ""), **columns)
+    if (value := result.get(quantity)) is not None:
+      facts.emit(quantity, value, _UNITS.get(quantity, ""), **columns)
 
 
 def _one_update(config: RunConfig) -> int:

@@ -8,7 +8,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -23,6 +22,7 @@ from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
 from playground.hardware.setup import Hardware, setup
 from playground.learning.trainer import Trainer
+from playground.pytree import PyTree
 from playground.runs.scaling import scale_envs
 from playground.runs.train import model_sampler
 
@@ -92,7 +92,7 @@ def alone(lock: str | None) -> Iterator[None]:
     yield
 
 
-def rate(call: Callable[[int], Any], steps: int, seconds: float) -> tuple[float, float]:
+def rate(call: Callable[[int], PyTree], steps: int, seconds: float) -> tuple[float, float]:
   """How fast something repeats.
 
   Args:
@@ -123,7 +123,7 @@ def peak_memory_gib() -> float | None:
   return max(known) / 2**30 if known else None
 
 
-def emit_peak(facts: Facts, **columns: Any) -> None:
+def emit_peak(facts: Facts, **columns: object) -> None:
   """A row for the memory, where it is known."""
   peak = peak_memory_gib()
   if peak is not None:

@@ -11,6 +11,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ import mujoco
 import numpy as np
 
 SIZES = ("num_envs", "batch_size", "num_minibatches", "grad_updates_per_step")
+Settings = dict[str, Any]  # what Brax's trainers take
 EVALUATION = ("num_evals", "num_resets_per_eval", "num_eval_envs")
 
 
@@ -42,7 +44,7 @@ def put_back_names() -> None:
     mujoco.MjSpec.find_body = lambda spec, name: spec.body(name)
 
 
-def replicate(tree: Any, devices: list[Any]) -> Any:
+def replicate(tree: object, devices: Sequence[object]) -> object:
   """A copy of every array on each device, under a leading axis, as pmap takes it."""
   mesh = jax.sharding.Mesh(np.asarray(devices), ("device",))
   sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
@@ -58,7 +60,7 @@ def use_menagerie(folder: str) -> None:
   mjx_env.MENAGERIE_PATH = epath.Path(folder)
 
 
-def tuned(task: str, backend: str, agent: str) -> dict[str, Any]:
+def tuned(task: str, backend: str, agent: str) -> Settings:
   """The package's own settings for a task; it has SAC's for DM Control only."""
   from mujoco_playground import dm_control_suite, locomotion  # pyright: ignore[reportMissingImports]
   from mujoco_playground.config import dm_control_suite_params, locomotion_params, manipulation_params  # pyright: ignore[reportMissingImports]
@@ -70,19 +72,19 @@ def tuned(task: str, backend: str, agent: str) -> dict[str, Any]:
   return dict(getattr(params, f"brax_{agent}_config")(task, backend))
 
 
-def load(task: str, backend: str, num_envs: int) -> Any:
+def load(task: str, backend: str, num_envs: int) -> object:
   """The package's task on a backend; Warp's buffers are for 8192 environments, more of them need larger ones."""
   from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
 
   config = registry.get_default_config(task)
-  changes: dict[str, Any] = {"impl": backend} if "impl" in config else {}
+  changes: dict[str, object] = {"impl": backend} if "impl" in config else {}
   if backend == "warp" and num_envs > 8192:
     sizes = {name: config.get(name) for name in ("naconmax", "naccdmax")}
     changes |= {name: int(size * num_envs / 8192) for name, size in sizes.items() if size}
   return registry.load(task, config_overrides=changes)
 
 
-def arguments_of(task: str, backend: str, seed: int, agent: str = "ppo") -> dict[str, Any]:
+def arguments_of(task: str, backend: str, seed: int, agent: str = "ppo") -> Settings:
   """What Brax's trainer takes to train a task on one device as the package does."""
   from mujoco_playground import registry, wrapper  # pyright: ignore[reportMissingImports]
 
@@ -101,12 +103,12 @@ def arguments_of(task: str, backend: str, seed: int, agent: str = "ppo") -> dict
   }
 
 
-def told(arguments: dict[str, Any], *names: str) -> str:
+def told(arguments: Settings, *names: str) -> str:
   """Settings in words."""
   return ", ".join(f"{name} {arguments[name]}" for name in (*SIZES, *names) if name in arguments)
 
 
-def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: Any) -> dict[str, Any]:
+def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: Callable[[], float]) -> dict[str, object]:
   """Trains for some epochs of at least `steps` control steps, without evaluations or resets between."""
   from brax.training.agents.ppo import train as ppo
 
@@ -135,7 +137,7 @@ def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: An
   }
 
 
-def learn(task: str, backend: str, seed: int, num_timesteps: int | None, agent: str) -> dict[str, Any]:
+def learn(task: str, backend: str, seed: int, num_timesteps: int | None, agent: str) -> dict[str, object]:
   """Trains to the end with the package's own evaluations and resets; None is its own budget.
 
   The clock starts when the evaluation before training is done. Brax has compiled and run that one by then; compiling
@@ -149,7 +151,7 @@ def learn(task: str, backend: str, seed: int, num_timesteps: int | None, agent: 
     arguments.pop("num_resets_per_eval", None)  # 0.2.0 has it in the set, Brax's SAC resets nothing between
   stretches = max(arguments.get("num_resets_per_eval", 0), 1)
 
-  def note(step: int, metrics: Any) -> None:
+  def note(step: int, metrics: Mapping[str, float]) -> None:
     evaluations.append((int(step), float(metrics["eval/episode_reward"]), time.perf_counter()))
     if step:  # Brax divides the steps of all stretches between resets by the time of the last one
       rates.append(float(metrics["training/sps"]) / stretches)

@@ -107,7 +107,7 @@ class Gate:
       return "the address must be the one that the command has printed, with its token"
     return ""
 
-  def admit(self, raw: Any) -> bytes | None:
+  def admit(self, raw: object) -> bytes | None:
     """A message as viser may have it; None for one that the page does not send, or whose value cannot be."""
     try:
       message = _DECODER.decode(raw) if isinstance(raw, bytes) else None

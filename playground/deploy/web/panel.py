@@ -78,7 +78,7 @@ class Panel:
     low = -high if told.get("min") is None else np.array(told["min"])
     sliders: list[viser.GuiSliderHandle[float]] = []
 
-    def take(_: Any) -> None:
+    def take(_: object) -> None:
       self._session.player.command = np.array([slider.value for slider in sliders])
 
     def leave() -> None:
