@@ -89,7 +89,7 @@ def judge(golden: Golden, found: Mapping[str, float]) -> bool:
 def measurement(golden: Golden, options: Options) -> Measurement:
   """The run as a job; raises ConfigError for overrides that are invalid."""
   overrides = [*golden.overrides, *options.overrides]
-  agent = compose(overrides).agent.name
+  agent = compose(overrides).agent_name
   columns = {"benchmark": "golden", "task": golden.name, "agent": agent, "who": "ours", "setting": ""}
   metrics = list(golden.windows)
   last = {"quantity": QUANTITY, "setting": setting(options.overrides, metrics[-1])}
