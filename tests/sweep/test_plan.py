@@ -96,7 +96,7 @@ def test_nothing_is_written_when_the_launcher_is_not_installed(
 ) -> None:
   monkeypatch.delitem(sys.modules, f"playground.sweep.{launcher}", raising=False)
   monkeypatch.setitem(sys.modules, module, None)
-  with pytest.raises(ConfigError, match=rf"^launcher={launcher} needs .*: pip install .playground-run\[{launcher}\]"):
+  with pytest.raises(ConfigError, match=rf"^launcher={launcher} needs .*: pip install -e '\.\[{launcher}\]'"):
     plan(["seed=1,2", f"launcher={launcher}"])
   assert list(here.iterdir()) == []
 
