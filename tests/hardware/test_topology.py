@@ -33,7 +33,7 @@ run, ended = Loop.run, []
 
 def remember(loop, *args):
   state, completed = run(loop, *args)
-  ended.append(checksum([np.asarray(x) for x in jax.device_get(jax.tree.leaves(loop._trainer.policy(state)))]))
+  ended.append(checksum([np.asarray(x) for x in jax.device_get(jax.tree.leaves(loop.trainer.policy(state)))]))
   return state, completed
 
 Loop.run = remember

@@ -51,9 +51,9 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
   class Watched(Loop):
     def run(self, state: Any, update: int | None = None) -> tuple[Any, bool]:
-      before = jax.device_get(self._trainer.policy(state))
+      before = jax.device_get(self.trainer.policy(state))
       state, completed = super().run(state, update)
-      seen.append((update, before, jax.device_get(self._trainer.policy(state))))
+      seen.append((update, before, jax.device_get(self.trainer.policy(state))))
       return state, completed
 
   monkeypatch.setattr(train_module, "Loop", Watched)

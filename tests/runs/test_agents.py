@@ -96,7 +96,7 @@ def test_a_new_run_starts_from_weights(
   policies, run_loop = [], Loop.run
 
   def watched(loop: Loop, state: Any, update: int | None = None) -> tuple[Any, bool]:
-    policies.append(jax.device_get(loop._trainer.policy(state)))
+    policies.append(jax.device_get(loop.trainer.policy(state)))
     return run_loop(loop, state, update)
 
   monkeypatch.setattr(Loop, "run", watched)

@@ -261,7 +261,7 @@ def test_a_chain_starts_at_a_stage_from_someones_weights(
   policies, run_loop = [], Loop.run
 
   def watched(loop: Loop, state: Any, update: int | None = None) -> tuple[Any, bool]:
-    policies.append(jax.device_get(loop._trainer.policy(state)))
+    policies.append(jax.device_get(loop.trainer.policy(state)))
     return run_loop(loop, state, update)
 
   monkeypatch.setattr(Loop, "run", watched)
