@@ -43,12 +43,13 @@ def test_the_old_handlers_come_back() -> None:
 
 
 def test_a_hang_up_saves_unless_it_is_ignored() -> None:
-  with Interrupts() as interrupts:
-    interrupts.start_saving()
-    os.kill(os.getpid(), signal.SIGHUP)
-    assert interrupts.signum == signal.SIGHUP
-  before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as `nohup` does
+  before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests may run under `nohup`
   try:
+    with Interrupts() as interrupts:
+      interrupts.start_saving()
+      os.kill(os.getpid(), signal.SIGHUP)
+      assert interrupts.signum == signal.SIGHUP
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as `nohup` does
     with Interrupts():
       os.kill(os.getpid(), signal.SIGHUP)
   finally:

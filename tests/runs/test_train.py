@@ -284,7 +284,8 @@ def test_a_terminal_that_is_gone(whole: Path, cache: Path, tmp_path: Path) -> No
   run = tmp_path / "run"
   ours, theirs = pty.openpty()
   args = [*COMMAND, *LONG, f"run_dir={run}", f"hardware.cache_dir={cache}"]
-  code = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execvp(sys.argv[1], sys.argv[1:])"
+  code = "import fcntl, os, signal, sys, termios; signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+  code += "fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execvp(sys.argv[1], sys.argv[1:])"
   env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
   terminal: Any = {"stdin": theirs, "stdout": theirs, "stderr": theirs, "start_new_session": True}
   process = subprocess.Popen([sys.executable, "-c", code, *args], env=env, **terminal)
