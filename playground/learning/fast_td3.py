@@ -55,6 +55,7 @@ class Transition(struct.PyTreeNode):
     reward: unscaled.
     bootstrap: 0 where the task ended the episode, else 1.
     valid: 0 for a step with a number that is not finite, else 1.
+    done: 1 where an episode ended, by the task or by time; only with `num_steps` above 1, else None.
   """
 
   obs: dict[str, jax.Array]
@@ -63,6 +64,7 @@ class Transition(struct.PyTreeNode):
   reward: jax.Array
   bootstrap: jax.Array
   valid: jax.Array
+  done: jax.Array | None = None
 
 
 class Atoms:
@@ -140,7 +142,8 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
     networks = FastTD3Networks(env, config, network_precision)
     obs = {key: jax.ShapeDtypeStruct(size, jnp.float32) for key, size in networks.obs_sizes.items()}
     scalar, action = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
-    example = Transition(obs, obs, action, reward=scalar, bootstrap=scalar, valid=scalar)  # pyright: ignore
+    done = scalar if config.num_steps > 1 else None
+    example = Transition(obs, obs, action, reward=scalar, bootstrap=scalar, valid=scalar, done=done)  # pyright: ignore
     self.buffer = ReplayBuffer(config.max_replay_size, config.num_envs, example, config.checkpoint_replay)
     super().__init__(config, networks, self.buffer)
     self.optimizer = optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
@@ -176,7 +179,8 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
     envs, final_obs = envs.step(action)
     after = envs.state
     bootstrap, valid = 1 - after.done * (1 - after.info["truncation"]), 1 - after.info["nonfinite"]
-    transition = Transition(before, networks.select(final_obs), action, after.reward, bootstrap, valid)
+    done = after.done if config.num_steps > 1 else None
+    transition = Transition(before, networks.select(final_obs), action, after.reward, bootstrap, valid, done)
     normalizer = state.normalizer
     if config.normalize_observations:
       normalizer = running_statistics.update(normalizer, before, pmap_axis_name=AXIS)
@@ -189,7 +193,11 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
 
     def learn(start: PyTree) -> tuple[PyTree, jax.Array]:
       shape = (config.grad_updates_per_step, config.batch_size // jax.lax.axis_size(AXIS))
-      batches = self.buffer.sample(replay, replay_key, shape)
+      if config.num_steps > 1:
+        windows = self.buffer.sample_windows(replay, replay_key, shape, config.num_steps)
+        batches = n_step(windows, config.discounting)
+      else:
+        batches = self.buffer.sample(replay, replay_key, shape)
       batches = batches.replace(obs=normalize(batches.obs, seen), next_obs=normalize(batches.next_obs, seen))
       return self._learn(start, batches, replay.inserted, noise_key)
 
@@ -245,6 +253,35 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
     actor, critic, target, opt_state = carry
     learned = FastTD3Params(unravel_actor(actor), unravel_critic(critic))
     return (learned, unravel_critic(target), opt_state), log.mean(axis=0)  # of the actor's also where it rested
+
+
+def n_step(windows: Transition, discounting: float) -> Transition:
+  """Makes one transition of several: rewards add up, discounted, until the episode or the window ends.
+
+  Args:
+    windows: successive steps, each [n, ..., ] with `done`.
+    discounting: discount of one step.
+
+  Returns:
+    From the first observation and action to the last `next_obs`, where `bootstrap` also holds the discount of all steps
+    but one; it is valid where all of its steps are.
+  """
+  assert windows.done is not None
+  whole = jax.tree.map(lambda x: x[0], windows)
+  alive, discount = 1 - whole.done, jnp.ones_like(whole.reward)
+  for k in range(1, len(windows.reward)):
+    step = jax.tree.map(lambda x, k=k: x[k], windows)
+    goes_on = alive > 0
+    discount = jnp.where(goes_on, discount * discounting, discount)
+    latest = lambda new, old, on=goes_on: jnp.where(on.reshape(on.shape + (1,) * (new.ndim - on.ndim)), new, old)
+    whole = whole.replace(
+      reward=whole.reward + alive * discount * step.reward,
+      next_obs=jax.tree.map(latest, step.next_obs, whole.next_obs),
+      bootstrap=latest(step.bootstrap, whole.bootstrap),
+      valid=whole.valid * latest(step.valid, jnp.ones_like(step.valid)),
+    )
+    alive *= 1 - step.done
+  return whole.replace(bootstrap=whole.bootstrap * discount)
 
 
 def critic_loss(

@@ -349,6 +349,7 @@ class FastTD3Config(OffPolicyConfig):
   min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 10_240
   learning_rate: Annotated[float, positive(1), "of AdamW, for actor and critics"] = 3e-4
   weight_decay: Annotated[float, at_least_0(), "of AdamW"] = 0.1
+  num_steps: Annotated[int, count(1, 100), "policy steps whose rewards a target holds before the critic's value"] = 1
   discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
   tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each critic update"] = 0.1
   reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
@@ -371,6 +372,11 @@ class FastTD3Config(OffPolicyConfig):
   def check(self, num_devices: int) -> None:
     super().check(num_devices)
     _check_values(self.min_value, self.max_value)
+    if min(self.prefill_updates, self.max_replay_size // self.num_envs) < self.num_steps:
+      raise ConfigError(
+        f"agent.num_steps={self.num_steps}: agent.min_replay_size={self.min_replay_size} and agent.max_replay_size="
+        f"{self.max_replay_size} must hold so many steps of agent.num_envs={self.num_envs} environments."
+      )
     if self.max_noise < self.min_noise:
       raise ConfigError(f"agent.max_noise={self.max_noise} must not be below agent.min_noise={self.min_noise}.")
 

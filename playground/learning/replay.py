@@ -74,6 +74,21 @@ class ReplayBuffer:
     transitions = self._unravel(rows.at[drawn].get(mode="promise_in_bounds"))
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), transitions)
 
+  def sample_windows(self, replay: Replay, key: jax.Array, shape: tuple[int, ...], length: int) -> PyTree:
+    """Draws successive transitions of one environment each, a tree of [length, *shape, ...].
+
+    All that are held whole have the same probability; there must be one: no window crosses the newest transition.
+    """
+    slots, num_envs = replay.data.shape[:2]
+    start_key, env_key = jax.random.split(key)
+    held = self.held(replay)
+    oldest = jnp.where(replay.inserted > slots, replay.inserted % slots, 0)
+    start = oldest + jax.random.randint(start_key, (math.prod(shape),), 0, held - length + 1)
+    env = jax.random.randint(env_key, (math.prod(shape),), 0, num_envs)
+    rows = replay.data[(start + jnp.arange(length)[:, None]) % slots, env]
+    transitions = self._unravel(rows.reshape(-1, self.width))
+    return jax.tree.map(lambda x: x.reshape(length, *shape, *x.shape[1:]), transitions)
+
   def held(self, replay: Replay) -> jax.Array:
     """Slots in use, []: the first ones."""
     return jnp.minimum(replay.inserted, self.slots)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from playground.errors import ConfigError
-from playground.learning.fast_td3 import Atoms, FastTD3Networks, Transition, critic_loss, policy_loss
+from playground.learning.fast_td3 import Atoms, FastTD3Networks, Transition, critic_loss, n_step, policy_loss
 from playground.learning.hyperparameters import FastTD3Config, FastTD3NetworkConfig
 from tests.dummy import PointTask
 
@@ -118,12 +118,31 @@ def test_the_actor_begins_near_0_and_climbs(networks: FastTD3Networks) -> None:
   assert value(params.policy) < either
 
 
+def test_returns_of_several_steps_equal_a_loop() -> None:
+  rng, discounting = np.random.default_rng(0), 0.9
+  done, cut = (rng.random((4, 200)) < 0.3).astype(np.float32), (rng.random((4, 200)) < 0.5).astype(np.float32)
+  reward, valid = rng.normal(size=(4, 200)).astype(np.float32), (rng.random((4, 200)) < 0.9).astype(np.float32)
+  obs = {"state": np.arange(4 * 200, dtype=np.float32).reshape(4, 200, 1)}
+  bootstrap = 1 - done * (1 - cut)
+  found = n_step(Transition(obs, {"state": obs["state"] + 0.5}, obs["state"], reward, bootstrap, valid, done), 0.9)  # pyright: ignore[reportArgumentType]
+  for i in range(200):
+    length = next((k for k in range(4) if done[k, i]), 3) + 1
+    expected = sum(discounting**k * reward[k, i] for k in range(length))
+    assert float(found.reward[i]) == pytest.approx(expected, rel=1e-5, abs=1e-6)
+    assert float(found.bootstrap[i]) == pytest.approx(bootstrap[length - 1, i] * discounting ** (length - 1), rel=1e-5)
+    assert float(found.valid[i]) == valid[:length, i].prod()
+    assert float(found.next_obs["state"][i, 0]) == obs["state"][length - 1, i, 0] + 0.5
+  np.testing.assert_array_equal(found.obs["state"], obs["state"][0])
+  np.testing.assert_array_equal(found.action, obs["state"][0])
+
+
 @pytest.mark.parametrize(
   ("changes", "sentence"),
   [
     ({"max_replay_size": 1000}, "agent.max_replay_size=1000 must not be below agent.num_envs=1024"),
     ({"min_noise": 1.0}, "agent.max_noise=0.4 must not be below agent.min_noise=1.0"),
     ({"max_value": -1.0}, "must hold 0 between them"),
+    ({"num_steps": 11}, "agent.num_steps=11: agent.min_replay_size=10240"),
     ({"batch_size": 32_769}, "must be a multiple of the number of devices, 2"),
   ],
 )

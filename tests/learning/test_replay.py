@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from playground.learning.replay import Replay, ReplayBuffer
 
@@ -47,3 +48,12 @@ def test_the_newest_replace_the_oldest() -> None:
   drawn = BUFFER.sample(replay, jax.random.PRNGKey(0), (2000,))["reward"]
   assert np.unique(drawn // 10).tolist() == [2, 3, 4, 5, 6]
   assert (int(BUFFER.held(replay)), int(replay.inserted)) == (SLOTS, SLOTS + 2)
+
+
+@pytest.mark.parametrize(("steps", "starts"), [(3, [0]), (SLOTS, [0, 1, 2]), (SLOTS + 2, [2, 3, 4])])
+def test_windows_are_successive_steps_of_one_environment(steps: int, starts: list[int]) -> None:
+  drawn = BUFFER.sample_windows(filled(steps), jax.random.PRNGKey(0), (2, 300), 3)
+  assert drawn["obs"]["more"].shape == (3, 2, 300, 2, 2)
+  times = np.asarray(drawn["reward"]).reshape(3, -1)
+  np.testing.assert_array_equal(np.diff(times, axis=0), 10)
+  assert np.unique(times[0]).tolist() == [10 * start + env for start in starts for env in range(ENVS)]
