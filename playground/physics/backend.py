@@ -52,6 +52,9 @@ class BufferUse(struct.PyTreeNode):
     return BufferUse(constraints, contacts, self.overflow | other.overflow)
 
 
+_ABSENT: Any = None  # a derived field that the task does not name
+
+
 class PhysicsData(struct.PyTreeNode):
   """One environment's simulator state, named as in `mujoco.MjData`; derived fields a task does not read are None.
 
@@ -73,22 +76,22 @@ class PhysicsData(struct.PyTreeNode):
   eq_active: jax.Array
   mocap_pos: jax.Array
   mocap_quat: jax.Array
-  qacc: Any = None
-  sensordata: Any = None
-  actuator_force: Any = None
-  qfrc_actuator: Any = None
-  xpos: Any = None
-  xquat: Any = None
-  xmat: Any = None
-  xipos: Any = None
-  xanchor: Any = None
-  site_xpos: Any = None
-  site_xmat: Any = None
-  geom_xpos: Any = None
-  geom_xmat: Any = None
-  subtree_com: Any = None
-  cvel: Any = None
-  ten_length: Any = None
+  qacc: jax.Array = _ABSENT
+  sensordata: jax.Array = _ABSENT
+  actuator_force: jax.Array = _ABSENT
+  qfrc_actuator: jax.Array = _ABSENT
+  xpos: jax.Array = _ABSENT
+  xquat: jax.Array = _ABSENT
+  xmat: jax.Array = _ABSENT
+  xipos: jax.Array = _ABSENT
+  xanchor: jax.Array = _ABSENT
+  site_xpos: jax.Array = _ABSENT
+  site_xmat: jax.Array = _ABSENT
+  geom_xpos: jax.Array = _ABSENT
+  geom_xmat: jax.Array = _ABSENT
+  subtree_com: jax.Array = _ABSENT
+  cvel: jax.Array = _ABSENT
+  ten_length: jax.Array = _ABSENT
   buffers: BufferUse | None = None
 
 

@@ -16,8 +16,9 @@ from playground.deploy.web.gamepad import Gamepads
 from playground.deploy.web.plots import Plots
 from playground.robots.terrain import TERRAINS
 
+Key = Any  # a literal type of viser that is not public
 # Component of the command, key that adds to it, key that takes away; viser moves its camera with WASD, QE and arrows.
-AXES: tuple[tuple[str, Any, Any], ...] = (
+AXES: tuple[tuple[str, Key, Key], ...] = (
   ("forward, m/s", "I", "K"),
   ("left, m/s", "U", "O"),
   ("turn, rad/s", "J", "L"),
@@ -157,13 +158,13 @@ class Panel:
     session = self._session
     return next((label for label, choice in choices.items() if choice == session.following), session.acting)
 
-  def _add_button(self, label: str, key: Any, act: Callable[[], None]) -> viser.GuiButtonHandle:
+  def _add_button(self, label: str, key: Key, act: Callable[[], None]) -> viser.GuiButtonHandle:
     button = self._gui.add_button(f"{label} ({key})")
     button.on_click(lambda _: self._session.ask(act))
     self._add_key(label, key, act)
     return button
 
-  def _add_key(self, label: str, key: Any, act: Callable[[], None]) -> None:
+  def _add_key(self, label: str, key: Key, act: Callable[[], None]) -> None:
     """A key, and an entry in viser's palette of commands (ctrl K)."""
     self._gui.add_command(label, hotkey=key).on_trigger(lambda _: self._session.ask(act))
 
