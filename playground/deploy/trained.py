@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from playground import registry
-from playground.config import Section, config_dict
+from playground.config import config_dict
 from playground.deploy.contract import describe_policy
 from playground.deploy.graph import policy_graph
 from playground.deploy.policy import ExportedPolicy
@@ -18,6 +18,7 @@ from playground.envs.wrappers import wrap_for_training
 from playground.extras import need
 from playground.runs.csv_tracker import read_metrics
 from playground.runs.loaded_policy import LoadedPolicy, load_policy
+from playground.settings import Section
 
 _EXACT = "highest"  # precision of matrix products: what the exported policy computes
 

@@ -186,8 +186,8 @@ sys.exit(jobs.run_jobs([job], Table(Path({str(table)!r})), {FACTS!r}, jobs.Plan(
   assert process.stdout is not None
   worker = int(process.stdout.readline().split()[-2].replace(",", ""))
   process.terminate()
-  assert process.wait(20) == 143
-  deadline = time.monotonic() + 20
+  assert process.wait(60) == 143
+  deadline = time.monotonic() + 60
   while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
     time.sleep(0.05)
   assert not Path(f"/proc/{worker}").exists()

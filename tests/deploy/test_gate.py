@@ -233,7 +233,7 @@ def test_a_signal_ends_it_whatever_its_clients_say(run: Path, signum: signal.Sig
         for _ in range(100):
           connection.send(share)
         process.send_signal(signum)
-        assert process.wait(30) == 0
+        assert process.wait(120) == 0
     finally:
       process.kill()
 

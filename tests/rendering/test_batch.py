@@ -138,6 +138,7 @@ def test_each_device_renders_its_share() -> None:
   assert done.stdout.splitlines()[-1] == "2 [1, 3, 1, 6]"  # two contexts of 3 on two devices, one of 6 on one
 
 
+@pytest.mark.slow  # three renderers of their own
 def test_shadows_and_textures_are_chosen() -> None:
   looks = [{}, {"shadows": True}, {"textures": True}]
   renderers = [BatchRenderer(task().physics, View(("fixed",), WIDTH, HEIGHT, **look)) for look in looks]

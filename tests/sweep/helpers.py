@@ -41,7 +41,7 @@ def controller(sweep: SweepDirectory, *settings: str) -> "subprocess.Popen[bytes
   return subprocess.Popen([sys.executable, "-c", CONTROLLER, str(sweep.path), *settings], cwd=Path(__file__).parents[2])
 
 
-def wait_for(what: Callable[[], bool], seconds: float = 30) -> None:
+def wait_for(what: Callable[[], bool], seconds: float = 120) -> None:
   until = time.monotonic() + seconds
   while not what():
     assert time.monotonic() < until, "what the test waits for does not come"

@@ -81,7 +81,7 @@ def test_an_interrupt_saves_and_starts_nothing_more(tmp_path: Path, signum: int,
   slots = min(2, len(os.sched_getaffinity(0)))
   wait_for(lambda: sum((folder / "starts.jsonl").is_file() for folder in folders) == slots)
   process.send_signal(signum)
-  assert process.wait(30) == code
+  assert process.wait(60) == code
   states = [state.status for state in sweep.states().values()]
   assert states == ["preempted"] * slots + ["queued"] * (4 - slots)
   assert "goes on" in output(sweep)
@@ -96,7 +96,7 @@ def test_a_second_interrupt_kills(tmp_path: Path) -> None:
   process.send_signal(signal.SIGINT)
   wait_for(lambda: "asked to stop" in output(sweep))
   process.send_signal(signal.SIGINT)
-  assert process.wait(20) == 130
+  assert process.wait(60) == 130
   assert statuses(sweep) == {11: "preempted"}
   assert not alive(starts(sweep)[11][0]["pid"])
 
@@ -127,7 +127,7 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
   wait_for(lambda: bool(starts(sweep)[15]) and folder.record.get("status") == "running")
   os.kill(folder.record["pid"], signal.SIGKILL)
   assert folder.locked() and folder.state().status == "running", "the job itself is still at work"
-  assert process.wait(30) == 0
+  assert process.wait(60) == 0
   assert folder.state().status == "finished"
 
 

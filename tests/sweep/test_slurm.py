@@ -47,7 +47,7 @@ def test_a_preempted_job_saves_is_queued_again_and_resumes(tmp_path: Path, local
   launcher = slurm.SlurmLauncher(sweep, SlurmConfig(), STUB)
   (job,) = sweep.jobs
   assert launcher.start(job)
-  until = time.monotonic() + 40
+  until = time.monotonic() + 120
   while not starts(sweep)[13]:
     assert time.monotonic() < until
     time.sleep(0.05)
@@ -64,7 +64,7 @@ def test_a_preempted_job_saves_is_queued_again_and_resumes(tmp_path: Path, local
 def test_submitting_without_waiting(tmp_path: Path, local: list[SlurmLauncher]) -> None:
   sweep = make_sweep(tmp_path / "sweep", 0)
   assert run(sweep, "launcher=slurm", "launcher.wait=false") == 0
-  until = time.monotonic() + 40
+  until = time.monotonic() + 120
   while statuses(sweep) != {0: "finished"}:
     assert time.monotonic() < until
     time.sleep(0.1)
