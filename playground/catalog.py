@@ -9,7 +9,7 @@ import dataclasses
 import json
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 Status = Literal["solved", "learning", "open", "not measured"]
 STATUSES = get_args(Status)
@@ -110,7 +110,7 @@ def status(row: dict[str, str]) -> Status:
 
 def _reference(task: str) -> dict[str, str] | None:
   """The best of our runs of a task; where there are only chains, the last stage."""
-  rows: list[dict[str, Any]] = []
+  rows: list[dict[str, str]] = []
   for name in _TABLES:
     with (_REFERENCE / f"{name}.csv").open(encoding="utf-8", newline="") as file:
       rows += [row for row in csv.DictReader(file) if row["task"] == task and row.get("who", "ours") == "ours"]

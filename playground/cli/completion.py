@@ -4,13 +4,13 @@ import argparse
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from playground.config import compose, config_roots, task_names
 from playground.config.definitions import chosen_names, definition
 from playground.config.files import groups, listed_options
 from playground.config.run_config import SCALARS, SECTIONS
 from playground.errors import PlaygroundError
+from playground.settings import Plain, Section
 
 PROGRAMS = ("playground", "playground-run")
 _FLAGS = ("-m", "--multirun", "--cfg", "--help", "--verbose", "--version", "--package")
@@ -125,7 +125,7 @@ def _of_run(current: str, overrides: Sequence[str]) -> Iterator[str]:
     yield from (f"{name}." for name in SECTIONS)
   else:
     parent = key.rpartition(".")[0]
-    node: Any = _resolved(overrides)
+    node: Plain = _resolved(overrides)
     for part in parent.split("."):
       node = node.get(part) if isinstance(node, Mapping) else None
     for name, inner in node.items() if isinstance(node, Mapping) else ():
@@ -139,7 +139,7 @@ def _choices(key: str, overrides: Sequence[str]) -> Iterator[str]:
     yield from ("null",) if setting.nullable else ()
 
 
-def _resolved(overrides: Sequence[str]) -> Mapping[str, Any]:
+def _resolved(overrides: Sequence[str]) -> Section:
   """The configuration of what is typed so far, or the default one where that does not compose yet."""
   try:
     return compose(overrides).resolved

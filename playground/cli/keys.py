@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -15,7 +14,7 @@ from playground.config.files import find_file, groups, lineage, listed_options
 from playground.config.schema import check_key
 from playground.errors import UnknownNameError
 from playground.mdp.options import OPTIONS
-from playground.settings import Setting
+from playground.settings import Plain, Section, Setting
 from playground.text import join
 
 _WIDE = 160  # columns, where no terminal says how many there are
@@ -56,9 +55,9 @@ def show_keys(prefix: str, overrides: Sequence[str]) -> int:
   return 0
 
 
-def _at(prefix: str, values: Mapping[str, Any]) -> Any:
+def _at(prefix: str, values: Section) -> Plain:
   """The part of the configuration at a dotted key; raises UnknownNameError if there is none."""
-  node: Any = values
+  node: Plain = values
   for part in prefix.split("."):
     if not isinstance(node, Mapping) or part not in node:
       check_key(prefix, values)
@@ -67,11 +66,11 @@ def _at(prefix: str, values: Mapping[str, Any]) -> Any:
   return node
 
 
-def _rows(prefix: str, node: Any, config: RunConfig, names: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]:
+def _rows(prefix: str, node: Plain, config: RunConfig, names: Section) -> Iterator[tuple[str, str, str, str]]:
   """Yields key, value, allowed values and help."""
   comments = _comments(config)
 
-  def walk(key: str, value: Any) -> Iterator[tuple[str, str, str, str]]:
+  def walk(key: str, value: Plain) -> Iterator[tuple[str, str, str, str]]:
     setting = definition(key, names)
     said = (setting and setting.help) or comments.get(key, "")
     if _is_term(key, value):
@@ -87,7 +86,7 @@ def _rows(prefix: str, node: Any, config: RunConfig, names: Mapping[str, Any]) -
   return walk(prefix, node)
 
 
-def _is_term(key: str, value: Any) -> bool:
+def _is_term(key: str, value: Plain) -> bool:
   section, kind, *names = [*key.split("."), "", ""]
   names = [name for name in names if name]
   return (
@@ -99,7 +98,7 @@ def _is_term(key: str, value: Any) -> bool:
   )
 
 
-def _term(key: str, entry: Mapping[str, Any]) -> tuple[str, str]:
+def _term(key: str, entry: Section) -> tuple[str, str]:
   """The fields of a term, and the first line of its function's docstring."""
   from playground.mdp.terms import bind_one  # imports JAX, which keys other than terms do without
 

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -11,6 +10,7 @@ from rich.text import Text
 
 from playground.catalog import Entry, entries
 from playground.errors import UnknownNameError, nearest
+from playground.settings import Plain, Section
 
 FILTERS = ("suite", "robot", "status", "backend")
 
@@ -48,11 +48,11 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   return 0
 
 
-def _row(name: str, entry: Entry | None) -> dict[str, Any]:
+def _row(name: str, entry: Entry | None) -> dict[str, Plain]:
   return dataclasses.asdict(entry) if entry else {"task": name}
 
 
-def _table(rows: Iterable[Mapping[str, Any]]) -> Table:
+def _table(rows: Iterable[Section]) -> Table:
   table = Table(box=None, padding=(0, 2, 0, 0))
   table.add_column("task", style="cyan", no_wrap=True)
   for name in ("suite", "robot", "observation"):

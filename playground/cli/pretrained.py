@@ -1,7 +1,5 @@
 """`playground pretrained`: the policies that come with the package, and how one is added."""
 
-from typing import Any
-
 from rich.console import Console
 from rich.table import Table
 
@@ -13,6 +11,7 @@ from playground.learning.checkpoints import find_checkpoints
 from playground.pretrained import add, cards
 from playground.runs.csv_tracker import read_metrics
 from playground.runs.run_dir import RunDirectory
+from playground.settings import Plain
 
 _EPISODES = 20  # in C MuJoCo
 
@@ -56,7 +55,7 @@ def add_policy(path: str) -> int:
   if evaluated.empty:
     raise ConfigError(f"{path} was not evaluated at its newest checkpoint, step {steps}.")
   config, manifest, row = run.config, run.manifest, evaluated.iloc[-1]
-  git: dict[str, Any] = manifest.get("git") or {}
+  git: dict[str, Plain] = manifest.get("git") or {}
   facts = {
     "task": config["choices"]["env"],
     "agent": config["choices"]["agent"],
@@ -87,5 +86,5 @@ def add_policy(path: str) -> int:
   return 0
 
 
-def _interval(measured: dict[str, Any]) -> str:
+def _interval(measured: dict[str, Plain]) -> str:
   return f"{measured['return']:.1f} ± {measured['return_std']:.1f}"

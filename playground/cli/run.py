@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser  # Hydra has no public name for its own flags
@@ -37,6 +37,7 @@ from playground.config import (
 )
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, one_sentence
 from playground.rendering.gl import withhold_gl
+from playground.settings import Plain
 from playground.trust import trust
 
 _COMPLETION = re.compile("(install|uninstall|query)=(bash|fish|zsh)")
@@ -131,7 +132,7 @@ def _shown(config: RunConfig, package: str | None) -> str:
   """The configuration as YAML, or what it has at a dotted key."""
   if package is None:
     return to_yaml(config)
-  section: Any = config.resolved
+  section: Plain = config.resolved
   for part in package.split("."):
     if not isinstance(section, Mapping) or part not in section:
       raise UnknownNameError(f"--package {package}: the configuration has no such key.")

@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
@@ -13,12 +13,14 @@ from playground import registry
 from playground.config import RunConfig, compose, format_value
 from playground.errors import ConfigError
 from playground.mdp.options import is_model_field
+from playground.settings import Plain, Section
 
 if TYPE_CHECKING:
   from playground.envs.base import Env
+  from playground.mdp.terms import Term
 
 _WIDE = 180  # columns, where no terminal says how many there are
-Row = Mapping[str, Any]
+Row = Section
 
 
 def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_views: int = 16) -> int:
@@ -76,7 +78,7 @@ def describe(config: RunConfig, env: "Env") -> Iterator[RenderableType]:
   yield _facts(f"{config.agent_name} ({origin})", _flat(config.resolved["agent"]))
 
 
-def _facts_of(env: "Env", section: Mapping[str, Any], choices: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def _facts_of(env: "Env", section: Section, choices: Section) -> Iterator[tuple[str, Plain]]:
   yield "class", section["task"]
   yield "what", inspect.getdoc(type(env.unwrapped)) or ""
   yield "robot", choices.get("robot") or "its own"
@@ -98,11 +100,11 @@ def _facts_of(env: "Env", section: Mapping[str, Any], choices: Mapping[str, Any]
     yield "noise", f"times {section['noise_level']:g}"
 
 
-def _terms(env: "Env", kind: str) -> list[Any]:
+def _terms(env: "Env", kind: str) -> "list[Term]":
   return getattr(getattr(env.unwrapped, kind, None), "terms", [])
 
 
-def _row(term: Any) -> dict[str, Any]:
+def _row(term: "Term") -> dict[str, Plain]:
   """Cells that terms of all kinds have."""
   return {
     "name": term.name,
@@ -112,7 +114,7 @@ def _row(term: Any) -> dict[str, Any]:
   }
 
 
-def _rewards(env: "Env", metrics: Mapping[str, Any]) -> Iterator[Row]:
+def _rewards(env: "Env", metrics: Section) -> Iterator[Row]:
   """Reward terms; those that a task computes itself have no weight."""
   terms = _terms(env, "rewards")
   own = [name.removeprefix("reward/") for name in metrics if name.startswith("reward/")]
@@ -137,7 +139,7 @@ def _observations(env: "Env") -> Iterator[Row]:
       yield {"name": name, "size": str(length)} | (_observation(bound[name], group) if name in bound else {})
 
 
-def _observation(term: Any, group: str) -> dict[str, Any]:
+def _observation(term: "Term", group: str) -> dict[str, Plain]:
   if group != "state" and term.name == "state":
     return {"what": "The group state, as the policy reads it."}
   options = term.options
@@ -150,7 +152,7 @@ def _observation(term: Any, group: str) -> dict[str, Any]:
   }
 
 
-def _events(events: Mapping[str, Any] | None) -> Iterator[Row]:
+def _events(events: Section | None) -> Iterator[Row]:
   """Events in the order in which they apply, within a mode."""
   from playground.mdp.terms import bind_one
 
@@ -167,7 +169,7 @@ def _events(events: Mapping[str, Any] | None) -> Iterator[Row]:
       yield _row(term) | enabled
 
 
-def function_and_source(func: Callable[..., Any], known: str = "") -> str:
+def function_and_source(func: Callable[..., object], known: str = "") -> str:
   """A function's name unless it is `known`, and its file and line from the top of its package."""
   target = inspect.unwrap(func)
   path = Path(inspect.getsourcefile(target) or "?")
@@ -176,15 +178,15 @@ def function_and_source(func: Callable[..., Any], known: str = "") -> str:
   return place if target.__name__ == known else f"{target.__qualname__} {place}"
 
 
-def _first_line(thing: Any) -> str:
+def _first_line(thing: object) -> str:
   return next(iter((thing.__doc__ or "").strip().splitlines()), "")
 
 
-def _params(params: Mapping[str, Any]) -> str:
+def _params(params: Section) -> str:
   return ", ".join(f"{name} {format_value(value)}" for name, value in params.items())
 
 
-def _flat(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flat(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
   for key, value in node.items():
     if isinstance(value, Mapping):
       yield from _flat(value, f"{prefix}{key}.")
@@ -209,7 +211,7 @@ def _table(title: str, rows: Sequence[Row]) -> RenderableType:
   return Group(Text(title, style="bold"), table if rows else Text("none"), Text())
 
 
-def _facts(title: str, rows: Iterable[tuple[str, Any]]) -> RenderableType:
+def _facts(title: str, rows: Iterable[tuple[str, Plain]]) -> RenderableType:
   """A table of keys and values."""
   table = Table(show_header=False, box=None, padding=(0, 2))
   for key, value in rows:
