@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from ml_collections import ConfigDict
 
 from playground import registry
 from playground.config import config_dict
@@ -91,12 +92,12 @@ def _newest_evaluation(trained: LoadedPolicy) -> dict[str, float]:
   return {"steps": int(last.step)} | scores
 
 
-def load_on_c_physics(task: str, config: Section) -> Env:
+def load_on_c_physics(task: str, config: Section | ConfigDict) -> Env:
   """Builds a task on C MuJoCo.
 
   Raises:
     ConfigError: it sees pictures, and MuJoCo-Warp, which renders them, is not installed.
   """
-  own: Section = config_dict(config)
+  own = config_dict(config)
   own.impl = "warp" if sees(own) else "jax"  # whose model is the smallest to build; it is not simulated
   return on_c_physics(registry.load(task, config=own))

@@ -6,7 +6,6 @@ environment after another on one core, so it is for looking, not for training.
 
 import copy
 import threading
-from typing import Any
 
 import jax
 import mujoco
@@ -52,7 +51,7 @@ class CPhysics(Physics):
     run = lambda state: self._run(state, num_substeps)
     return PhysicsData(**jax.pure_callback(run, self._shapes, state, vmap_method="broadcast_all"))
 
-  def _run(self, state: dict[str, Any], num_substeps: int) -> dict[str, np.ndarray]:
+  def _run(self, state: dict[str, np.ndarray], num_substeps: int) -> dict[str, np.ndarray]:
     """Runs each environment of a batch (any leading axes): `num_substeps` steps, or for 0 a forward pass."""
     state = {name: np.asarray(value) for name, value in state.items()}
     batch = state["time"].shape

@@ -194,8 +194,8 @@ def _is_loopback(host: str, port: int) -> bool:
   return all(_is_address_of_loopback(found[4][0]) for found in socket.getaddrinfo(host, port))
 
 
-def _is_address_of_loopback(text: Any) -> bool:
+def _is_address_of_loopback(text: object) -> bool:
   try:
-    return ipaddress.ip_address(text).is_loopback
+    return ipaddress.ip_address(str(text)).is_loopback
   except ValueError:
     return False
