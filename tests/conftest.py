@@ -46,6 +46,12 @@ def bounded_memory(allowed: list[float]) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
+def trusted_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+  """`trust=my_package` holds for a process."""
+  monkeypatch.setattr("playground.trust._named", set())
+
+
+@pytest.fixture(autouse=True)
 def logging_as_before() -> Iterator[None]:
   """Hydra's `--info` and hydra.verbose=true give the root logger a level, and a handler on what pytest closes."""
   root = logging.getLogger()

@@ -6,6 +6,7 @@ a process of its own (`playground.sweep`).
 """
 
 import argparse
+import itertools
 import os
 import re
 import signal
@@ -26,6 +27,7 @@ from playground.config import (
   RunConfig,
   command_lines,
   compose,
+  compose_all,
   config_roots,
   is_hydras,
   parse_with_hydra,
@@ -68,6 +70,9 @@ def _main(argv: Sequence[str]) -> int:
   if "--version" in argv:  # Hydra's option of this name prints Hydra's version
     print(f"playground-run {__version__}")
     return 0
+  argv, *others = ([*run] for apart, run in itertools.groupby(argv or [""], "--".__eq__) if not apart)
+  if others:
+    return _together(argv, others)
   verbose, argv = "--verbose" in argv, [arg for arg in argv if arg != "--verbose"]
   parser = get_args_parser()
   parser.error = _refuse
@@ -94,6 +99,26 @@ def _main(argv: Sequence[str]) -> int:
   if args.cfg or hydras:
     return _hydra_app(flags, [*config.overrides, *hydras], config, verbose)
   return _train(config, verbose)
+
+
+def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
+  """Trains runs in one program (`playground.runs.together`), their overrides with `--` between them.
+
+  What holds for the whole command (`trust`, `hardware.cache_dir`) stands in the first.
+  """
+  overrides, trusted = _trusted(overrides)
+  trust(*trusted)
+  common = command_lines(overrides)
+  configs = compose_all([overrides, *([*common, *run] for run in others)])
+  from playground.envs.options import impl_on_gpu
+  from playground.physics.warp_kernels import stand_by
+
+  stand_by(impl_on_gpu(configs[0].env), configs[0].hardware.platform)
+  print("\n".join([*header(configs[0]), f"  {'together':<10} {len(configs)} agents in one program"]), flush=True)
+  with uncollected(stays=True):
+    from playground.runs.together import train_together
+
+  return train_together(configs)
 
 
 def _help(keys: Sequence[str], overrides: Sequence[str]) -> int:

@@ -31,6 +31,13 @@ class LocalConfig(LauncherConfig):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class TogetherConfig(LocalConfig):
+  """One process for jobs that differ only in seeds, initial weights and numbers of the agent, else as `local`."""
+
+  max_agents: Annotated[int, count(1), "most jobs in one process, which share its compiled program and memory"] = 16
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class RayConfig(LauncherConfig):
   """A Ray cluster; its nodes share the sweep's folder. Without an address one is started on this machine."""
 
@@ -94,7 +101,12 @@ class OptunaConfig:
   seed: Annotated[int, SEED, "of the sampler"] = 0
 
 
-LAUNCHERS: dict[str, type[LauncherConfig]] = {"local": LocalConfig, "ray": RayConfig, "slurm": SlurmConfig}
+LAUNCHERS: dict[str, type[LauncherConfig]] = {
+  "local": LocalConfig,
+  "ray": RayConfig,
+  "slurm": SlurmConfig,
+  "together": TogetherConfig,
+}
 SEARCHES: dict[str, type] = {"grid": GridConfig, "optuna": OptunaConfig}
 
 

@@ -1,5 +1,10 @@
-"""Devices as a mesh of one axis, over which environments are divided (data parallel)."""
+"""Devices as a mesh of one axis, over which environments are divided (data parallel).
 
+A mesh for several agents has a second axis before it. What is jitted over such a mesh, and what is put on it, has an
+axis of agents before all others; functions are written for one agent all the same.
+"""
+
+import math
 import os
 from collections.abc import Callable
 
@@ -13,6 +18,8 @@ from jax.stages import Wrapped
 from playground.pytree import PyTree
 
 AXIS = "data"  # the mesh's axis; inside a mapped function collectives name it
+AGENTS = "agents"  # the axis over which agents are divided
+GROUP = "group"  # the axis of the agents that share a device, inside a mapped function
 
 
 def make_mesh(num_devices: int) -> Mesh:
@@ -20,6 +27,11 @@ def make_mesh(num_devices: int) -> Mesh:
   devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
   mine = lambda index: [device for device in devices if device.process_index == index][:num_devices]
   return Mesh(np.array([device for i in range(jax.process_count()) for device in mine(i)]), (AXIS,))
+
+
+def for_agents(mesh: Mesh, count: int) -> Mesh:
+  """The same devices for several agents: these are divided over them first, then each agent's environments."""
+  return Mesh(mesh.devices.reshape(math.gcd(count, mesh.size), -1), (AGENTS, AXIS))
 
 
 def gather_on_mesh(function: Callable[..., PyTree], mesh: Mesh, spec: PyTree) -> Wrapped:
@@ -47,16 +59,18 @@ def put(tree: PyTree, mesh: Mesh, spec: PyTree) -> PyTree:
   return jax.tree.map(place, shardings, tree)
 
 
-def own_share(array: jax.Array, axis: int) -> np.ndarray:
+def own_share(array: jax.Array | np.ndarray, axis: int) -> np.ndarray:
   """What this process has of an array that is divided by `axis`, on the host: all of it if there is one process."""
-  if array.is_fully_addressable or array.is_fully_replicated:
+  if isinstance(array, np.ndarray) or array.is_fully_addressable or array.is_fully_replicated:
     return np.asarray(array)
   shards = sorted(array.addressable_shards, key=lambda shard: shard.index[axis].start or 0)
   return np.concatenate([np.asarray(shard.data) for shard in shards], axis)
 
 
 def _shardings(mesh: Mesh, specs: PyTree) -> PyTree:
-  return jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs)
+  """The shardings that specs for one agent come to."""
+  agents = (AGENTS,) if AGENTS in mesh.axis_names else ()
+  return jax.tree.map(lambda spec: NamedSharding(mesh, P(*agents, *spec)), specs)
 
 
 def device_memory(mesh: Mesh) -> int | None:
@@ -75,17 +89,22 @@ def jit_on_mesh(
 
   Args:
     function: sees its device's share; collectives over "data" reach the other devices.
-    mesh: the devices.
-    in_specs: a PartitionSpec for each argument (or a tree prefix of them): P("data") divides the leading axis.
+    mesh: the devices. If it is one for several agents, arguments and results have an axis of agents in front.
+    in_specs: a PartitionSpec for each argument (or a tree prefix of them): P("data") divides the leading axis. None is
+      an argument that is the same for all devices and all agents.
     out_specs: the same for the results; P() promises that all devices return the same.
     donate_argnums: the argument whose buffers the result takes over.
   """
+  if AGENTS in mesh.axis_names:
+    function = jax.vmap(function, tuple(None if spec is None else 0 for spec in in_specs), axis_name=GROUP)
+  ins = tuple(NamedSharding(mesh, P()) if spec is None else _shardings(mesh, spec) for spec in in_specs)
+  outs = _shardings(mesh, out_specs)
+  in_specs, out_specs = jax.tree.map(lambda sharding: sharding.spec, (ins, outs))
   over_mesh = lambda function: jax.shard_map(
     function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
   )
   mapped = over_mesh(function) if mesh.size == 1 else _without_empty_arrays(function, over_mesh)
-  inputs, outputs = _shardings(mesh, in_specs), _shardings(mesh, out_specs)
-  return jax.jit(mapped, in_shardings=inputs, out_shardings=outputs, donate_argnums=donate_argnums)
+  return jax.jit(mapped, in_shardings=ins, out_shardings=outs, donate_argnums=donate_argnums)
 
 
 def _without_empty_arrays(function: Callable[..., PyTree], over_mesh: Callable[..., PyTree]) -> Callable[..., PyTree]:

@@ -1,10 +1,12 @@
 """The interface of an algorithm. The trainer does what is the same for all (`playground.learning.trainer`)."""
 
 import abc
+import copy
+import dataclasses
 import functools
 import importlib
-from collections.abc import Callable
-from typing import ClassVar, Generic, TypeVar
+from collections.abc import Callable, Mapping
+from typing import ClassVar, Generic, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -91,6 +93,12 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
       `gradient_steps`, and `nonfinite_updates`, those of them that were left out. Where `learned` is 0, the means are
       left out: there was nothing to learn from yet.
     """
+
+  def with_settings(self, values: Mapping[str, jax.Array]) -> Self:
+    """Returns the same algorithm with other values, each [], of settings that `config.traced` names."""
+    other = copy.copy(self)
+    other.config = dataclasses.replace(self.config, **values)
+    return other
 
   def new_policy(self, key: jax.Array) -> Policy:
     """Returns fresh parameters, and statistics of no observations."""

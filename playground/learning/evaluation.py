@@ -34,7 +34,7 @@ def make_evaluator(
     env: the task.
     act: the policy.
     num_envs: episodes, a multiple of the number of devices.
-    mesh: devices, one axis named "data".
+    mesh: devices, an axis named "data"; where it is one for several agents, all have an axis of agents in front.
     num_recorded: episodes on each device to record for a video.
     others: other ways to act on the same parameters, by name. Each gets `num_envs` episodes of its own, which start
       from the same states on the same models and run side by side with those of `act`.
@@ -49,7 +49,7 @@ def make_evaluator(
   """
   wrapped = wrap_for_evaluation(env)
   decisions = -(-env.episode_length // env.action_repeat)
-  per_device = num_envs // mesh.size
+  per_device = num_envs // mesh.shape[AXIS]
   acts = (act, *others.values())
   repeat = lambda tree: jax.tree.map(lambda x: jnp.concatenate([x] * len(acts)) if others else x, tree)
 

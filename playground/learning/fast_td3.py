@@ -146,8 +146,11 @@ class FastTD3(Algorithm[FastTD3Config, FastTD3Networks, FastTD3State]):
     example = Transition(obs, obs, action, reward=scalar, bootstrap=scalar, valid=scalar, done=done)  # pyright: ignore
     self.buffer = ReplayBuffer(config.max_replay_size, config.num_envs, example, config.checkpoint_replay)
     super().__init__(config, networks, self.buffer)
-    self.optimizer = optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
     self._noise_for = env.episode_length
+
+  @property
+  def optimizer(self) -> optax.GradientTransformation:
+    return optax.adamw(self.config.learning_rate, weight_decay=self.config.weight_decay)
 
   def init(self, key: jax.Array, policy: Policy | None) -> FastTD3State:
     policy = policy or self.new_policy(key)

@@ -28,9 +28,12 @@ class AgentConfig:
 
   Attributes:
     algorithm: the class of the algorithm, `module:name`.
+    traced: numbers that are arguments of the compiled program, no constants of it: another value compiles nothing, and
+      agents of one program may differ in them. No Python branch may depend on one.
   """
 
   algorithm: ClassVar[str]
+  traced: ClassVar[tuple[str, ...]] = ()
 
   num_timesteps: Annotated[
     int, count(1, 1e12), "environment steps in all, action repeats counted, to within one batch"
@@ -160,6 +163,15 @@ class PPOConfig(AgentConfig):
   """Hyperparameters of PPO."""
 
   algorithm = "playground.learning.ppo:PPO"
+  traced = (
+    "learning_rate",
+    "discounting",
+    "gae_lambda",
+    "entropy_cost",
+    "clipping_epsilon",
+    "vf_loss_coefficient",
+    "reward_scaling",
+  )
 
   unroll_length: Annotated[int, count(1, 100_000), "policy steps of one trajectory"] = 20
   batch_size: Annotated[int, count(1, 2**24), "trajectories of one minibatch"] = 1024
@@ -239,6 +251,7 @@ class SACConfig(OffPolicyConfig):
   """Hyperparameters of SAC."""
 
   algorithm = "playground.learning.sac:SAC"
+  traced = ("learning_rate", "alpha_learning_rate", "discounting", "tau", "reward_scaling")
 
   num_timesteps: Annotated[int, count(1, 1e12), "environment steps in all, action repeats and prefill counted"] = (
     5_000_000
@@ -275,6 +288,7 @@ class REPPOConfig(AgentConfig):
   """Hyperparameters of REPPO; the defaults are the published ones for DM Control."""
 
   algorithm = "playground.learning.reppo:REPPO"
+  traced = ("learning_rate", "discounting", "gae_lambda", "reward_scaling", "target_entropy")
 
   num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
   deterministic_eval: Annotated[
@@ -340,6 +354,7 @@ class FastTD3Config(OffPolicyConfig):
   """Hyperparameters of FastTD3; the defaults are those of public runs on DM Control."""
 
   algorithm = "playground.learning.fast_td3:FastTD3"
+  traced = ("learning_rate", "discounting", "tau", "reward_scaling")
 
   num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
   deterministic_eval: Annotated[bool, "has no effect: the policy is deterministic"] = True

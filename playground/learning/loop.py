@@ -25,6 +25,7 @@ from playground.learning.algorithm import Policy
 from playground.learning.evaluation import Evaluate, Recording
 from playground.learning.rollout import Step
 from playground.learning.trainer import Trainer, TrainState
+from playground.pytree import PyTree
 
 Metrics = dict[str, float]
 Draw = Callable[[], tuple[ModelFields, ModelFields]]  # randomised models, of the training and of the evaluation
@@ -67,7 +68,7 @@ def longest_stretch(events: Sequence[ScheduleEvent]) -> int:
 
 
 class Callbacks(Protocol):
-  """What a run does with what happens; called on a thread of its own while the device works on."""
+  """What the run of one agent does with what happens; called on a thread of its own while the device works on."""
 
   def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Recording | None) -> None:
     """A row of the log.
@@ -76,12 +77,12 @@ class Callbacks(Protocol):
       step: control steps trained.
       metrics: its columns.
       captured: the run's first non-finite step (on the host) if the row counts any, else None.
-      recording: what the row's evaluation recorded (on the device), None for a row without one.
+      recording: what the row's evaluation recorded, None for a row without one.
     """
     ...
 
   def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
-    """A state to keep, on the device; its buffers stay valid. After the final one there is nothing left to train."""
+    """A state to keep; its buffers stay valid. After the final one there is nothing left to train."""
     ...
 
   def should_stop(self) -> bool:
@@ -124,7 +125,8 @@ def compile_program(trainer: Trainer, evaluate: Wrapped, draw: Draw, policy: Pol
     draw: randomised model fields of the training and of the evaluation environments.
     policy: what a new run starts from, if it has any weights to start from.
   """
-  key, count = jax.ShapeDtypeStruct((2,), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
+  agents = (trainer.num_agents,) if trainer.num_agents else ()
+  key, count = jax.ShapeDtypeStruct((*agents, 2), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
   start = time.perf_counter()
   pool = ThreadPoolExecutor(thread_name_prefix=COMPILER)
   kernels = trainer.env.unwrapped.physics.compile_ahead()
@@ -132,7 +134,7 @@ def compile_program(trainer: Trainer, evaluate: Wrapped, draw: Draw, policy: Pol
   try:
     with uncollected():  # tracing makes millions of objects
       model, eval_model = jax.eval_shape(draw)
-      init = trainer.init.trace(key, model, policy)
+      init = trainer.init.trace(key, model, policy, trainer.settings)
       state = init.out_info
       train = submit(trainer.train.trace(state, model, count))  # first, for it takes XLA longest
       others = [
@@ -163,21 +165,21 @@ class SegmentResult:
   train_s: float = 0.0
   evaluated: tuple[dict[str, jax.Array], Recording] | None = None
   eval_s: float = 0.0
-  captured: Step | None = None
+  captured: Sequence[Step | None] | None = None
   snapshot: TrainState | None = None
 
 
 @dataclasses.dataclass
 class Loop:
-  """One run: from a state at some event of the schedule to its end.
+  """One run, or those of several agents: from a state at some event of the schedule to its end.
 
   Attributes:
     trainer: of the run.
     functions: the trainer's, compiled, and the models.
     events: the schedule.
-    seed: of the run; evaluations and resets draw from it and the event they belong to, so they do not depend on where
-      the run was interrupted.
-    callbacks: called with rows, states to keep and for whether to stop.
+    seeds: of each agent; evaluations and resets draw from it and the event they belong to, so they do not depend on
+      where the run was interrupted.
+    callbacks: of each agent, called with rows, states to keep and for whether to stop, which it does if all say so.
     train_s: device time of training alone.
     first_update_s: that of one training step, by the first row.
   """
@@ -185,18 +187,20 @@ class Loop:
   trainer: Trainer
   functions: CompiledFunctions
   events: list[ScheduleEvent]
-  seed: int
-  callbacks: Callbacks
+  seeds: Sequence[int]
+  callbacks: Sequence[Callbacks]
   train_s: float = 0.0
   first_update_s: float | None = None
 
   def __post_init__(self) -> None:
-    self._init_key, self._eval_key, self._reset_key = jax.random.split(jax.random.PRNGKey(self.seed), 3)
+    keys = self.trainer.join([np.asarray(jax.random.split(jax.random.PRNGKey(seed), 3)) for seed in self.seeds])
+    self._init_key, self._eval_key, self._reset_key = (jnp.asarray(keys[..., i, :]) for i in range(3))
 
   def init(self, policy: Policy | None = None) -> TrainState:
     """Returns the state of a new run, which starts from a policy (host arrays) if there is one."""
     placed = None if policy is None else self.trainer.place_policy(policy)
-    return self.functions.init(self._place(self._init_key), self.functions.model, placed)
+    key, settings = self._place(self._init_key), self._place(self.trainer.settings)
+    return self.functions.init(key, self.functions.model, placed, settings)
 
   def run(self, state: TrainState, update: int | None = None) -> tuple[TrainState, bool]:
     """Runs to the end of the schedule, or until the callbacks say stop.
@@ -217,7 +221,7 @@ class Loop:
         at = event.update
         if reported:
           reported.result()  # one row is in flight; what went wrong with it stops the run here
-        stop = agree(self.callbacks.should_stop()) and event is not events[-1]
+        stop = agree(all(each.should_stop() for each in self.callbacks)) and event is not events[-1]
         if stop:
           done.snapshot = self.functions.copy(state) if several() else state
         reported = reports.submit(self._report, done)
@@ -237,10 +241,12 @@ class Loop:
       done.train_s = time.perf_counter() - start
       self.train_s += done.train_s
       self.first_update_s = self.first_update_s or done.train_s / num_updates
-      if done.trained["nonfinite"] > 0:
-        capture = self.functions.copy(state).capture if several() else state.capture
+      if np.any(done.trained["nonfinite"] > 0):
+        capture = jax.device_get(self.functions.copy(state).capture if several() else state.capture)
+        shapes = self.trainer.shapes((state.env_state, self.functions.model))
         action_size = self.trainer.env.action_size
-        done.captured = jax.device_get(capture).first(state.env_state, action_size, self.functions.model)
+        first = lambda i: self.trainer.agent(capture, i).first(shapes[0], action_size, shapes[1])
+        done.captured = [first(i) for i in range(len(self.callbacks))]
     if event.evaluate:
       start = time.perf_counter()
       policy = self.trainer.policy(state)
@@ -258,24 +264,30 @@ class Loop:
     return state, done
 
   def _report(self, done: SegmentResult) -> None:
-    """Hands finished work to the callbacks."""
-    row: Metrics = {}
+    """Hands finished work to the callbacks, to each its agent's part."""
     step = done.event.update * self.trainer.steps_per_update
-    recording = None
-    if done.trained is not None:
-      report = {k: float(v) for k, v in jax.device_get(done.trained).items()}
-      row |= {f"training/{k}": v for k, v in report.items() if not math.isnan(v)}  # NaN is a mean over nothing
-      row["time/steps_per_second"] = done.steps / done.train_s
-    if done.evaluated is not None:
-      scores, recording = done.evaluated
-      row |= {f"eval/{k}": float(v) for k, v in jax.device_get(scores).items()}
-      row["time/eval_s"] = done.eval_s
-    self.callbacks.on_metrics(step, row, done.captured, recording)
-    if done.snapshot is not None:
-      self.callbacks.on_save(done.event.update, step, done.snapshot, done.event is self.events[-1])
+    trained, (scores, recording), snapshot = done.trained, done.evaluated or (None, None), done.snapshot
+    trained, scores = jax.device_get((trained, scores))
+    if self.trainer.num_agents:
+      recording, snapshot = jax.device_get((recording, snapshot))  # in one go; an agent's part is a view
+    for i, callbacks in enumerate(self.callbacks):
+      row: Metrics = {}
+      if trained is not None:
+        report = {k: float(v) for k, v in self.trainer.agent(trained, i).items()}
+        row |= {f"training/{k}": v for k, v in report.items() if not math.isnan(v)}  # NaN is a mean over nothing
+        row["time/steps_per_second"] = done.steps / done.train_s
+      if scores is not None:
+        row |= {f"eval/{k}": float(v) for k, v in self.trainer.agent(scores, i).items()}
+        row["time/eval_s"] = done.eval_s
+      captured = None if done.captured is None else done.captured[i]
+      callbacks.on_metrics(step, row, captured, self.trainer.agent(recording, i))
+      if snapshot is not None:
+        last = done.event is self.events[-1]
+        callbacks.on_save(done.event.update, step, self.trainer.agent(snapshot, i), last)
 
   def _key(self, key: jax.Array, event: ScheduleEvent) -> jax.Array:
-    return self._place(jax.random.fold_in(key, event.update))
+    fold = lambda key: jax.random.fold_in(key, event.update)
+    return self._place(fold(key) if key.ndim == 1 else jax.vmap(fold)(key))
 
-  def _place(self, key: jax.Array) -> jax.Array:
-    return put(key, self.trainer.mesh, P())
+  def _place(self, tree: PyTree) -> PyTree:
+    return put(tree, self.trainer.mesh, P())

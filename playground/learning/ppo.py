@@ -84,12 +84,16 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
       )
     super().__init__(config, networks)
     self.mirror: Mirror | None = _mirror(env, networks) if config.mirror_augmentation else None
+    self.bounds_kl = config.desired_kl is not None or config.max_kl is not None
+    self.losses = LOSSES + (ESTIMATION,) * bool(networks.estimated_obs_key) + (KL,) * self.bounds_kl
+
+  @property
+  def optimizer(self) -> optax.GradientTransformation:
+    config = self.config
     clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm else optax.identity()
     # With a desired KL divergence the learning rate is part of the optimiser's state.
     adam = optax.adam if config.desired_kl is None else optax.inject_hyperparams(optax.adam)
-    self.optimizer = optax.chain(clip, adam(learning_rate=config.learning_rate))
-    self.bounds_kl = config.desired_kl is not None or config.max_kl is not None
-    self.losses = LOSSES + (ESTIMATION,) * bool(networks.estimated_obs_key) + (KL,) * self.bounds_kl
+    return optax.chain(clip, adam(learning_rate=config.learning_rate))
 
   def init(self, key: jax.Array, policy: Policy | None) -> PPOState:
     policy = policy or self.new_policy(key)

@@ -159,7 +159,10 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
 
   def __init__(self, env: Env, config: REPPOConfig, network_precision: str | None = None):
     super().__init__(config, REPPONetworks(env, config, network_precision))
-    self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
+
+  @property
+  def optimizer(self) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(self.config.max_grad_norm), optax.adam(self.config.learning_rate))
 
   def init(self, key: jax.Array, policy: Policy | None) -> AlgorithmState:
     policy = policy or self.new_policy(key)

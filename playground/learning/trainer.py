@@ -1,5 +1,7 @@
 """What is the same for all algorithms: the training state, its division over devices, training steps, checkpoints."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ from playground.envs.base import Env, State
 from playground.envs.wrappers import PRESERVE_INFO, ModelFields, wrap_for_training
 from playground.errors import ConfigError
 from playground.hardware.distributed import several
-from playground.hardware.mesh import AXIS, device_memory, gather_on_mesh, jit_on_mesh, put
+from playground.hardware.mesh import AXIS, device_memory, for_agents, gather_on_mesh, jit_on_mesh, put
 from playground.learning.algorithm import AlgorithmState, Metrics, Policy, build_algorithm
 from playground.learning.checkpoints import Checkpoint
 from playground.learning.hyperparameters import AgentConfig
@@ -32,6 +34,7 @@ class TrainState(struct.PyTreeNode):
     key: of the next training step.
     env_state: a batch.
     capture: the first step with a number that is not finite.
+    settings: the values of `AgentConfig.traced`, each []; no checkpoint has them.
   """
 
   algorithm: AlgorithmState
@@ -39,23 +42,36 @@ class TrainState(struct.PyTreeNode):
   key: jax.Array
   env_state: State
   capture: NonfiniteCapture
+  settings: dict[str, jax.Array]
 
 
 class Trainer:
   """Trains one algorithm on one task over a mesh of devices.
 
+  It may train several agents at once, which differ in seeds, models, initial policies and traced settings. Then
+  everything that the attributes' functions take and return has an axis of agents in front, but for the number of
+  training steps; `join` and `agent` put it there and take it away.
+
   Attributes:
     algorithm: what is trained.
     env: the task as a batch that resets itself.
     steps_per_update: environment steps of one training step, over all devices.
-    init: (key, model fields, policy or None) -> state of a new run.
+    settings: the values of the settings that the programs take as arguments, by name.
+    init: (key, model fields, policy or None, settings) -> state of a new run.
     train: (state, model fields, number of training steps) -> (state, metrics); takes the state's buffers over.
     reset: (state, key, model fields) -> state with all environments reset, but for what outlasts a full reset; takes
       the state's buffers over.
     copy: (state) -> state in buffers of its own, as a checkpoint needs it.
   """
 
-  def __init__(self, env: Env, config: AgentConfig, mesh: Mesh, network_precision: str | None = None):
+  def __init__(
+    self,
+    env: Env,
+    config: AgentConfig,
+    mesh: Mesh,
+    network_precision: str | None = None,
+    agents: Sequence[AgentConfig] = (),
+  ):
     """Builds the algorithm.
 
     Args:
@@ -63,27 +79,53 @@ class Trainer:
       config: hyperparameters.
       mesh: devices, one axis named "data".
       network_precision: matrix-product precision of the networks.
+      agents: the hyperparameters of each of several agents, which differ from `config` in traced settings only.
 
     Raises:
       ConfigError: sizes that do not go together or do not divide over the devices, or networks that do not fit the
         task.
     """
-    config.check(mesh.size)
+    self.num_agents = len(agents)
+    self.mesh = mesh = for_agents(mesh, len(agents)) if agents else mesh
+    self.num_devices = mesh.shape[AXIS]  # of each agent
+    config.check(self.num_devices)
     self.algorithm = build_algorithm(env, config, network_precision)
-    self.config, self.mesh, self.env = config, mesh, wrap_for_training(env)
+    self.config, self.env = config, wrap_for_training(env)
+    values = [{name: np.float32(getattr(agent, name)) for name in config.traced} for agent in agents or [config]]
+    self.settings: dict[str, PyTree] = self.join(values)
     self.act, self.networks = self.algorithm.act, self.algorithm.networks
     self.steps_per_update = config.steps_per_update * env.action_repeat
     self._buffer = self.algorithm.replay
     if several() and self._buffer and self._buffer.saved:
       raise ConfigError("agent.checkpoint_replay=true needs one process for all devices: set it to false.")
-    specs: dict[str, PyTree] = {"algorithm": P(), "key": P(), "env_state": P(AXIS), "capture": P(AXIS)}
+    specs: dict[str, PyTree] = {"algorithm": P(), "key": P(), "env_state": P(AXIS), "capture": P(AXIS), "settings": P()}
     spec = self._spec = TrainState(**specs, replay=REPLAY_SPEC if self._buffer else None)
-    self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS), P()), spec)
+    self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS), P(), P()), spec)
     self.reset = jit_on_mesh(self._reset, mesh, (spec, P(), P(AXIS)), spec, donate_argnums=0)
-    self.train = jit_on_mesh(self._train, mesh, (spec, P(AXIS), P()), (spec, P()), donate_argnums=0)
+    self.train = jit_on_mesh(self._train, mesh, (spec, P(AXIS), None), (spec, P()), donate_argnums=0)
     copy = lambda state: jax.tree.map(jnp.copy, self._saved(state))
     # Whole on every device where no process sees all of them.
     self.copy = gather_on_mesh(copy, mesh, spec) if several() else jit_on_mesh(copy, mesh, (spec,), self._saved(spec))
+
+  def join(self, parts: Sequence[PyTree]) -> PyTree:
+    """Puts the trees of all agents, a tree each, into one; that of a single agent stays as it is."""
+    on_host = lambda x: isinstance(x, np.ndarray | np.generic)
+    stack = lambda *x: np.stack(x) if on_host(x[0]) else jnp.stack(x)
+    return jax.tree.map(stack, *parts) if self.num_agents else parts[0]
+
+  def agent(self, tree: PyTree, index: int) -> PyTree:
+    """Returns one agent's part of a tree."""
+    return jax.tree.map(lambda x: x[index], tree) if self.num_agents else tree
+
+  def shapes(self, tree: PyTree) -> PyTree:
+    """Returns shapes and dtypes of one agent's part of a tree."""
+    start = 1 if self.num_agents else 0
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[start:], x.dtype), tree)
+
+  def template(self, model: ModelFields) -> TrainState:
+    """Returns one agent's structure, shapes and dtypes; `model` has those of all agents."""
+    key = self.join([np.zeros(2, np.uint32)] * max(self.num_agents, 1))
+    return self.shapes(jax.eval_shape(self.init, key, model, None, self.settings))
 
   def policy(self, state: TrainState) -> Policy:
     """Returns what acting needs, and what a new run can start from."""
@@ -106,7 +148,7 @@ class Trainer:
     buffer = self._buffer
     if buffer is None:
       return []
-    each, limit = buffer.nbytes / self.mesh.size, device_memory(self.mesh)
+    each, limit = buffer.nbytes * max(self.num_agents, 1) / self.mesh.size, device_memory(self.mesh)
     size = f"{buffer.size:,} transitions of {buffer.width} numbers, {each / 1e9:.2f} GB on each device"
     size += ", and as much again while a checkpoint is saved" * buffer.saved
     if limit is not None and each * (1 + buffer.saved) > limit:
@@ -120,7 +162,7 @@ class Trainer:
 
   def split(self, state: TrainState) -> tuple[Policy, TrainState]:
     """Returns the items `policy` and `state` of a checkpoint, which together are all but the replay buffer's data."""
-    rest = state.replace(algorithm=state.algorithm.replace(params=None, normalizer=None))
+    rest = state.replace(algorithm=state.algorithm.replace(params=None, normalizer=None), settings={})
     return self.policy(state), self._without_data(rest)
 
   def experience(self, state: TrainState) -> np.ndarray | None:
@@ -138,14 +180,15 @@ class Trainer:
       template: the state's structure, shapes and dtypes.
 
     Returns:
-      The state, on the devices, and a sentence for the user on what it is.
+      The state, on the host, and a sentence for the user on what it is.
 
     Raises:
       CheckpointError: damaged, or made for other shapes.
     """
     policy, rest = self.split(template)
     leaves = {name: shape for name, shape, _ in checkpoint.meta["leaves"]["state"]}
-    there, here = leaves.get(".capture.found", [self.mesh.size])[0], self.mesh.size
+    here = self.num_devices
+    there = leaves.get(".capture.found", [here])[0]
     theirs = jax.tree.map(lambda x: jax.ShapeDtypeStruct((there, *x.shape[1:]), x.dtype), rest.capture)
     rest = checkpoint.restore("state", rest.replace(capture=theirs))
     policy = checkpoint.restore("policy", policy)
@@ -157,11 +200,11 @@ class Trainer:
       "rounding differ from here on."
     )
     said = f"Resuming {what} of {checkpoint.path} ({checkpoint.step:,} steps).{elsewhere * (there != here)}"
-    return self.place(state), said
+    return state, said
 
   def place(self, state: TrainState) -> TrainState:
-    """Puts a state's host arrays on the devices, each its share."""
-    return put(state, self.mesh, self._spec)
+    """Puts a state's host arrays on the devices, each its share, with the trainer's settings."""
+    return put(state.replace(settings=self.settings), self.mesh, self._spec)
 
   def _restore_replay(
     self, checkpoint: Checkpoint, template: TrainState, replay: Replay | None
@@ -189,12 +232,14 @@ class Trainer:
 
   # On each device
 
-  def _init(self, key: jax.Array, model: ModelFields, policy: Policy | None) -> TrainState:
+  def _init(
+    self, key: jax.Array, model: ModelFields, policy: Policy | None, settings: dict[str, jax.Array]
+  ) -> TrainState:
     key, algorithm_key, env_key = jax.random.split(key, 3)
-    algorithm = self.algorithm.init(algorithm_key, policy)
+    algorithm = self.algorithm.with_settings(settings).init(algorithm_key, policy)
     env_state = self._reset_environments(env_key, model)
     capture = NonfiniteCapture.empty(env_state, self.env.action_size, model)
-    return _train_state(algorithm, key, env_state, capture)
+    return _train_state(algorithm, key, env_state, capture, settings)
 
   def _reset(self, state: TrainState, key: jax.Array, model: ModelFields) -> TrainState:
     fresh = self._reset_environments(key, model)
@@ -204,7 +249,7 @@ class Trainer:
   def _reset_environments(self, key: jax.Array, model: ModelFields) -> State:
     """Resets this device's share of the environments, with keys that no other device has."""
     device = jax.lax.axis_index(AXIS)
-    reset_keys = jax.random.split(jax.random.fold_in(key, device), self.config.num_envs // self.mesh.size)
+    reset_keys = jax.random.split(jax.random.fold_in(key, device), self.config.num_envs // self.num_devices)
     state = self.env.reset(reset_keys, model)
     if not self.config.random_episode_ages:
       return state
@@ -229,17 +274,21 @@ class Trainer:
   def _train_step(self, state: TrainState, model: ModelFields) -> tuple[TrainState, Metrics]:
     key, shared = jax.random.split(state.key)
     envs = Environments(state.env_state, state.capture, model, {}, self.env)
-    algorithm, envs, metrics = self.algorithm.train_step(
+    algorithm, envs, metrics = self.algorithm.with_settings(state.settings).train_step(
       state.algorithm.replace(replay=state.replay), envs, jax.random.fold_in(shared, jax.lax.axis_index(AXIS))
     )
     metrics = {"learned": jnp.ones(())} | metrics | jax.lax.psum(envs.sums, AXIS)
-    return _train_state(algorithm, key, envs.state, envs.capture), metrics
+    return _train_state(algorithm, key, envs.state, envs.capture, state.settings), metrics
 
 
-def _train_state(algorithm: AlgorithmState, key: jax.Array, env_state: State, capture: NonfiniteCapture) -> TrainState:
-  return TrainState(
-    algorithm=algorithm.replace(replay=None), replay=algorithm.replay, key=key, env_state=env_state, capture=capture
-  )
+def _train_state(
+  algorithm: AlgorithmState,
+  key: jax.Array,
+  env_state: State,
+  capture: NonfiniteCapture,
+  settings: dict[str, jax.Array],
+) -> TrainState:
+  return TrainState(algorithm.replace(replay=None), algorithm.replay, key, env_state, capture, settings)
 
 
 _COUNTS = ("episodes", "nonfinite", "gradient_steps", "nonfinite_updates", "overflows")

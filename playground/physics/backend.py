@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
+from playground.hardware.mesh import GROUP
 from playground.physics.warp_kernels import Building, dismiss, quiet_warp
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
@@ -205,9 +206,14 @@ def _device() -> Any:
 
 
 def _batch_size() -> int:
+  """How many environments share Warp's buffers: a batch, for each agent that shares the device."""
+  return _axis_size(WORLDS) * _axis_size(GROUP)
+
+
+def _axis_size(name: str) -> int:
   try:
-    return jax.lax.axis_size(WORLDS)
-  except NameError:  # no batch around
+    return jax.lax.axis_size(name)
+  except NameError:  # nothing around is mapped over it
     return 1
 
 

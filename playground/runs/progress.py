@@ -21,11 +21,18 @@ class Progress:
     enabled: False shows no progress at all; `print` still prints.
     console: where to; standard output by default.
     activity: what makes the steps, as the bar calls it.
+    name: what lines begin with, if it is one of several.
   """
 
   def __init__(
-    self, total_steps: int, enabled: bool = True, console: Console | None = None, activity: str = "training"
+    self,
+    total_steps: int,
+    enabled: bool = True,
+    console: Console | None = None,
+    activity: str = "training",
+    name: str = "",
   ):
+    self._name = name
     self._total = total_steps
     self._activity = activity
     self._enabled = enabled
@@ -57,6 +64,10 @@ class Progress:
     if self._line:
       self._print_plain(self._line)
 
+  def silent(self, name: str) -> "Progress":
+    """Returns one for another run beside this one: it only prints, above the same bar."""
+    return Progress(self._total, enabled=False, console=self._console, name=name)
+
   def phase(self, text: str) -> None:
     """Shows what is going on while no steps are made (building, compiling, rendering)."""
     if self._live:
@@ -85,6 +96,7 @@ class Progress:
 
   def print(self, text: str) -> None:
     """Prints a line above the bar."""
+    text = f"{self._name}: {text}" if self._name else text
     self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
   def _text(self, step: int) -> str:

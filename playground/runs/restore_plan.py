@@ -125,7 +125,7 @@ class RestorePlan:
       self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is fresh.")
       return
     model, _ = jax.eval_shape(draw)
-    template = jax.eval_shape(trainer.init, jax.random.PRNGKey(0), model, None)
+    template = trainer.template(model)
     for path in self.checkpoints:
       try:
         checkpoint = Checkpoint(path)

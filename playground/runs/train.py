@@ -1,22 +1,33 @@
 """One training run, from a resolved config to a finished run directory."""
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING
 
 import jax
+import mujoco
+from jax.stages import Wrapped
 
 from playground import registry
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import ending_together, is_main, leave, noting_loss, preflight, share, wait_for_all
 from playground.hardware.setup import Hardware, setup
+from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
 from playground.learning.hyperparameters import AgentConfig
-from playground.learning.loop import Loop, ScheduleEvent, compile_program, longest_stretch, schedule
+from playground.learning.loop import (
+  CompiledFunctions,
+  Draw,
+  Loop,
+  ScheduleEvent,
+  compile_program,
+  longest_stretch,
+  schedule,
+)
 from playground.learning.trainer import Trainer, TrainState
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
@@ -70,60 +81,139 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
   return 0
 
 
-def _train_locked(
-  config: "RunConfig", interrupts: Interrupts, began_s: float, plan: RestorePlan, hardware: Hardware
-) -> int:
-  """One run, new or to resume, that no other process writes."""
+@dataclasses.dataclass
+class Training:
+  """What a process trains: one run, or those of several agents that share a program.
+
+  Attributes:
+    env: the task.
+    drawn: the model that videos show.
+    trainer: of the task and the algorithm.
+    events: the schedule.
+    evaluate: see `evaluation.make_evaluator`.
+    draw: see `loop.compile_program`.
+  """
+
+  env: Env
+  drawn: mujoco.MjModel
+  trainer: Trainer
+  events: list[ScheduleEvent]
+  evaluate: Wrapped
+  draw: Draw
+
+  @property
+  def steps(self) -> int:
+    """Environment steps of each agent."""
+    return self.events[-1].update * self.trainer.steps_per_update
+
+  def compile(self, plans: Sequence[RestorePlan]) -> CompiledFunctions:
+    """Compiles what it needs; `plans` say what each agent starts from."""
+    return compile_program(self.trainer, self.evaluate, self.draw, self._policies(plans))
+
+  def run(self, loop: Loop, plans: Sequence[RestorePlan], interrupts: Interrupts) -> tuple[TrainState, bool]:
+    """Trains from where the runs begin; returns the last state, and whether the schedule was completed."""
+    wait_for_all()  # a first exchange waits for half a minute on CPUs: not all compile equally fast
+    interrupts.start_saving()
+    if plans[0].state is None:
+      return loop.run(loop.init(self._policies(plans)))
+    state = self.trainer.place(self.trainer.join([plan.state for plan in plans]))
+    return loop.run(state, plans[0].update)
+
+  def _policies(self, plans: Sequence[RestorePlan]) -> Policy | None:
+    return None if plans[0].policy is None else self.trainer.join([plan.policy for plan in plans])
+
+
+def prepare(
+  configs: "Sequence[RunConfig]", plans: Sequence[RestorePlan], hardware: Hardware, together: bool = False
+) -> Training:
+  """Builds what is trained and restores what there is, before anything is compiled.
+
+  Args:
+    configs: of the run, or (`together`) of the runs of several agents.
+    plans: where each begins; what is restored goes there, with what the user should know.
+    hardware: of the process.
+    together: whether there is an axis of agents, be it of length 1.
+
+  Raises:
+    PlaygroundError: a setting, a checkpoint or a size that does not fit.
+  """
+  config, plan = configs[0], plans[0]
   preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
-  agent = config.agent
-  agent.check(hardware.mesh.size)
+  agents = [each.agent for each in configs]
+  agent = agents[0]
+  agent.check(1 if together else hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
   need_camera(drawn, config.video.camera, "video.camera")
-  draw = partial(model_sampler(env, config, agent.num_envs, agent.num_eval_envs), config.seed)
-  trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision)
+  trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision, agents if together else ())
+  samplers = [model_sampler(env, each, agent.num_envs, agent.num_eval_envs) for each in configs]
+
+  def draw() -> tuple[ModelFields, ModelFields]:
+    models = [sample(each.seed) for sample, each in zip(samplers, configs, strict=True)]
+    return trainer.join([model for model, _ in models]), trainer.join([model for _, model in models])
+
   plan.notices += trainer.notices()
-  if hardware.mesh.size > 1:
-    plan.notices.append(describe_division(agent, hardware.mesh.size))
-  plan.restore(trainer, config.agent_name, draw)
+  if trainer.num_devices > 1:
+    plan.notices.append(describe_division(agent, trainer.num_devices))
+  for each, theirs in zip(plans, configs, strict=True):
+    each.restore(trainer, theirs.agent_name, draw)
   preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # one may see it damaged
 
   num_updates = math.ceil(agent.num_timesteps / trainer.steps_per_update)
   events = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
   plan.notices += cut_short(agent, env.episode_length, events, trainer.steps_per_update)
-  num_recorded = min(config.video.episodes, agent.num_eval_envs // hardware.mesh.size) * config.video.enable
+  num_recorded = min(config.video.episodes, agent.num_eval_envs // trainer.num_devices) * config.video.enable
   other_acts = trainer.algorithm.other_acts()
-  evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, hardware.mesh, num_recorded, other_acts)
+  evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, trainer.mesh, num_recorded, other_acts)
+  return Training(env, drawn, trainer, events, evaluate, draw)
+
+
+def _train_locked(
+  config: "RunConfig", interrupts: Interrupts, began_s: float, plan: RestorePlan, hardware: Hardware
+) -> int:
+  """One run, new or to resume, that no other process writes."""
+  training = prepare([config], [plan], hardware)
   if not is_main():
     with noting_loss(RunDirectory(share()).note_loss):
-      program = compile_program(trainer, evaluate, draw, plan.policy)
-      callbacks = NonMainCallbacks(config, env, interrupts, plan.step)
-      loop = Loop(trainer, program, events, config.seed, callbacks)
-      _, completed = _run(loop, plan, interrupts)
+      program = training.compile([plan])
+      callbacks = NonMainCallbacks(config, training.env, interrupts, plan.step)
+      loop = Loop(training.trainer, program, training.events, [config.seed], [callbacks])
+      _, completed = training.run(loop, [plan], interrupts)
     return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
-  run_dir = plan.run_dir or RunDirectory.create(
-    str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
-  )
+  run_dir = open_run(config, plan)
   share(str(run_dir.path.absolute()))
-  with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(num_updates * trainer.steps_per_update) as progress:
-    run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=env.impl, **hardware.facts)
+  with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(training.steps) as progress:
+    run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=training.env.impl, **hardware.facts)
     for notice in plan.notices:
       progress.print(notice)
     progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
-    program = compile_program(trainer, evaluate, draw, plan.policy)
+    program = training.compile([plan])
     if program.notice:
       progress.print(program.notice)
-    to_compiled_s = process_age_s() - began_s
-    timings = {"start_to_compiled_s": to_compiled_s, "trace_s": program.trace_s, "compile_s": program.compile_s}
-    run_dir.update_manifest(timings=timings)
+    run_dir.update_manifest(timings=timings_of(program, began_s))
 
-    callbacks = RunCallbacks(config, run_dir, env, trainer, progress, interrupts, plan, drawn)
+    callbacks = RunCallbacks(
+      config, run_dir, training.env, training.trainer, progress, interrupts, plan, training.drawn
+    )
     with contextlib.closing(callbacks):
-      loop = Loop(trainer, program, events, config.seed, callbacks)
-      state, completed = _run(loop, plan, interrupts)
+      loop = Loop(training.trainer, program, training.events, [config.seed], [callbacks])
+      state, completed = training.run(loop, [plan], interrupts)
       callbacks.finish(loop, state, completed)
-  _say_where(run_dir)
+  say_where(run_dir)
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+
+
+def open_run(config: "RunConfig", plan: RestorePlan) -> RunDirectory:
+  """Returns the run's directory, made if the run is a new one."""
+  return plan.run_dir or RunDirectory.create(
+    str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
+  )
+
+
+def timings_of(program: CompiledFunctions, began_s: float) -> dict[str, float]:
+  """Returns the manifest's times (seconds) up to the compiled program."""
+  started = process_age_s() - began_s
+  return {"start_to_compiled_s": started, "trace_s": program.trace_s, "compile_s": program.compile_s}
 
 
 def cut_short(
@@ -147,14 +237,6 @@ def cut_short(
     f"Training sees the first {seen} of an episode's {episode_length} control steps: then all environments start "
     f"afresh (agent.num_resets_per_eval={agent.num_resets_per_eval}; fewer, or more steps, let episodes go on)."
   ]
-
-
-def _run(loop: Loop, plan: RestorePlan, interrupts: Interrupts) -> tuple[TrainState, bool]:
-  """Trains from where the run begins; returns the last state, and whether the schedule was completed."""
-  wait_for_all()  # a first exchange waits for half a minute on CPUs: not all compile equally fast
-  interrupts.start_saving()
-  state = loop.init(plan.policy) if plan.state is None else plan.state
-  return loop.run(state, plan.update)
 
 
 def model_sampler(
@@ -181,7 +263,7 @@ def model_sampler(
   return draw
 
 
-def _say_where(run_dir: RunDirectory) -> None:
+def say_where(run_dir: RunDirectory) -> None:
   """The last lines of a run: what lies where."""
   summary = run_dir.summary
   print(f"{summary['status']}: return {format_return(summary['final_return'])}, {summary['steps']:,} steps")

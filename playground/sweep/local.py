@@ -86,6 +86,11 @@ class LocalLauncher:
         )
 
   def start(self, job: Job) -> bool:
+    return self._start([job])
+
+  def _start(self, jobs: Sequence[Job]) -> bool:
+    """Starts jobs that need the same devices in one process, or returns False because there is no room for it now."""
+    job = jobs[0]
     for name in [name for name in self._taken if not self._at_work(name)]:
       del self._taken[name]
     taken = {slot for slots in self._taken.values() for slot in slots}
@@ -98,19 +103,21 @@ class LocalLauncher:
     where = f"GPU {','.join(gpus)}" if gpus else f"cores {','.join(map(str, cores))}" if cores else ""
     limits = ["--grace", str(self._config.grace)]
     limits += [] if self._config.timeout is None else ["--timeout", str(self._config.timeout)]
-    folder = self._sweep.folder(job)
-    folder.write_waiting("submitted")
+    folders = [self._sweep.folder(job) for job in jobs]
+    for folder in folders:
+      folder.write_waiting("submitted")
     numbers = [str(slot.number) for slot in slots]
     args = [*limits, "--where", where, "--slots", *numbers, "--cores", *map(str, cores), "--", *self._command]
-    with folder.log.open("ab") as log:
-      self._workers[job.name] = subprocess.Popen(
-        [*PYTHON, "-m", "playground.sweep.worker", str(folder.path), *args],
+    with folders[0].log.open("ab") as log:
+      worker = subprocess.Popen(
+        [*PYTHON, "-m", "playground.sweep.worker", *(str(folder.path) for folder in folders), *args],
         env=self._environment(gpus),
         stdin=subprocess.DEVNULL,
         stdout=log,
         stderr=subprocess.STDOUT,
         start_new_session=True,  # Ctrl-C is for us; jobs are asked to stop through the sweep's folder
       )
+    self._workers |= {job.name: worker for job in jobs}
     self._taken[job.name] = slots
     return True
 

@@ -113,4 +113,4 @@ def _run(folder: str, command: tuple[str, ...], timeout: float | None, grace: fl
     os.environ["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION * gpus:.3f}"
   given = ",".join(map(str, ray.get_gpu_ids()))
   where = socket.gethostname() + (f" GPU {given}" if given else "")
-  return Worker(Path(folder), command, timeout, grace).run(where)
+  return Worker([Path(folder)], command, timeout, grace).run(where)

@@ -22,6 +22,7 @@ from playground.config.sweep_options import (
   RayConfig,
   SlurmConfig,
   SweepSettings,
+  TogetherConfig,
 )
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
@@ -36,7 +37,12 @@ ConfigT = TypeVar("ConfigT", bound=LauncherConfig, contravariant=True)
 
 POLL_S = 0.3
 MAX_CODE = 100  # exit codes above are signals'
-_CLASSES = {LocalConfig: "local:LocalLauncher", RayConfig: "ray:RayLauncher", SlurmConfig: "slurm:SlurmLauncher"}
+_CLASSES = {
+  LocalConfig: "local:LocalLauncher",
+  RayConfig: "ray:RayLauncher",
+  SlurmConfig: "slurm:SlurmLauncher",
+  TogetherConfig: "together:TogetherLauncher",
+}
 
 
 class Launcher(Protocol):

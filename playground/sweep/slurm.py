@@ -45,7 +45,7 @@ class SlurmJob:
   _worker = None  # no field: it is not pickled
 
   def __call__(self) -> int:
-    self._worker = Worker(self.folder, self.command, self.timeout, self.grace)
+    self._worker = Worker([self.folder], self.command, self.timeout, self.grace)
     code = self._worker.run(where=socket.gethostname())
     if self._taken():
       signal.raise_signal(signal.SIGUSR2)  # submitit's: Slurm queues nothing again that left before it was killed

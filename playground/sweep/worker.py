@@ -1,4 +1,4 @@
-"""One job in one process: starts it or resumes it, watches over it, and records how it ended.
+"""The process of a job, or of several that train together: starts or resumes it, watches it, records how it ended.
 
 Launchers start this wherever the job is to run; it needs no more than the sweep's folder. It holds the job's lock, so
 that no two of them run the same job.
@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from playground.interpreter import PYTHON
@@ -30,76 +30,102 @@ def job_command(trusted: Sequence[str] = (), lines: Sequence[str] = ()) -> tuple
 
 
 class Worker:
-  """Runs one job. `stop` may be called by a signal handler or another thread."""
+  """Runs one job, or several in one process. `stop` may be called by a signal handler or another thread."""
 
-  def __init__(self, folder: Path, command: Sequence[str] = COMMAND, timeout: float | None = None, grace: float = 60.0):
+  def __init__(
+    self,
+    folders: Sequence[Path],
+    command: Sequence[str] = COMMAND,
+    timeout: float | None = None,
+    grace: float = 60.0,
+  ):
     """Args:
-    folder: of the job, `<sweep>/jobs/<job>`.
-    command: what the job's overrides are handed to.
+    folders: of the jobs of one sweep, `<sweep>/jobs/<job>`.
+    command: what the jobs' overrides are handed to, with `--` between those of two jobs.
     timeout: seconds until the job is asked to stop.
     grace: seconds from then until it is killed.
     """
-    self._folder = JobFolder(Path(folder).absolute())
+    self._folders = [JobFolder(Path(folder).absolute()) for folder in folders]
     self._command = tuple(command)
     self._timeout = timeout
     self._grace = grace
     self._stopping = False
-    self._sweep_path = self._folder.path.parents[1]
+    self._sweep_path = self._folders[0].path.parents[1]
     self._child: subprocess.Popen[bytes] | None = None
-    self._record: dict[str, object] = {}
+    self._records: dict[JobFolder, dict[str, object]] = {}  # of the jobs that this worker has claimed
 
   def stop(self) -> None:
     """Asks the job to save and leave."""
     self._stopping = True
 
   def run(self, where: str = "", **facts: object) -> int:
-    """Runs the job to its end and returns its exit code; returns 0 if another worker runs it or has finished it.
+    """Runs the jobs to their end and returns the exit code; 0 if others run them or have finished them.
 
     Args:
-      where: what it runs on, for people.
+      where: what they run on, for people.
       **facts: what the launcher wants to find in job.json.
     """
     sweep = SweepDirectory.open(self._sweep_path)
-    (job,) = (job for job in sweep.jobs if job.name == self._folder.path.name)
-    with self._folder.claim() as lock:
-      if lock is None:
-        return 0
-      attempt = self._folder.record.get("attempt", 0) + 1
-      self._record = {"attempt": attempt, "host": socket.gethostname(), "where": where, "started": now()}
-      self._record |= {"pid": os.getpid(), **facts}
-      if self._folder.run.status.get("status") == "finished":  # another worker had the lock while this one started
-        self._write("finished")
+    overrides = {job.name: job.overrides for job in sweep.jobs}
+    with contextlib.ExitStack() as stack:
+      locks: list[int] = []
+      for folder in self._folders:
+        lock = stack.enter_context(folder.claim())
+        if lock is None:
+          continue
+        started = {"attempt": folder.record.get("attempt", 0) + 1, "host": socket.gethostname(), "started": now()}
+        self._records[folder] = {**started, "where": where, "pid": os.getpid(), **facts}
+        if folder.run.status.get("status") == "finished":  # another worker had the lock while this one started
+          self._write(folder, "finished")
+          del self._records[folder]
+        else:
+          locks.append(lock)
+      if not self._records:
         return 0
       if sweep.stop_file.exists():
-        self._write("preempted", "stopped before it began")
+        self._write_all("preempted", "stopped before it began")
         return 128 + signal.SIGTERM
-      self._child = self._start(sweep, job.overrides, attempt, lock)
-      self._record["job_pid"] = self._child.pid
-      self._write("running")
+      self._child = self._start(sweep, overrides, locks)
+      for record in self._records.values():
+        record["job_pid"] = self._child.pid
+      self._write_all("running")
       code, why = self._watch(self._child)
-      self._write(*self._outcome(code, why))
+      for folder in self._records:
+        self._write(folder, *self._outcome(folder, code, why))
     return code
 
   def interrupt(self, reason: str) -> None:
-    """Stops the job, which saves it, and records it as preempted; for signal handlers that do not return to `run`."""
+    """Stops the jobs, which saves them, and records it; for signal handlers that do not return to `run`."""
     self.stop()
     if self._child is not None:
       self._watch(self._child)
-    self._write("preempted", reason)
+    self._write_all("preempted", reason)
 
-  def _write(self, status: str, reason: str = "") -> None:
+  def _write_all(self, status: str, reason: str = "") -> None:
+    for folder in self._records or self._folders:
+      self._write(folder, status, reason)
+
+  def _write(self, folder: JobFolder, status: str, reason: str = "") -> None:
     ended = {} if self._child is None or self._child.returncode is None else {"exit_code": self._child.returncode}
     ended |= {} if status == "running" else {"ended": now()}
-    self._folder.write(status=status, reason=reason, **self._record, **ended)
+    folder.write(status=status, reason=reason, **self._records.get(folder, {}), **ended)
 
   def _start(
-    self, sweep: SweepDirectory, overrides: Sequence[str], attempt: int, lock: int
+    self, sweep: SweepDirectory, overrides: Mapping[str, Sequence[str]], locks: Sequence[int]
   ) -> "subprocess.Popen[bytes]":
-    path = quoted(self._folder.path)
-    args = [f"resume={path}"] if self._folder.begun else [*overrides, f"run_dir={path}"]
+    args: list[str] = []
+    for folder in self._records:
+      path = quoted(folder.path)
+      args += ["--"] * bool(args)
+      args += [f"resume={path}"] if folder.begun else [*overrides[folder.path.name], f"run_dir={path}"]
+    first, *others = self._records
+    for folder in others:
+      with folder.log.open("a") as log:
+        log.write(f"--- {now()}: trained together with {first.path.name}, which has the log\n")
     # Some Slurms send submitit's signal to all processes of a job; one that does not know it dies of it.
-    with self._folder.log.open("ab") as log, _blocked(signal.SIGUSR2):
-      log.write(f"--- start {attempt}, {now()}, {socket.gethostname()}: {' '.join(args)}\n".encode())
+    with first.log.open("ab") as log, _blocked(signal.SIGUSR2):
+      start = self._records[first]["attempt"]
+      log.write(f"--- start {start}, {now()}, {socket.gethostname()}: {' '.join(args)}\n".encode())
       log.flush()
       return subprocess.Popen(
         [*self._command, *args],
@@ -109,7 +135,7 @@ class Worker:
         stdout=log,
         stderr=subprocess.STDOUT,
         start_new_session=True,  # so that nothing it starts is left when it is killed
-        pass_fds=[lock],
+        pass_fds=locks,
       )
 
   def _watch(self, child: "subprocess.Popen[bytes]") -> tuple[int, str]:
@@ -130,10 +156,10 @@ class Worker:
     _signal(child, signal.SIGKILL, group=True)  # what it may have left behind
     return child.returncode, why
 
-  def _outcome(self, code: int, why: str) -> tuple[str, str]:
-    """The job's status and its reason, in words."""
-    run = self._folder.run.status
-    if code == 0:
+  def _outcome(self, folder: JobFolder, code: int, why: str) -> tuple[str, str]:
+    """A job's status and its reason, in words."""
+    run = folder.run.status
+    if code == 0 or (len(self._records) > 1 and run.get("status") == "finished"):
       return "finished", ""
     if why == "timeout":
       return "timeout", f"took longer than launcher.timeout={self._timeout:g} s"
@@ -145,13 +171,13 @@ class Worker:
       return "killed", f"killed by {name}{', perhaps for want of memory' if code == -signal.SIGKILL else ''}"
     if run.get("status") == "failed" and run.get("reason"):
       return "failed", run["reason"]
-    return "failed", f"exit code {code}: {_last_line(self._folder.log)}"
+    return "failed", f"exit code {code}: {_last_line(next(iter(self._records)).log)}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-  """`python -m playground.sweep.worker <job folder> [options] [-- command]`."""
+  """`python -m playground.sweep.worker <job folder>... [options] [-- command]`."""
   parser = argparse.ArgumentParser(prog="playground.sweep.worker")
-  parser.add_argument("folder", type=Path)
+  parser.add_argument("folders", type=Path, nargs="+")
   parser.add_argument("--timeout", type=float)
   parser.add_argument("--grace", type=float, default=60.0)
   parser.add_argument("--where", default="")
@@ -162,7 +188,7 @@ def main(argv: Sequence[str] | None = None) -> int:
   args = parser.parse_args(argv[:cut])
   if args.cores:
     os.sched_setaffinity(0, args.cores)
-  worker = Worker(args.folder, argv[cut + 1 :] or COMMAND, args.timeout, args.grace)
+  worker = Worker(args.folders, argv[cut + 1 :] or COMMAND, args.timeout, args.grace)
   with on_signals(lambda *_: worker.stop()):
     return worker.run(args.where, slots=args.slots)
 

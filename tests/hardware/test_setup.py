@@ -23,10 +23,10 @@ from tests.dummy import SMALL_PPO, SMALL_SAC, PointTask, point_trainer
 assert jax.device_count() == 2
 for config in (SMALL_PPO, SMALL_SAC):
   trainer = point_trainer(config, num_devices=2)
-  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  state = trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings)
   state, metrics = trainer.train(state, {}, np.int32(30))
   alone = point_trainer(config)
-  _, its = alone.train(alone.init(jax.random.PRNGKey(0), {}, None), {}, np.int32(30))
+  _, its = alone.train(alone.init(jax.random.PRNGKey(0), {}, None, alone.settings), {}, np.int32(30))
   ratio = float(metrics["grad_norm"]) / float(its["grad_norm"])
   assert 0.7 < ratio < 1.4, f"gradients are averaged, not added: {ratio}"
   for leaf in jax.tree.leaves((state.algorithm)):

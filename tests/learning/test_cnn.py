@@ -164,7 +164,7 @@ def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: py
   network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", cnn=TINY)
   config = dataclasses.replace(SMALL_PPO, network=network, augment_pixels=1)
   trainer = Trainer(Seen(), config, make_mesh(1))
-  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  state = trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings)
   assert state.env_state.obs["pixels/eye"].dtype == jnp.uint8
   before = numbers(state.algorithm.params)
   traced = trainer.train.trace(state, {}, jnp.int32(1))
@@ -188,7 +188,7 @@ def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
   network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", estimated_obs_key="state", cnn=TINY)
   config = dataclasses.replace(SMALL_PPO, network=network)
   trainer = Trainer(Seen(), config, make_mesh(1))
-  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  state = trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings)
   nets, policy = trainer.networks, jax.device_get(state.algorithm.params.policy)
   assert isinstance(nets, ActorCritic)
   assert policy["params"]["estimator"]["kernel"].shape == (16, 2)
@@ -212,9 +212,8 @@ def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
   assert 900 < parts["estimation_loss"] < 1100  # not a million, which would drown what the policy learns
   still = dataclasses.replace(config, estimation_coefficient=0.0)
   trainer = Trainer(Seen(), still, make_mesh(1))
-  after = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None), {}, jnp.int32(2))[0].algorithm.params.policy[
-    "params"
-  ]
+  state = trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings)
+  after = trainer.train(state, {}, jnp.int32(2))[0].algorithm.params.policy["params"]
   np.testing.assert_array_equal(after["estimator"]["kernel"], policy["params"]["estimator"]["kernel"])
 
 

@@ -55,7 +55,7 @@ def test_an_observation_entry_that_is_not_there_is_named() -> None:
 
 
 def test_environments_can_start_at_all_ages() -> None:
-  state = lambda trainer: trainer.init(jax.random.PRNGKey(0), {}, None).env_state
+  state = lambda trainer: trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings).env_state
   same_age, mixed = (
     state(point_trainer(dataclasses.replace(SMALL_PPO, init_at_random_ep_len=mix), num_devices=2))
     for mix in (False, True)
@@ -71,7 +71,7 @@ def test_environments_can_start_at_all_ages() -> None:
 def test_a_time_out_is_worth_what_its_true_last_observation_promises() -> None:
   config = dataclasses.replace(SMALL_PPO, init_at_random_ep_len=True, bootstrap_on_timeout=True)
   trainer: Any = point_trainer(config, episode_length=4)
-  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  state = trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings)
   normalizer = jax.tree.map(lambda x: x + 0.25 if x.dtype == jnp.float32 else x, state.algorithm.normalizer)
   actor = (trainer.networks, state.algorithm.params.policy, normalizer)
   envs = lambda env_state: Environments(env_state, state.capture, {}, {}, trainer.env)
@@ -115,7 +115,7 @@ def test_a_run_that_pays_time_outs_stores_no_more_and_learns() -> None:
   shapes, learned = [], []
   for pays in (False, True):
     trainer = point_trainer(dataclasses.replace(SMALL_PPO, bootstrap_on_timeout=pays), num_devices=2)
-    state, metrics = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None), {}, np.int32(4))
+    state, metrics = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings), {}, np.int32(4))
     assert metrics["episodes"] > 0 and FINAL_OBS not in state.env_state.info
     shapes.append(jax.eval_shape(lambda state=state: state))
     learned.append(ravel_pytree(state.algorithm.params)[0])

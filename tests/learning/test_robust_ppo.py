@@ -148,7 +148,7 @@ def test_targets_of_the_first_epoch_are_those_of_the_first_minibatch(networks: A
   ends = []
   for targets in ("minibatch", "epoch"):
     trainer = point_trainer(dataclasses.replace(config, targets=targets))
-    state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None), {}, np.int32(2))
+    state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings), {}, np.int32(2))
     ends.append(jax.device_get(trainer.policy(state).params))
   jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5), *ends)
 
@@ -160,7 +160,7 @@ def test_an_epoch_that_goes_too_far_is_the_last() -> None:
   ]
   first, metrics = [], []
   for trainer in trainers:
-    state, log = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None), {}, np.int32(1))
+    state, log = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings), {}, np.int32(1))
     first.append(jax.device_get(trainer.policy(state).params))
     metrics.append(log)
   assert (float(metrics[0]["stopped_early"]), float(metrics[2]["stopped_early"])) == (1, 0)

@@ -46,7 +46,7 @@ def other() -> Trainer:
 
 def trained(updates: int, trainer: Trainer | None = None) -> Any:
   trainer = trainer or built()
-  state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), MODEL, None), MODEL, np.int32(updates))
+  state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), MODEL, None, trainer.settings), MODEL, np.int32(updates))
   return state
 
 
@@ -97,7 +97,7 @@ def test_what_comes_after_a_termination_is_worth_nothing_whatever_the_time(lengt
     envs, step = algorithm(trainer)._collect(state.algorithm, envs, key)
     return envs.state, step
 
-  state, discounts = trainer.init(jax.random.PRNGKey(0), MODEL, None), []
+  state, discounts = trainer.init(jax.random.PRNGKey(0), MODEL, None, trainer.settings), []
   for i in range(6):
     env_state, step = transition(state, jax.random.PRNGKey(i))
     np.testing.assert_allclose(step.next_obs["state"], step.obs["state"] + 0.1 * step.action, atol=1e-6)
@@ -156,7 +156,7 @@ def test_the_newest_checkpoint_restores_everything(tmp_path: Path, updates: int)
   newest, older = save(tmp_path, trainer, trained(3), state)
   assert Checkpoint(newest).has("replay")
   assert not Checkpoint(older).has("replay")
-  template = jax.eval_shape(trainer.init, jax.random.PRNGKey(0), MODEL, None)
+  template = trainer.template(MODEL)
   restored, said = trainer.restore(Checkpoint(newest), template)
   assert said == f"Resuming the whole training state of {newest} (20 steps)."
   assert jax.tree.structure(restored) == jax.tree.structure(state)
@@ -167,7 +167,7 @@ def test_the_newest_checkpoint_restores_everything(tmp_path: Path, updates: int)
 def test_without_the_buffer_it_is_filled_again(tmp_path: Path) -> None:
   trainer = built()
   _, older = save(tmp_path, trainer, trained(30), trained(31))
-  template = jax.eval_shape(trainer.init, jax.random.PRNGKey(0), MODEL, None)
+  template = trainer.template(MODEL)
   state, said = trainer.restore(Checkpoint(older), template)
   assert "without its replay buffer (64 transitions are collected before it learns on)" in said
   before = numbers(state.algorithm.params)
@@ -197,7 +197,7 @@ def test_a_buffer_that_is_not_to_be_saved_is_not_even_copied(tmp_path: Path) -> 
 def test_new_weights_come_with_their_target() -> None:
   trainer = built()
   policy = jax.device_get(trainer.policy(trained(20)))
-  state = trainer.init(jax.random.PRNGKey(0), MODEL, policy)
+  state = trainer.init(jax.random.PRNGKey(0), MODEL, policy, trainer.settings)
   for ours, theirs in ((state.algorithm.params, policy.params), (state.algorithm.target_q, policy.params.q)):
     for a, b in zip(numbers(ours), numbers(theirs), strict=True):
       np.testing.assert_array_equal(a, b)
@@ -209,7 +209,7 @@ def test_another_buffer_is_refused(tmp_path: Path) -> None:
   (path / "replay").rename(path / "elsewhere")
   (path / "replay").mkdir()
   with pytest.raises(CheckpointError, match="damaged: its 'replay' cannot be read"):
-    trainer.restore(Checkpoint(path), jax.eval_shape(trainer.init, jax.random.PRNGKey(0), MODEL, None))
+    trainer.restore(Checkpoint(path), trainer.template(MODEL))
 
 
 # What is refused

@@ -1,5 +1,6 @@
 """Training as a whole, with every algorithm, on a task that compiles in seconds."""
 
+import dataclasses
 import subprocess
 import sys
 from functools import cache
@@ -49,11 +50,12 @@ def run(
   callbacks: Recorder,
   updates: int = 12,
   resumed: tuple[Any, int] | None = None,
+  seed: int = 3,
   **events: Any,
 ) -> tuple[Any, bool]:
   trainer, program = built(config, **events)
   marks = schedule(updates, 3, 1, max(5, updates // 20))
-  loop = Loop(trainer, program, marks, seed=3, callbacks=callbacks)
+  loop = Loop(trainer, program, marks, seeds=[seed], callbacks=[callbacks])
   return loop.run(*(resumed or (loop.init(), None)))
 
 
@@ -101,7 +103,7 @@ def test_an_interrupted_run_goes_on_bit_for_bit(config: Config) -> None:
 def test_a_training_call_of_any_length_is_one_program(config: Config) -> None:
   trainer, _ = built(config)
   model: dict[str, Any] = {}
-  state = trainer.init(jax.random.PRNGKey(0), model, None)
+  state = trainer.init(jax.random.PRNGKey(0), model, None, trainer.settings)
   for updates in (1, 3, 2):
     state, _ = trainer.train(state, model, np.int32(updates))
   assert trainer.train._cache_size() == 1
@@ -110,7 +112,7 @@ def test_a_training_call_of_any_length_is_one_program(config: Config) -> None:
 @two_of_them
 def test_nan_in_first_observations_is_counted_and_kept_from_what_is_learned(config: Config) -> None:
   trainer, program = built(config, nan_reset=True)
-  state = program.init(jax.random.PRNGKey(0), {}, None)
+  state = program.init(jax.random.PRNGKey(0), {}, None, trainer.settings)
   broken = np.asarray(state.env_state.info["nonfinite_reset"])
   assert 0 < broken.sum() < len(broken)
   state, metrics = program.train(state, {}, np.int32(8))
@@ -147,7 +149,7 @@ class Rising(PointTask):
 def test_a_fresh_start_of_all_environments_keeps_what_outlasts_a_reset(config: Config) -> None:
   trainer = Trainer(Rising(), config, make_mesh(1))
   model: dict[str, Any] = {}
-  state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), model, None), model, np.int32(1))
+  state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), model, None, trainer.settings), model, np.int32(1))
   before = jax.device_get(state.env_state)
   after = jax.device_get(trainer.reset(state, jax.random.PRNGKey(1), model).env_state)
   assert (before.info[PRESERVE_INFO]["level"] > 0).all()
@@ -168,3 +170,29 @@ def test_a_mean_over_nothing_is_left_out(config: Config) -> None:
 def test_no_torch_is_imported() -> None:
   code = "import sys, playground.runs.train, playground.cli.main; assert not {'torch', 'rsl_rl'} & set(sys.modules)"
   subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@every_algorithm
+def test_agents_of_one_program_end_as_they_do_alone(config: Config) -> None:
+  faster = dataclasses.replace(config, learning_rate=2 * config.learning_rate)
+  agents = [(config, 3), (faster, 3), (config, 4)]
+  alone, callbacks = [Recorder() for _ in agents], [Recorder() for _ in agents]
+  expected = [run(each, recorder, seed=seed)[0] for (each, seed), recorder in zip(agents, alone, strict=True)]
+
+  env = point_trainer(config).env.unwrapped
+  trainer = Trainer(env, config, make_mesh(1), agents=[each for each, _ in agents])
+  others = trainer.algorithm.other_acts()
+  evaluate = make_evaluator(env, trainer.act, config.num_eval_envs, trainer.mesh, 1, others)
+  program = compile_program(trainer, evaluate, lambda: ({}, {}))
+  loop = Loop(trainer, program, schedule(12, 3, 1, 5), [seed for _, seed in agents], callbacks)
+  state, completed = loop.run(loop.init())
+  assert completed
+  for i, (theirs, recorder) in enumerate(zip(expected, alone, strict=True)):
+    got = trainer.policy(trainer.agent(jax.device_get(state), i))
+    for a, b in zip(numbers(got), numbers(trainer.policy(theirs)), strict=True):
+      np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
+    assert [step for step, _ in callbacks[i].rows] == [step for step, _ in recorder.rows]
+    assert callbacks[i].rows[-1][1].keys() == recorder.rows[-1][1].keys()
+    assert [update for update, _ in callbacks[i].saved] == [update for update, _ in recorder.saved]
+  first, faster = (numbers(trainer.policy(trainer.agent(state, i)))[0] for i in (0, 1))
+  assert not np.array_equal(first, faster)

@@ -116,7 +116,7 @@ def test_a_worker_does_nothing_again(tmp_path: Path) -> None:
   """A killed controller may leave a worker that has yet to take its job's lock; the next controller starts another."""
   sweep = make_sweep(tmp_path / "sweep", 0)
   folder = sweep.folder(sweep.jobs[0])
-  assert [Worker(folder.path, STUB).run() for _ in range(2)] == [0, 0]
+  assert [Worker([folder.path], STUB).run() for _ in range(2)] == [0, 0]
   assert len(starts(sweep)[0]) == 1 and folder.state().status == "finished"
 
 

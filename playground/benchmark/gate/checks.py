@@ -54,7 +54,7 @@ def training_step(agent: str, overrides: tuple[str, ...], layers: tuple[int, int
   """
   config = compose(["env=CartpoleBalance", f"agent={agent}", "env.impl=jax", *overrides])
   trainer = Trainer(registry.load("CartpoleBalance", config=config.env), config.agent, make_mesh(1))
-  state = trainer.init(jax.random.PRNGKey(0), {}, None)
+  state = trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings)
   state, _ = trainer.train(state, {}, np.int32(trainer.config.prefill_updates))
 
   def ours() -> PyTree:

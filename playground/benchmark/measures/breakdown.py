@@ -49,7 +49,10 @@ def measure(
   """
   with used_memory(facts) if watch_memory else nullcontext():
     subject = Subject.build(facts, task, agent, overrides)
-    trainer, state = subject.trainer, subject.trainer.init(subject.key(0), subject.model, None)
+    trainer, state = (
+      subject.trainer,
+      subject.trainer.init(subject.key(0), subject.model, None, subject.trainer.settings),
+    )
     length = getattr(trainer.config, "unroll_length", LENGTH)
     calls: dict[str, tuple[Callable[[int], PyTree], int]] = {}
     wanted = list(PARTS)[: list(PARTS).index(until) + 1]

@@ -1,0 +1,178 @@
+"""Several agents that train in one process and one compiled program, each a run of its own on disk."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import jax
+
+from playground.errors import CheckpointError, ConfigError, HardwareError, PlaygroundError
+from playground.hardware.mesh import device_memory
+from playground.hardware.setup import Hardware, setup
+from playground.learning.evaluation import Recording
+from playground.learning.loop import CompiledFunctions, Loop
+from playground.learning.rollout import Step
+from playground.learning.trainer import TrainState
+from playground.runs.callbacks import RunCallbacks
+from playground.runs.interrupts import Interrupted, Interrupts, exit_code
+from playground.runs.programs import program_of
+from playground.runs.progress import Progress
+from playground.runs.restore_plan import RestorePlan
+from playground.runs.run_dir import RunDirectory
+from playground.runs.train import open_run, prepare, say_where, timings_of
+
+if TYPE_CHECKING:
+  from playground.config import RunConfig
+
+
+def train_together(configs: Sequence["RunConfig"]) -> int:
+  """Trains runs that have the same program, new or to resume.
+
+  A run that fails, be it for its numbers or its disk, ends alone. Runs that stand at different steps (an earlier start
+  was cut short between two of them) are trained in turn, those of the same step together.
+
+  Returns:
+    The exit code: 0 when all are finished, 130 or 143 when interrupted (and saved), 2 where a run failed.
+
+  Raises:
+    PlaygroundError: what keeps all of them from training.
+  """
+  if len({program_of(config) for config in configs}) > 1 or program_of(configs[0]) is None:
+    raise ConfigError("These runs cannot train together: they differ in more than seeds and numbers of the agent.")
+  with Interrupts() as interrupts:
+    try:
+      hardware, groups = setup(configs[0].hardware), _by_step(configs)
+      codes = [_train_group(group, interrupts, hardware) for group in groups if interrupts.signum is None]
+    except Interrupted as interrupt:
+      print(f"Interrupted by {interrupt}.")
+      return exit_code(interrupt.signum)
+  return exit_code(interrupts.signum) if interrupts.signum is not None and any(codes) else max(codes, default=0)
+
+
+def _by_step(configs: Sequence["RunConfig"]) -> "list[list[RunConfig]]":
+  """The runs that are not finished, those at the same step together."""
+  groups: dict[str, list[RunConfig]] = {}
+  for config in configs:
+    plan = RestorePlan.find(config)
+    if not plan.finished:
+      groups.setdefault(plan.checkpoints[0].name if plan.checkpoints else "", []).append(config)
+  return list(groups.values())
+
+
+def _train_group(configs: Sequence["RunConfig"], interrupts: Interrupts, hardware: Hardware) -> int:
+  """Trains runs that stand at the same step."""
+  with contextlib.ExitStack() as runs:
+    plans = [runs.enter_context(RestorePlan.find(config).locked(config)) for config in configs]
+    training = prepare(configs, plans, hardware, together=True)
+    if len({plan.update for plan in plans}) > 1:
+      raise CheckpointError("A checkpoint was damaged, and one run of the group is behind: start the sweep again.")
+    members = [Member(open_run(config, plan), interrupts) for config, plan in zip(configs, plans, strict=True)]
+    for member in members:
+      runs.enter_context(member)
+    progress = runs.enter_context(Progress(training.steps))
+    facts = {"impl": training.env.impl, "agents_in_program": len(configs), **hardware.facts}
+    for config, plan, member in zip(configs, plans, members, strict=True):
+      member.run_dir.write_manifest(seed=config.seed, task=config.choices["env"], **facts)
+      for notice in plan.notices:
+        progress.print(f"{member.name}: {notice}")
+    progress.phase(f"compiling {len(configs)} agents for {hardware.mesh.size} x {hardware.facts['device']}")
+    program = training.compile(plans)
+    for notice in (program.notice, memory_needed(program, hardware)):
+      if notice:
+        progress.print(notice)
+    for config, plan, member in zip(configs, plans, members, strict=True):
+      member.run_dir.update_manifest(timings=timings_of(program, 0.0))
+      shown = progress if member is members[0] else progress.silent(member.name)
+      member.begin(
+        RunCallbacks(config, member.run_dir, training.env, training.trainer, shown, interrupts, plan, training.drawn)
+      )
+    loop = Loop(training.trainer, program, training.events, [config.seed for config in configs], members)
+    state, completed = training.run(loop, plans, interrupts)
+    state = jax.device_get(state)
+    for i, member in enumerate(members):
+      member.finish(loop, training.trainer.agent(state, i), completed)
+  for member in members:
+    say_where(member.run_dir) if member.error is None else print(
+      f"{member.name} failed: {member.error}", file=sys.stderr
+    )
+  if any(member.error for member in members):
+    return 2
+  return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+
+
+def memory_needed(program: CompiledFunctions, hardware: Hardware) -> str:
+  """Returns a sentence on the memory that training takes.
+
+  Raises:
+    HardwareError: a device has less.
+  """
+  needs, limit = program.train.memory_analysis(), device_memory(hardware.mesh)
+  if needs is None or limit is None:
+    return ""
+  size = needs.argument_size_in_bytes + needs.temp_size_in_bytes
+  if size > limit:
+    raise HardwareError(
+      f"These agents need {size / 1e9:.2f} GB on each device, which has {limit / 1e9:.2f} GB: lower "
+      "launcher.max_agents."
+    )
+  return f"Training takes {size / 1e9:.2f} of {limit / 1e9:.2f} GB on each device."
+
+
+class Member:
+  """One agent's run: the callbacks of the loop, which end with the first error while those of others go on.
+
+  Attributes:
+    run_dir: of the run, locked while the context lasts.
+    name: of its folder.
+    error: why it failed, None if it did not.
+  """
+
+  def __init__(self, run_dir: RunDirectory, interrupts: Interrupts):
+    self.run_dir, self.name = run_dir, run_dir.path.name
+    self.error: str | None = None
+    self._interrupts = interrupts
+    self._callbacks: RunCallbacks | None = None
+    self._record = contextlib.ExitStack()
+
+  def __enter__(self) -> Self:
+    self._record.enter_context(self.run_dir.recorded())
+    return self
+
+  def __exit__(
+    self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+  ) -> None:
+    if self.error is None:
+      self._record.__exit__(kind, error, trace)
+
+  def begin(self, callbacks: RunCallbacks) -> None:
+    """Takes what does the work, and closes it in the end."""
+    self._callbacks = self._record.enter_context(contextlib.closing(callbacks))
+
+  def on_metrics(
+    self, step: int, metrics: dict[str, float], captured: Step | None, recording: Recording | None
+  ) -> None:
+    self._do(lambda callbacks: callbacks.on_metrics(step, metrics, captured, recording))
+
+  def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
+    self._do(lambda callbacks: callbacks.on_save(update, step, state, final))
+
+  def should_stop(self) -> bool:
+    return self._interrupts.signum is not None or self.error is not None
+
+  def finish(self, loop: Loop, state: TrainState, completed: bool) -> None:
+    """See `RunCallbacks.finish`."""
+    self._do(lambda callbacks: callbacks.finish(loop, state, completed))
+
+  def _do(self, work: Callable[[RunCallbacks], None]) -> None:
+    if self.error is not None or self._callbacks is None:
+      return
+    try:
+      work(self._callbacks)
+    except (PlaygroundError, OSError) as error:
+      self.error = str(error)
+      try:
+        self._record.__exit__(type(error), error, error.__traceback__)  # records that the run failed, and why
+      except PlaygroundError as said:
+        self.error = str(said)

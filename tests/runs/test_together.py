@@ -1,0 +1,122 @@
+"""Agents of one program: each leaves behind what it leaves alone, and what ends one lets the others go on."""
+
+import errno
+import itertools
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from playground.config import RunConfig, compose
+from playground.runs.callbacks import RunCallbacks
+from playground.runs.programs import program_of
+from playground.runs.run_dir import RunDirectory
+from playground.runs.together import Member, train_together
+from playground.runs.train import train
+from tests.runs.helpers import TASK, resume
+
+STEPS = 2000
+BUDGET = [*TASK, f"agent.num_timesteps={STEPS}", "agent.num_evals=3"]
+AGENTS = {"a": ["seed=1"], "b": ["seed=2"], "c": ["seed=1", "agent.learning_rate=3e-3"]}
+
+
+def configs(folder: Path) -> list[RunConfig]:
+  return [compose([*BUDGET, *own, f"run_dir={folder / name}"]) for name, own in AGENTS.items()]
+
+
+def resumed(folder: Path, *names: str) -> list[RunConfig]:
+  return [compose([f"resume={folder / name}"]) for name in names]
+
+
+@pytest.fixture(scope="module")
+def group(tmp_path_factory: pytest.TempPathFactory) -> Path:
+  folder = tmp_path_factory.mktemp("group")
+  assert train_together(configs(folder)) == 0
+  return folder
+
+
+def test_each_agent_is_a_run_of_its_own(group: Path, tmp_path: Path) -> None:
+  runs = {name: RunDirectory(group / name) for name in AGENTS}
+  for name, run in runs.items():
+    assert run.status["status"] == run.summary["status"] == "finished"
+    assert run.manifest["agents_in_program"] == 3 and run.manifest["timings"]["compile_s"] > 0
+    table = pd.read_csv(run.metrics_csv)
+    assert run.summary["steps"] == int(table["step"].to_numpy()[-1]) and run.summary["steps"] >= STEPS
+    assert len(table["eval/episode_reward"].dropna()) == 3
+    assert len(list(run.plots.iterdir())) == 2 and (run.checkpoints / "best").is_dir(), name
+  assert len({run.summary["params_sha256"] for run in runs.values()}) == 3
+
+  alone = tmp_path / "alone"
+  assert train(compose([*BUDGET, *AGENTS["c"], f"run_dir={alone}"])) == 0
+  ours, theirs = (pd.read_csv(path / "metrics.csv").filter(regex="^(?!time/)") for path in (group / "c", alone))
+  pd.testing.assert_frame_equal(ours, theirs, check_like=True, rtol=1e-3, atol=1e-3)
+
+
+def test_what_was_cut_short_goes_on_together_or_alone(
+  group: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  with monkeypatch.context() as patch:
+    asked = itertools.count()  # after every stretch
+    patch.setattr(Member, "should_stop", lambda self: next(asked) > 14)
+    train_together(configs(tmp_path / "cut"))
+  whole = {name: RunDirectory(group / name).summary["params_sha256"] for name in AGENTS}
+  cut = {name: RunDirectory(tmp_path / "cut" / name) for name in AGENTS}
+  assert [run.status["status"] for run in cut.values()] == ["preempted"] * 3
+  shutil.copytree(tmp_path / "cut" / "b", tmp_path / "alone")
+  assert train_together(resumed(tmp_path / "cut", *AGENTS)) == 0
+  assert {name: run.summary["params_sha256"] for name, run in cut.items()} == whole, "bit for bit"
+
+  assert resume(tmp_path / "alone") == 0
+  final = [RunDirectory(path).summary["final_return"] for path in (tmp_path / "alone", group / "b")]
+  assert final[0] == pytest.approx(final[1], rel=1e-3)
+
+
+def test_what_ends_one_lets_the_others_go_on(
+  group: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  log: Callable[..., None] = RunCallbacks.on_metrics
+
+  def full(self: RunCallbacks, step: int, *rest: Any) -> None:
+    if step and self._run_dir.path.name == "b":
+      raise OSError(errno.ENOSPC, "No space left on device", "metrics.csv")
+    log(self, step, *rest)
+
+  with monkeypatch.context() as patch:
+    patch.setattr(RunCallbacks, "on_metrics", full)
+    assert train_together(configs(tmp_path)) == 2
+  runs = {name: RunDirectory(tmp_path / name) for name in AGENTS}
+  assert [run.status["status"] for run in runs.values()] == ["finished", "failed", "finished"]
+  assert "No space left on device" in runs["b"].status["reason"] and "b failed" in capsys.readouterr().err
+  for name in ("a", "c"):
+    assert runs[name].summary["params_sha256"] == RunDirectory(group / name).summary["params_sha256"]
+  assert train_together(resumed(tmp_path, *AGENTS)) == 0, "the finished ones have nothing left to do"
+  assert runs["b"].summary["steps"] == runs["a"].summary["steps"]
+
+
+@pytest.mark.parametrize(
+  ("override", "same"),
+  [
+    ("seed=7", True),
+    ("agent.learning_rate=1e-5", True),
+    ("agent.discounting=0.9", True),
+    ("run_dir=elsewhere", True),
+    ("agent.unroll_length=7", False),
+    ("agent.num_timesteps=500", False),
+    ("env=PendulumSwingup", False),
+  ],
+)
+def test_what_a_program_depends_on(override: str, same: bool) -> None:
+  assert (program_of(compose([*BUDGET, override])) == program_of(compose(BUDGET))) == same
+
+
+@pytest.mark.parametrize("override", ["tracking=wandb", "profile.enable=true", "hardware=multi_node"])
+def test_what_trains_alone(override: str) -> None:
+  assert program_of(compose([*BUDGET, override])) is None
+
+
+def test_runs_of_different_programs_are_refused(refused: Callable[..., str], tmp_path: Path) -> None:
+  said = refused(*BUDGET, f"run_dir={tmp_path}/a", "--", *BUDGET, "agent.unroll_length=7", f"run_dir={tmp_path}/b")
+  assert "cannot train together" in said and not list(tmp_path.iterdir())
