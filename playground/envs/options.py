@@ -63,9 +63,9 @@ class TermsConfig:
 class RobotKeys:
   """Settings of `env.robot` that are texts or may be null."""
 
-  mjcf: Annotated[str | None, "file of the robot's MJCF"]
-  foot_pos: Annotated[Sequence[str] | None, "names of the sensors of the feet's positions"]
-  foot_contact: Annotated[Sequence[Sequence[str]] | None, "names of the sensors of each foot's contacts"]
+  mjcf: Annotated[str, "file of the robot's MJCF"]
+  foot_pos: Annotated[Sequence[str], "names of the sensors of the feet's positions"]
+  foot_contact: Annotated[Sequence[Sequence[str]], "names of the sensors of each foot's contacts"]
   pd: Annotated[Mapping[str, Any] | None, "gains of the position actuators; null keeps those of the MJCF"]
 
 

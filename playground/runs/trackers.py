@@ -38,7 +38,7 @@ class TensorBoardTracker:
 
     self._event, self._summary = Event, Summary
     folder.mkdir(parents=True, exist_ok=True)
-    self._writer = EventsWriter(str(folder / "events"))
+    self._writer = EventsWriter(str(folder.absolute() / "events"))  # it takes `s3:/...` for a place on the network
     self._flushed = time.monotonic()
     if resume_step is not None:
       session = SessionLog(status=SessionLog.START)  # pyright: ignore[reportAttributeAccessIssue]

@@ -115,6 +115,8 @@ WERE_TRACEBACKS = [
   "env=Go1JoystickFlatTerrain env.observations.state=[]",
   "env=Go1JoystickFlatTerrain env.robot.feet=[]",
   "env=Go1JoystickFlatTerrain env.robot.foot_contact=[]",
+  "env=Go1JoystickFlatTerrain env.robot.foot_contact=null",
+  "env=Go1JoystickFlatTerrain env.robot.mjcf=null",
   "env=Go1JoystickFlatTerrain env.robot.foot_linvel=[]",
   "env=Go1JoystickFlatTerrain env.robot.pose_weights=[2,1]",
   "env=LeapCubeReorient env.robot.sensors.fingertip_pos=[]",
