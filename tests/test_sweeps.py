@@ -223,7 +223,7 @@ def test_keys_that_jobs_cannot_have(line: str, message: str):
 @pytest.mark.parametrize(
   ("line", "message"),
   {
-    "launcher=slrm": "launcher=slrm does not exist: choose from local, ray, slurm. Did you mean 'slurm'?",
+    "launcher=slrm": "launcher=slrm does not exist: choose from local, ray, slurm, together. Did you mean 'slurm'?",
     "launcher.timeot=3": "launcher.timeot does not exist",
     "launcher.timeout=-3": "launcher.timeout=-3 must be a number above 0 and at most 1000000000.",
     "launcher.slots_per_gpu=many": "launcher.slots_per_gpu=many has the wrong type",

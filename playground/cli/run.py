@@ -70,9 +70,9 @@ def _main(argv: Sequence[str]) -> int:
   if "--version" in argv:  # Hydra's option of this name prints Hydra's version
     print(f"playground-run {__version__}")
     return 0
-  argv, *others = ([*run] for apart, run in itertools.groupby(argv or [""], "--".__eq__) if not apart)
+  first, *others = [[*run] for apart, run in itertools.groupby(argv, "--".__eq__) if not apart] or [[]]
   if others:
-    return _together(argv, others)
+    return _together(first, others)
   verbose, argv = "--verbose" in argv, [arg for arg in argv if arg != "--verbose"]
   parser = get_args_parser()
   parser.error = _refuse

@@ -159,6 +159,7 @@ def test_the_newest_checkpoint_restores_everything(tmp_path: Path, updates: int)
   template = trainer.template(MODEL)
   restored, said = trainer.restore(Checkpoint(newest), template)
   assert said == f"Resuming the whole training state of {newest} (20 steps)."
+  restored = trainer.place(restored)
   assert jax.tree.structure(restored) == jax.tree.structure(state)
   for a, b in zip(numbers(state), numbers(restored), strict=True):
     np.testing.assert_array_equal(a, b)
@@ -170,7 +171,7 @@ def test_without_the_buffer_it_is_filled_again(tmp_path: Path) -> None:
   template = trainer.template(MODEL)
   state, said = trainer.restore(Checkpoint(older), template)
   assert "without its replay buffer (64 transitions are collected before it learns on)" in said
-  before = numbers(state.algorithm.params)
+  before, state = numbers(state.algorithm.params), trainer.place(state)
   state, _ = trainer.train(state, MODEL, np.int32(PREFILL))
   for a, b in zip(before, numbers(state.algorithm.params), strict=True):
     np.testing.assert_array_equal(a, b)

@@ -68,6 +68,7 @@ def context(
     "qacc": jnp.array([9, 9, 9, 9, 9, 9, 3.0, -2.0]),
     "ctrl": jnp.array([0.1, 0.2]),
     "actuator_force": jnp.array([3.0, -4.0]),
+    "qfrc_actuator": jnp.array([9, 9, 9, 9, 9, 9, 3.0, -4.0]),
     "site_xpos": jnp.array([[0, 0, 0.3], [0.5, 0.1, 0.15], [0, -0.05, 0.02]]),
     "site_xmat": jnp.array([[[0.6, 0, 0.8], [0, 1, 0], [-0.8, 0, 0.6]]]),
   }

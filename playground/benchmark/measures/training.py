@@ -47,7 +47,7 @@ def measure(
       model = program.model if seed == seeds[0] else subject.draw(seed)[0]
       with alone(facts.lock):
         state = None  # the last seed's goes before the next one's comes: a replay buffer is large
-        state = program.init(subject.key(seed), model, None)
+        state = program.init(subject.key(seed), model, None, trainer.settings)
 
         def train(count: int) -> jax.Array:
           nonlocal state
