@@ -184,7 +184,7 @@ class Physics:
   def _template(self) -> mjx.Data:
     if self.impl == "jax":
       return mjx.make_data(self.mj_model, _device(), impl="jax")
-    worlds = max(_batch_size(), _FEW)
+    worlds = max(batch_size(), _FEW)
     sizes: dict[str, Any] = {"njmax": self._buffers.get("njmax")}
     for name in ("naconmax", "naccdmax"):
       each = self._buffers.get(f"{name}_per_env")
@@ -205,7 +205,7 @@ def _device() -> Any:
   return jax.local_devices()[0]
 
 
-def _batch_size() -> int:
+def batch_size() -> int:
   """How many environments share Warp's buffers: a batch, for each agent that shares the device."""
   return _axis_size(WORLDS) * _axis_size(GROUP)
 

@@ -46,6 +46,27 @@ first, second = (np.asarray(shard.data) for shard in state.replay.data.addressab
 assert first.shape == (31, 8, 17) and (first[:30] != 0).any() and not (first[:30, :, :2] == second[:30, :, :2]).any()
 """
 
+AGENTS = """
+import dataclasses
+import jax, numpy as np
+from playground.hardware.mesh import make_mesh
+from playground.learning.trainer import Trainer
+from tests.dummy import SMALL_PPO, PointTask
+
+for count, devices in ((2, 1), (3, 2)):  # one agent on each device; all of them on both
+  agents = [dataclasses.replace(SMALL_PPO, learning_rate=(i + 1) * 1e-3) for i in range(count)]
+  trainer = Trainer(PointTask(), SMALL_PPO, make_mesh(2), agents=agents)
+  assert trainer.num_devices == devices
+  state = trainer.init(np.stack([jax.random.PRNGKey(i) for i in range(count)]), {}, None, trainer.settings)
+  state, _ = trainer.train(state, {}, np.int32(10))
+  for i, config in enumerate(agents):
+    alone = Trainer(PointTask(), config, make_mesh(devices))
+    expected, _ = alone.train(alone.init(jax.random.PRNGKey(i), {}, None, alone.settings), {}, np.int32(10))
+    ours, theirs = (jax.tree.leaves(jax.device_get(s.algorithm.params)) for s in (trainer.agent(state, i), expected))
+    for a, b in zip(ours, theirs, strict=True):
+      np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
+"""
+
 
 def hardware(**changes: Any) -> HardwareConfig:
   return dataclasses.replace(compose(["experiment=quickstart"]).hardware, **changes)
@@ -79,10 +100,17 @@ def test_more_than_there_are_is_one_sentence() -> None:
   assert done.stderr.splitlines()[-1] == "error: hardware.devices=2, but this machine has 1 (cpu)."
 
 
-def test_training_over_two_devices_keeps_parameters_equal_and_environments_apart() -> None:
+@pytest.mark.parametrize(
+  "code",
+  [
+    pytest.param(TWO_DEVICES, id="parameters are equal, environments apart"),
+    pytest.param(AGENTS, id="agents end as they do alone", marks=pytest.mark.slow),
+  ],
+)
+def test_training_over_two_devices(code: str) -> None:
   simulated = {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
   done = subprocess.run(
-    [sys.executable, "-c", TWO_DEVICES],
+    [sys.executable, "-c", code],
     cwd=Path(__file__).parents[2],
     env=os.environ | simulated,
     capture_output=True,

@@ -172,7 +172,7 @@ def test_no_torch_is_imported() -> None:
   subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@every_algorithm
+@two_of_them
 def test_agents_of_one_program_end_as_they_do_alone(config: Config) -> None:
   faster = dataclasses.replace(config, learning_rate=2 * config.learning_rate)
   agents = [(config, 3), (faster, 3), (config, 4)]
