@@ -25,9 +25,9 @@ def test_a_seed_begins_anew_and_warms_up_before_the_clock(monkeypatch: pytest.Mo
     return 1.0, seconds
 
   program = SimpleNamespace(trace_s=1.0, compile_s=1.0, model="model 3", train=train)
-  program.init = lambda key, model, policy: f"{key} {model}"
+  program.init = lambda key, model, policy, settings: f"{key} {model}"
   found = SimpleNamespace(
-    trainer=SimpleNamespace(config=config, steps_per_update=1),
+    trainer=SimpleNamespace(config=config, steps_per_update=1, settings={}),
     key=lambda seed: f"key {seed}",
     draw=lambda seed: (f"model {seed}", None),
   )
