@@ -83,7 +83,7 @@ def measure(task: str) -> Entry:
     status=status(row) if row else "not measured",
     reference_return=float(row["final_return"]) if row else None,
     reference_steps=int(row["steps"]) if row else None,
-    reference_agent=row.get("agent", "ppo").split(",")[0] if row else "",
+    reference_agent=row["agent"].split(",")[0] if row else "",
   )
 
 
@@ -113,7 +113,7 @@ def _reference(task: str) -> dict[str, str] | None:
   rows: list[dict[str, str]] = []
   for name in _TABLES:
     with (_REFERENCE / f"{name}.csv").open(encoding="utf-8", newline="") as file:
-      rows += [row for row in csv.DictReader(file) if row["task"] == task and row.get("who", "ours") == "ours"]
+      rows += [row for row in csv.DictReader(file) if row["task"] == task and row["who"] == "ours"]
   single = [row for row in rows if "chain" not in row.get("experiment", "")]
   return max(single, key=lambda row: float(row["final_return"])) if single else rows[-1] if rows else None
 

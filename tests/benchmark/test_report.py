@@ -234,31 +234,17 @@ def test_whole_runs_stand_beside_the_rates_of_a_topology(tmp_path: Path):
   }
 
 
-def test_a_run_that_two_files_tell_of_is_listed_once(tmp_path: Path):
-  run_of = lambda who, rate, score: [
-    {"benchmark": "learning", "agent": "sac", "who": who, "seed": 1, "quantity": quantity, "value": value}
-    for quantity, value in (("training_steps_per_s", rate), ("final_return", score))
-  ]
-  (tmp_path / "a_runs.csv").write_text(
-    "task,agent,who,seed,final_return,training_steps_per_s,note,conditions\n"
-    "CheetahRun,sac_v020,ours,1,977.6,17092,the same,NVIDIA H200\n"
-    "CheetahRun,sac_v020,Brax's SAC,1,969.9,15296,the same,NVIDIA H200\n"
-    "CheetahRun,sac,ours,1,977.6,,another whose rate nobody took,NVIDIA H200\n"
-    "CheetahRun,sac,ours,2,977.6,17031,another,NVIDIA H200\n"
-    "CheetahRun,sac,ours,2,612.5,17092,another that went at the same rate,NVIDIA H200\n"
+def test_a_table_of_whole_runs_has_a_column_for_each_quantity(tmp_path: Path):
+  (tmp_path / "runs.csv").write_text(
+    "task,agent,who,seed,final_return,training_steps_per_s,note,device\n"
+    "CheetahRun,sac,ours,1,977.6,,alone,NVIDIA X\n"
+    "CheetahRun,sac,ours,2,612.5,17092,alone,NVIDIA X\n"
+    "CheetahRun,sac,ours,1,977.6,17031,beside others,NVIDIA X\n"
   )
-  (tmp_path / "old_calls.csv").write_text(
-    "call,commit,task,who,quantity,value,unit,note,conditions\n"
-    "A,abc,CheetahRun,ours,final return,612.52,,so many episodes,NVIDIA H200\n"
-    "A,abc,CheetahRun,ours,training steps/s,17092.3,steps/s,median of its rows,NVIDIA H200\n"
-  )
-  found = evidence(tmp_path, *run_of("ours", 17092.4, 977.618), *run_of("playground 0.2.0", 15296.0, 969.905))
+  found = Evidence([tmp_path])
   scores = [(row[1], row[2], row[4]) for row in table_with(page(found), "return of each run").rows]
-  assert scores == [
-    ("sac", "ours", "612.5"), ("sac", "ours", "977.6"), ("sac", "ours", "977.6"),
-    ("sac", "ours", "977.6"), ("sac", "playground 0.2.0", "969.9"),
-  ]  # fmt: skip
-  assert len(found.find(quantity="training_steps_per_s")) == 7, "rates stay, which other sections read"
+  assert scores == [("sac", "ours", "977.6"), ("sac", "ours", "977.6, 612.5")], "a note sets runs apart"
+  assert sorted(row["value"] for row in found.rows if row["quantity"] == "training_steps_per_s") == [17031, 17092]
 
 
 def test_the_committed_results_make_a_page(tmp_path: Path):

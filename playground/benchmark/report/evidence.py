@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,17 +11,7 @@ from playground.errors import ConfigError
 from playground.reporting.page import mean_and_ci95
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
 
-# Tables measured before `playground-bench`: their words for what a row's quantity is, and their columns.
-_WORDS = {
-  "training steps/s": "training_steps_per_s",
-  "command to first update, cold": "start_to_first_update_s",
-  "final return": "final_return",
-  "peak_gib": "peak_memory_gib",
-}
-_UNITS = {"training_steps_per_s": "steps/s", "steps": "steps", "peak_memory_gib": "GiB"}
-_UNITS |= dict.fromkeys(("return", "mode_return", "best_return", "final_return", "final_mode_return"), "")
-
-Row = dict[str, Any]  # the columns of a row as text, `value` as a number, and `source`: the file
+Row = dict[str, Any]  # the columns of a row as text, `value` as a number, `source`: the file, and a run's `note`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,14 +47,13 @@ class Evidence:
       self.curves |= curves
       self.mode_curves |= _curves(path, lines, OTHER_RETURNS["mode"])
       self.files += [path] * bool(rows or curves)
-    self.rows = _once(self.rows)
 
   def find(self, **wanted: str) -> list[Figure]:
     """Figures of the rows with these columns, a GPU's before a CPU's, then the newest, then the largest."""
     groups: dict[tuple[str, ...], dict[str, Row]] = {}
     for row in self.rows:
       if all(row[name] == text for name, text in wanted.items()):
-        same = (str(row["source"]), *(row[name] for name in SAME), row.get("apart", ""))
+        same = (str(row["source"]), *(row[name] for name in SAME))
         groups.setdefault(same, {})[row["seed"]] = row  # measured again: the later one counts
     figures = []
     for rows in groups.values():
@@ -79,30 +67,7 @@ class Evidence:
     return next(iter(self.find(**wanted)), None)
 
 
-SAME = ("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "devices", "device", "commit")
-
-
-def _once(rows: Sequence[Row]) -> list[Row]:
-  """The rows, without the final return of a run that another file has, too: the schema's stays, else the first.
-
-  Every file has its own words for a run; it is the same one where task, side, steps/s and return agree up to rounding.
-  """
-  of_run = lambda row: tuple(row.get(name) for name in (*SAME, "source", "seed", "apart") if name != "quantity")
-  rates = {of_run(row): row["value"] for row in rows if row["quantity"] == "training_steps_per_s"}
-  told: list[tuple[Row, float]] = []
-  repeated: set[int] = set()
-  for row in sorted((row for row in rows if row["quantity"] == "final_return"), key=lambda row: "apart" in row):
-    rate = rates.get(of_run(row), math.nan)  # which is close to none
-    if any(_alike(row, other) and math.isclose(rate, its, rel_tol=1e-4) for other, its in told):
-      repeated.add(id(row))
-    told.append((row, rate))
-  return [row for row in rows if id(row) not in repeated]
-
-
-def _alike(row: Row, other: Row) -> bool:
-  """Whether two final returns may be one that two files have."""
-  same = row["task"] == other["task"] and (row["who"] == "ours") == (other["who"] == "ours")
-  return same and row["source"] != other["source"] and abs(row["value"] - other["value"]) < 0.06
+SAME = ("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "devices", "device", "commit", "note")
 
 
 def _before(date: str) -> list[int]:
@@ -127,39 +92,17 @@ def _number(path: Path, text: str) -> float:
 
 
 def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
-  """Rows of a table in the columns of the schema."""
+  """Rows of a table in the columns of the schema; a table of whole runs has a column for each quantity."""
   if not lines or "task" not in lines[0]:
     return
   for line in lines:
     if None in line:
       raise ConfigError(f"{path} has a line of too many columns, of {line['task']}: mend or remove it.")
-    if {"quantity", "value"} <= set(line):
-      values = {line["quantity"]: line["value"]}
-    else:
-      values = {name: line[name] for name in line if _WORDS.get(name, name) in QUANTITIES}
-    for quantity, value in values.items():
-      quantity = _WORDS.get(quantity, quantity)
-      if quantity in QUANTITIES and value:
-        yield _row(path, line, quantity, _number(path, value))
-
-
-def _row(path: Path, line: dict[str, str], quantity: str, value: float) -> Row:
-  row: Row = dict.fromkeys(COLUMNS, "") | {name: text for name, text in line.items() if name in COLUMNS}
-  row |= {"source": path, "quantity": quantity, "value": value, "unit": row["unit"] or _UNITS.get(quantity, "s")}
-  if row["benchmark"]:
-    return row
-  call, note = line.get("call", ""), line.get("note", "")
-  row |= {
-    "benchmark": "compare" if "call" in line else "throughput" if "compile_s" in line else "",
-    "agent": row["agent"] or "ppo",
-    "who": row["who"] or "ours",
-    "device": "NVIDIA H200" if "NVIDIA H200" in row["conditions"] else "",
-    "devices": "1",
-    "conditions": "; ".join(part for part in (note, row["conditions"]) if part),
-    "call": call,
-    "apart": call or note,  # what sets runs apart that agree in all else
-  }
-  return row
+    known = {name: line.get(name, "") for name in (*COLUMNS, "note")}
+    values = {line["quantity"]: line["value"]} if {"quantity", "value"} <= set(line) else line
+    for quantity in QUANTITIES:
+      if value := values.get(quantity):
+        yield {**known, "source": path, "quantity": quantity, "value": _number(path, value)}
 
 
 def _curves(path: Path, lines: Sequence[dict[str, str]], column: str) -> dict[str, list[tuple[float, float]]]:

@@ -28,7 +28,8 @@ class Notes:
   def number(self, figure: Figure) -> str:
     """The note of a figure's conditions."""
     untimed = re.sub(r"[\d.]+ s timed", "timed", figure["conditions"])  # else every seed has a note of its own
-    parts = (figure["precision"], figure["versions"], untimed, figure["commit"] and f"commit {figure['commit']}")
+    commit = figure["commit"] and f"commit {figure['commit']}"
+    parts = (figure["precision"], figure["versions"], figure["note"], untimed, commit)
     text = "; ".join(part for part in parts if part)
     return f"[{self._texts.setdefault(text, len(self._texts) + 1)}]"
 
@@ -90,21 +91,13 @@ def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   for quantity, label in names.items():
     pick = max if quantity == SPEED else min
     for ours in evidence.find(benchmark="compare", who="ours", quantity=quantity):
-      call = ours.rows[0].get("call", "")
       of_it = {name: ours[name] for name in ("task", "source", "device", "commit")}
       for peer in evidence.find(benchmark="compare", quantity=quantity, **of_it):
-        if peer["who"] != "ours" and peer.rows[0].get("call", "") == call and (call or _same_overrides(ours, peer)):
+        if peer["who"] != "ours" and _same_overrides(ours, peer):
           mine, its = (pick(row["value"] for row in figure.rows) for figure in (ours, peer))
           better = mine / its if quantity == SPEED else its / mine
-          what, who = f"{label}, call {call}" if call else label, f"{peer['who']} {peer['backend']}".strip()
-          found = [
-            f"{ours['task']} {'' if call else ours['setting']}".strip(),
-            what,
-            short(mine),
-            who,
-            short(its),
-            f"{better:.2f}",
-          ]
+          task, who = f"{ours['task']} {ours['setting']}".strip(), f"{peer['who']} {peer['backend']}".strip()
+          found = [task, label, short(mine), who, short(its), f"{better:.2f}"]
           rows.append([*found, notes.number(ours), notes.number(peer)])
   if rows:
     yield Table(["task", "", "ours", "peer", "its", "times better", "ours: note", "its: note"], sorted(rows))
@@ -124,10 +117,6 @@ def startup(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   for figure in evidence.find(benchmark="startup", quantity="start_to_first_update_s"):
     kind = figure["setting"].rpartition(" ")[2]
     rows.append([_named(figure, kind), kind, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
-  for figure in evidence.find(benchmark="compare", who="ours", quantity="start_to_first_update_s"):
-    if figure.rows[0].get("call"):
-      name = f"cold, call {figure.rows[0]['call']}"
-      rows.append([_named(figure), name, f"{figure.mean:.1f}", figure["device"], notes.number(figure)])
   yield Table(["task", "caches", "seconds", "device", "note"], sorted(rows)) if rows else nothing("startup")
 
 

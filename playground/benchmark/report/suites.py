@@ -105,9 +105,9 @@ def _blocks(rows: Sequence[Row]) -> Iterator[Block]:
 
 def _run(row: Row) -> tuple[str, str, str]:
   """Who and what trained, the backend, and millions of steps."""
-  if (who := row.get("who") or "ours") != "ours":
+  if (who := row["who"]) != "ours":
     return who, row["backend"], _millions(row)
-  setting = " ".join(_BUDGET.sub("", f"{row.get('agent') or 'ppo'} {row.get('setting') or ''}").split())
+  setting = " ".join(_BUDGET.sub("", f"{row['agent']} {row.get('setting', '')}").split())
   for long, short in _SHORT.items():
     setting = setting.replace(long, short)
   if row.get("experiment", "").endswith("_chain"):
