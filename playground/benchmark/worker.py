@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from playground.collector import uncollected
+from playground.gc_pause import gc_paused
 
 ROW = "ROW "  # a line with a row begins with it; other lines are the libraries' own
 CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")
@@ -43,9 +43,9 @@ def main() -> None:
     facts.lock = str(folder.parent / f"gpu{gpus}.lock")
   module, _, function = job["measure"].partition(":")
   try:
-    with uncollected(stays=True):
+    with gc_paused(stays=True):
       if module == "training":  # in this process
-        _stand_by(**arguments)
+        _prestart(**arguments)
       measure = getattr(importlib.import_module(f"playground.benchmark.measures.{module}"), function or "measure")
     measure(facts, **arguments)
   except PlaygroundError as error:
@@ -53,14 +53,14 @@ def main() -> None:
     sys.exit(2)
 
 
-def _stand_by(task: str, agent: str, overrides: Sequence[str], **_: object) -> None:
+def _prestart(task: str, agent: str, overrides: Sequence[str], **_: object) -> None:
   """Starts the process that compiles Warp's kernels, as `playground-run` does."""
   from playground.config import compose
   from playground.envs.options import impl_on_gpu
-  from playground.physics.warp_kernels import stand_by
+  from playground.physics.warp_kernels import prestart
 
   config = compose([f"env={task}", f"agent={agent}", *overrides])
-  stand_by(impl_on_gpu(config.env), config.hardware.platform)
+  prestart(impl_on_gpu(config.env), config.hardware.platform)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from hydra.errors import HydraException
 from playground import __version__
 from playground.cli.header import header
 from playground.cli.help import print_help
-from playground.collector import uncollected
 from playground.config import (
   RunConfig,
   command_lines,
@@ -38,6 +37,7 @@ from playground.config import (
   values_to_yaml,
 )
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, one_sentence
+from playground.gc_pause import gc_paused
 from playground.rendering.gl import withhold_gl
 from playground.settings import Plain
 from playground.trust import trust
@@ -111,11 +111,11 @@ def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
   common = command_lines(overrides)
   configs = compose_all([overrides, *([*common, *run] for run in others)])
   from playground.envs.options import impl_on_gpu
-  from playground.physics.warp_kernels import stand_by
+  from playground.physics.warp_kernels import prestart
 
-  stand_by(impl_on_gpu(configs[0].env), configs[0].hardware.platform)
+  prestart(impl_on_gpu(configs[0].env), configs[0].hardware.platform)
   print("\n".join([*header(configs[0]), f"  {'together':<10} {len(configs)} agents in one program"]), flush=True)
-  with uncollected(stays=True):
+  with gc_paused(stays=True):
     from playground.runs.together import train_together
 
   return train_together(configs)
@@ -184,13 +184,13 @@ def _train(config: RunConfig, verbose: bool) -> int:
   from rich.console import Console
 
   from playground.envs.options import impl_on_gpu
-  from playground.physics.warp_kernels import stand_by
+  from playground.physics.warp_kernels import prestart
 
-  stand_by(impl_on_gpu(config.env), config.hardware.platform)
+  prestart(impl_on_gpu(config.env), config.hardware.platform)
   print("\n".join(header(config)), flush=True)
   if verbose:
     Console().print(tree(config))
-  with uncollected(stays=True):
+  with gc_paused(stays=True):
     from playground.runs.train import train  # imports JAX
 
   return train(config)

@@ -17,8 +17,8 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 from jax.stages import Wrapped
 
-from playground.collector import uncollected
 from playground.envs.wrappers import ModelFields
+from playground.gc_pause import gc_paused
 from playground.hardware.distributed import agree, several
 from playground.hardware.mesh import divide, put
 from playground.learning.algorithm import Policy
@@ -132,7 +132,7 @@ def compile_program(trainer: Trainer, evaluate: Wrapped, draw: Draw, policy: Pol
   kernels = trainer.env.unwrapped.physics.compile_ahead()
   submit = lambda traced: pool.submit(traced.lower().compile)
   try:
-    with uncollected():  # tracing makes millions of objects
+    with gc_paused():  # tracing makes millions of objects
       model, eval_model = jax.eval_shape(draw)
       init = trainer.init.trace(key, model, policy, trainer.settings)
       state = init.out_info

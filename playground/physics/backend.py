@@ -18,7 +18,7 @@ import mujoco
 from flax import struct
 
 from playground.hardware.mesh import GROUP
-from playground.physics.warp_kernels import Building, dismiss, quiet_warp
+from playground.physics.warp_kernels import KernelBuild, cancel_prestart, quiet_warp
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
@@ -136,12 +136,12 @@ class Physics:
     still._forward = lambda model, data: data
     return still
 
-  def compile_ahead(self) -> Building | None:
-    """Starts to compile what Warp will need on a GPU; None where there is nothing to be gained."""
+  def compile_ahead(self) -> KernelBuild | None:
+    """Starts to compile the kernels that Warp needs on a GPU; returns None for another backend or device."""
     if self.impl != "warp" or jax.default_backend() != "gpu":
-      dismiss()
+      cancel_prestart()
       return None
-    return Building(self.mj_model, self._buffers.get("njmax"))
+    return KernelBuild(self.mj_model, self._buffers.get("njmax"))
 
   def make(self, **fields: jax.Array) -> PhysicsData:
     """Returns the model's default state with `fields` replaced; derived fields are those of fresh data."""

@@ -1,11 +1,11 @@
-"""Compiles Warp's kernels for a model ahead of its first step, side by side, in a process of their own.
+"""Compiles Warp's kernels for a model before its first step, in parallel, in another process.
 
-Warp compiles a module of kernels when one of them is first launched, so a cold start compiles one after another when
-everything else is ready: half a minute to one and a half, longer than tracing and XLA together. Here another process
-walks through a physics step without launching anything, notes the modules it would need, and compiles all of them at
-once into Warp's cache while this one traces. What it should miss is compiled at its first launch, as ever.
+Warp compiles a module of kernels at the first launch of one of them. A cold start therefore compiles one module after
+another when everything else is ready: 30 to 95 s, longer than tracing and XLA together. Here another process runs a
+physics step without launching a kernel, records the modules that the step needs, and compiles all of them at once into
+Warp's cache while this process traces. Warp compiles a module that the process missed at its first launch.
 
-What that process imports takes seconds, too. A command that will want it has it stand by while it imports its own.
+The imports of that process take seconds. `prestart` starts it before this process imports its own modules.
 """
 
 import contextlib
@@ -23,34 +23,34 @@ from typing import Any
 
 import mujoco
 
-from playground.collector import uncollected
+from playground.gc_pause import gc_paused
 from playground.interpreter import PYTHON
 
 LIMIT_S = 900.0  # for a machine with few cores; a process that takes longer hangs
 _NEEDS = ("warp", "mujoco.mjx.warp.ffi", "mujoco.mjx.third_party.mujoco_warp")
 _LONGEST = "ccd_kernel"  # in the name of the module that takes NVRTC longest, half a minute and more
 
-_standing_by: list[subprocess.Popen[str]] = []  # one at most
+_prestarted: list[subprocess.Popen[str]] = []  # at most one
 
 
-def stand_by(impl: str, platform: str) -> None:
-  """Starts the process for the next `Building` if a run may want it; unused, it ends with this one.
+def prestart(impl: str, platform: str) -> None:
+  """Starts the process for the next `KernelBuild` if the run may need it; unused, it ends with this process.
 
-  Call it before what takes long to import; this module does not.
+  Call it before slow imports; this module imports fast.
 
   Args:
     impl: the backend that the task has on a GPU.
     platform: `hardware.platform`.
   """
   no_gpu = "cpu" in (platform, os.environ.get("JAX_PLATFORMS")) or not shutil.which("nvidia-smi")
-  if impl == "warp" and not (_standing_by or no_gpu):
-    _standing_by.append(_start())
+  if impl == "warp" and not (_prestarted or no_gpu):
+    _prestarted.append(_start())
 
 
-def dismiss() -> None:
-  """Ends the process that stands by, if there is one."""
-  while _standing_by:
-    with _standing_by.pop() as process:
+def cancel_prestart() -> None:
+  """Ends the process that `prestart` started, if no `KernelBuild` took it."""
+  while _prestarted:
+    with _prestarted.pop() as process:
       process.kill()
 
 
@@ -62,16 +62,16 @@ def _start() -> subprocess.Popen[str]:
 
 def _tell(process: subprocess.Popen[str], job: dict[str, Any]) -> None:
   assert process.stdin is not None
-  with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # what has failed by now is told by `wait`
+  with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # `wait` reports why it failed
     json.dump(job, pipe)
   process.stdin = None  # so that `communicate` does not write to it
 
 
-class Building:
-  """Kernels that are being compiled for one model, or were before."""
+class KernelBuild:
+  """Compiles the kernels of one model, unless Warp's cache has them."""
 
   def __init__(self, mj_model: mujoco.MjModel, njmax: int | None):
-    """Starts to compile what Warp's cache does not have yet.
+    """Starts to compile the kernels that Warp's cache does not have.
 
     Args:
       mj_model: the compiled model, as the physics has it.
@@ -89,12 +89,12 @@ class Building:
     self._marker = Path(str(warp.config.kernel_cache_dir), f"playground_{key}")
     self._process: subprocess.Popen[str] | None = None
     if not self._marker.exists():
-      self._process = _standing_by.pop() if _standing_by else _start()
+      self._process = _prestarted.pop() if _prestarted else _start()
       _tell(self._process, {"model": str(path), "njmax": njmax, "cache": str(self._marker.parents[1])})
-    dismiss()
+    cancel_prestart()
 
   def wait(self) -> str | None:
-    """Waits until all of them are there; returns a sentence if they could not be compiled ahead."""
+    """Waits for all kernels; returns a sentence if they could not be compiled ahead."""
     if self._process is None:
       return None
     try:
@@ -107,10 +107,10 @@ class Building:
       self._marker.touch()
       return None
     why = (errors.strip().splitlines() or [f"exit code {self._process.returncode}"])[-1]
-    return f"Warp's kernels were not compiled ahead, they are at their first launch: {why}"
+    return f"Warp's kernels were not compiled ahead; Warp compiles them at their first launch: {why}"
 
   def stop(self) -> None:
-    """Ends the process if it is still there, and removes what it was given."""
+    """Ends the process if it still runs, and removes its files."""
     if self._process is not None and self._process.poll() is None:
       self._process.kill()
       self._process.wait()
@@ -164,8 +164,8 @@ def _launched(mj_model: mujoco.MjModel, njmax: int | None) -> list[tuple[Any, in
 
 
 def _main() -> None:
-  """Imports, waits for a job on stdin, compiles; ends without one."""
-  with uncollected(stays=True):
+  """Imports, waits for a job on stdin and compiles it; ends if there is none."""
+  with gc_paused(stays=True):
     for name in _NEEDS:
       importlib.import_module(name)
   if told := sys.stdin.read():

@@ -12,12 +12,10 @@ from playground.physics import warp_kernels
 
 
 @pytest.mark.parametrize(("measure", "stands_by"), [("training", True), ("runs:startup", False)])
-def test_what_trains_in_it_has_warps_compiler_stand_by(
-  monkeypatch: pytest.MonkeyPatch, measure: str, stands_by: bool
-) -> None:
+def test_training_prestarts_warps_compiler(monkeypatch: pytest.MonkeyPatch, measure: str, stands_by: bool) -> None:
   asked: list[Any] = []
   measured: list[dict[str, Any]] = []
-  monkeypatch.setattr(warp_kernels, "stand_by", lambda *chosen: asked.append(chosen))
+  monkeypatch.setattr(warp_kernels, "prestart", lambda *chosen: asked.append(chosen))
   module, name = (training, "measure") if measure == "training" else (runs, "startup")
   monkeypatch.setattr(module, name, lambda _, **arguments: measured.append(arguments))
   arguments = {"task": "PandaPickCube", "agent": "ppo", "overrides": ["hardware=cpu"], "seeds": [1]}

@@ -58,11 +58,11 @@ def test_trains_the_default_run_and_describes_it_in_ten_lines(
   assert "slow_turns (100,000,000 steps), fast_turns" in capsys.readouterr().out
 
 
-def test_has_warps_compiler_stand_by_for_the_task(
+def test_prestarts_warps_compiler_for_the_task(
   command: Command, trained: list[RunConfig], monkeypatch: pytest.MonkeyPatch
 ):
   asked: list[Any] = []
-  monkeypatch.setattr(warp_kernels, "stand_by", lambda *chosen: asked.append((*chosen, len(trained))))
+  monkeypatch.setattr(warp_kernels, "prestart", lambda *chosen: asked.append((*chosen, len(trained))))
   assert command("env=PandaPickCube", "hardware=cpu") == 0
   assert asked == [("warp", "cpu", 0)]  # before training begins
 

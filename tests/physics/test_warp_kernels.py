@@ -1,4 +1,4 @@
-"""Kernels compiled ahead: all that a step needs are there, once, and a failure is told and harms nothing."""
+"""Kernels compiled ahead: all that a step needs, once; a failure is reported and harms nothing."""
 
 import os
 import subprocess
@@ -23,14 +23,14 @@ SCRIPT = """
 import os, sys
 import jax
 from playground import registry
-from playground.physics.warp_kernels import Building
+from playground.physics.warp_kernels import KernelBuild
 env = registry.load(sys.argv[1], overrides={"impl": "warp"})
-building = Building(env.mj_model, env.physics._njmax)
-assert building.wait() is None
+build = KernelBuild(env.mj_model, env.physics._njmax)
+assert build.wait() is None
 import warp
 modules = lambda: {name for name in os.listdir(warp.config.kernel_cache_dir) if name.startswith("wp_")}
 before = modules()
-again = Building(env.mj_model, env.physics._njmax)
+again = KernelBuild(env.mj_model, env.physics._njmax)
 assert again._process is None and again.wait() is None
 state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
 state = jax.jit(jax.vmap(env.step))(state, jax.numpy.zeros((2, env.action_size)))
@@ -55,28 +55,28 @@ def model():
   return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
 
 
-def test_what_went_wrong_is_said(model, monkeypatch, tmp_path):
+def test_a_failure_is_reported(model, monkeypatch, tmp_path):
   monkeypatch.setattr(warp_kernels, "PYTHON", ("false",))
-  building = warp_kernels.Building(model, 7)
-  assert building.wait() == "Warp's kernels were not compiled ahead, they are at their first launch: exit code 1"
-  assert not building._marker.exists()
+  build = warp_kernels.KernelBuild(model, 7)
+  assert build.wait() == "Warp's kernels were not compiled ahead; Warp compiles them at their first launch: exit code 1"
+  assert not build._marker.exists()
 
 
-def test_a_stopped_building_leaves_nothing(model):
-  building = warp_kernels.Building(model, 8)
-  building.stop()
-  assert building._process is not None
-  assert building._process.poll() is not None
-  assert not os.path.exists(building._folder.name)
+def test_a_stopped_build_leaves_nothing(model):
+  build = warp_kernels.KernelBuild(model, 8)
+  build.stop()
+  assert build._process is not None
+  assert build._process.poll() is not None
+  assert not os.path.exists(build._folder.name)
 
 
 def test_a_run_waits_and_says_it(model, monkeypatch, tmp_path, capsys):
   """As on a GPU, with a process that fails at once."""
   made = []
 
-  def compile_ahead(physics: Physics) -> warp_kernels.Building:
+  def compile_ahead(physics: Physics) -> warp_kernels.KernelBuild:
     monkeypatch.setattr(warp_kernels, "PYTHON", ("false",))
-    made.append(warp_kernels.Building(physics.mj_model, 9))
+    made.append(warp_kernels.KernelBuild(physics.mj_model, 9))
     return made[0]
 
   monkeypatch.setattr(Physics, "compile_ahead", compile_ahead)
@@ -87,27 +87,27 @@ def test_a_run_waits_and_says_it(model, monkeypatch, tmp_path, capsys):
 
 @pytest.fixture
 def gpu(monkeypatch, tmp_path):
-  """A machine whose driver has a GPU, for `stand_by`; what stands by is gone after the test."""
+  """A machine whose driver has a GPU, for `prestart`; the process ends with the test."""
   (tmp_path / "nvidia-smi").write_text("#!/bin/sh\n")
   (tmp_path / "nvidia-smi").chmod(0o755)
   monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
   monkeypatch.delenv("JAX_PLATFORMS", raising=False)
   yield
-  warp_kernels.dismiss()
+  warp_kernels.cancel_prestart()
 
 
 def env_config(**changes):
   return {"impl": "auto", "cuda_impl": "warp", "vision": {"enable": False}} | changes
 
 
-def test_a_building_takes_the_process_that_stands_by(gpu, model):
-  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
-  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")  # once is enough
-  (process,) = warp_kernels._standing_by
-  stopped = warp_kernels.Building(model, 10)
+def test_a_build_takes_the_prestarted_process(gpu, model):
+  warp_kernels.prestart(impl_on_gpu(env_config()), "auto")
+  warp_kernels.prestart(impl_on_gpu(env_config()), "auto")  # once is enough
+  (process,) = warp_kernels._prestarted
+  stopped = warp_kernels.KernelBuild(model, 10)
   stopped.stop()
   assert stopped._process is process
-  assert warp_kernels._standing_by == []
+  assert warp_kernels._prestarted == []
 
 
 @pytest.mark.slow  # all kernels
@@ -117,21 +117,21 @@ def test_kernels_are_compiled_once(gpu, model, monkeypatch, tmp_path):
   warp.init()
   cache = tmp_path / warp.config.version
   monkeypatch.setattr(warp.config, "kernel_cache_dir", str(cache))
-  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
-  building = warp_kernels.Building(model, 11)
-  assert building.wait() is None
-  assert building._marker.exists()
+  warp_kernels.prestart(impl_on_gpu(env_config()), "auto")
+  build = warp_kernels.KernelBuild(model, 11)
+  assert build.wait() is None
+  assert build._marker.exists()
   assert len(list(cache.glob("wp_*"))) > 10
-  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
-  (process,) = warp_kernels._standing_by
-  again = warp_kernels.Building(model, 11)
+  warp_kernels.prestart(impl_on_gpu(env_config()), "auto")
+  (process,) = warp_kernels._prestarted
+  again = warp_kernels.KernelBuild(model, 11)
   assert again._process is None
   assert again.wait() is None
   assert process.poll() is not None  # nothing was left to do
 
 
 @pytest.mark.parametrize(
-  ("changes", "stands_by"),
+  ("changes", "prestarts"),
   [
     ({"cuda_impl": "jax"}, False),
     ({"impl": "jax"}, False),
@@ -139,24 +139,24 @@ def test_kernels_are_compiled_once(gpu, model, monkeypatch, tmp_path):
     ({"cuda_impl": "jax", "vision": {"enable": True}}, True),
   ],
 )
-def test_only_what_runs_on_warp_has_a_process_stand_by(gpu, changes, stands_by):
-  warp_kernels.stand_by(impl_on_gpu(env_config(**changes)), "auto")
-  assert bool(warp_kernels._standing_by) == stands_by
+def test_only_tasks_on_warp_prestart(gpu, changes, prestarts):
+  warp_kernels.prestart(impl_on_gpu(env_config(**changes)), "auto")
+  assert bool(warp_kernels._prestarted) == prestarts
 
 
 @pytest.mark.parametrize("without", ["platform", "JAX_PLATFORMS", "PATH"])
-def test_nothing_stands_by_without_a_gpu(gpu, monkeypatch, tmp_path, without):
+def test_nothing_is_prestarted_without_a_gpu(gpu, monkeypatch, tmp_path, without):
   if without == "PATH":
     (tmp_path / "nvidia-smi").unlink()
   elif without == "JAX_PLATFORMS":
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-  warp_kernels.stand_by(impl_on_gpu(env_config()), "cpu" if without == "platform" else "auto")
-  assert warp_kernels._standing_by == []
+  warp_kernels.prestart(impl_on_gpu(env_config()), "cpu" if without == "platform" else "auto")
+  assert warp_kernels._prestarted == []
 
 
 def test_it_ends_with_the_process_that_started_it(gpu):
-  warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
-  (process,) = warp_kernels._standing_by
+  warp_kernels.prestart(impl_on_gpu(env_config()), "auto")
+  (process,) = warp_kernels._prestarted
   assert process.stdin is not None
   process.stdin.close()  # as when that one ends
   assert process.wait(60) == 0
@@ -177,6 +177,6 @@ def test_the_longest_module_is_compiled_first(model, monkeypatch):
 
 def test_the_cpu_and_mjx_alone_compile_nothing_ahead(gpu):
   for impl in ("jax", "warp"):
-    warp_kernels.stand_by(impl_on_gpu(env_config()), "auto")
+    warp_kernels.prestart(impl_on_gpu(env_config()), "auto")
     assert registry.load("CartpoleBalance", overrides={"impl": impl}).physics.compile_ahead() is None
-    assert warp_kernels._standing_by == []
+    assert warp_kernels._prestarted == []

@@ -1,4 +1,4 @@
-"""Python's garbage collector stays away where it is told to, and comes back."""
+"""The garbage collector pauses in the context, and works again after it."""
 
 import gc
 import subprocess
@@ -6,15 +6,15 @@ import sys
 
 import pytest
 
-from playground.collector import uncollected
+from playground.gc_pause import gc_paused
 
 
 @pytest.mark.parametrize("collecting", [True, False])
-def test_it_is_as_it_was_afterwards(collecting):
+def test_it_works_again_afterwards(collecting):
   if not collecting:
     gc.disable()
   try:
-    with pytest.raises(ValueError, match="within"), uncollected():
+    with pytest.raises(ValueError, match="within"), gc_paused():
       assert not gc.isenabled()
       raise ValueError("within")
     assert gc.isenabled() == collecting
@@ -22,17 +22,17 @@ def test_it_is_as_it_was_afterwards(collecting):
     gc.enable()
 
 
-def test_what_stays_is_never_looked_through_again():
+def test_frozen_objects_are_ignored():
   script = """
 import gc
-from playground.collector import uncollected
-with uncollected():
+from playground.gc_pause import gc_paused
+with gc_paused():
   pass
 assert not any(isinstance(x, dict) and x.get("kept") for x in gc.get_objects())
-with uncollected(stays=True):
+with gc_paused(stays=True):
   made = {"kept": [1]}
 assert gc.isenabled() and not any(x is made for x in gc.get_objects())
-with uncollected(stays=True):
+with gc_paused(stays=True):
   later = {"kept": [2]}
 assert any(x is later for x in gc.get_objects()), "once is enough"
 """
