@@ -1,5 +1,6 @@
 """Replay: a ring of transitions on the device, of fixed size, drawn from uniformly."""
 
+import functools
 import math
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec as P
+from jax.typing import DTypeLike
 
 from playground.hardware.mesh import AXIS
 from playground.pytree import PyTree
@@ -16,7 +18,8 @@ class Replay(struct.PyTreeNode):
   """What a buffer holds.
 
   Attributes:
-    data: one row of numbers for each transition, [slots, num_envs, width]; a slot takes one step of all environments.
+    data: one row for each transition, [slots, num_envs, columns]; a slot takes one step of all environments. A column
+      is a float32 number or, in a buffer of bfloat16, the 16 bits of one or half of those of a float32.
     inserted: steps put in so far, []; beyond `slots` they replace the oldest.
   """
 
@@ -31,7 +34,7 @@ REPLAY_SPEC = Replay(data=P(None, AXIS), inserted=P())  # pyright: ignore[report
 class ReplayBuffer:
   """Puts transitions in and draws them; pure functions on `Replay`, each device on its share of the environments."""
 
-  def __init__(self, max_size: int, num_envs: int, example: PyTree, saved: bool = True):
+  def __init__(self, max_size: int, num_envs: int, example: PyTree, saved: bool = True, dtype: DTypeLike = jnp.float32):
     """Sizes an empty buffer.
 
     Args:
@@ -39,12 +42,17 @@ class ReplayBuffer:
       num_envs: environments, over all devices.
       example: one transition, a tree of float32 arrays or their shapes.
       saved: whether the newest checkpoint holds the transitions; else a resumed run collects them anew.
+      dtype: float32, or bfloat16 to keep arrays at half of the memory; single numbers (rewards, flags) stay float32.
     """
     self.max_size, self.saved = max_size, saved
-    row, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, jnp.float32), example))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, jnp.float32), example)
+    row, unravel = ravel_pytree(zeros)
     self.slots, self.num_envs, self.width = max_size // num_envs, num_envs, row.size
-    self._ravel = jax.vmap(lambda tree: ravel_pytree(tree)[0])
-    self._unravel = jax.vmap(unravel)
+    ravel = lambda tree: ravel_pytree(tree)[0]
+    if jnp.dtype(dtype) == jnp.bfloat16:
+      ravel, unravel = _bits, functools.partial(_from_bits, zeros)
+    self._row = jax.eval_shape(ravel, zeros)
+    self._ravel, self._unravel = jax.vmap(ravel), jax.vmap(unravel)
 
   @property
   def size(self) -> int:
@@ -54,11 +62,11 @@ class ReplayBuffer:
   @property
   def nbytes(self) -> int:
     """Memory of all of them, over all devices."""
-    return 4 * self.size * self.width
+    return self.size * self._row.size * self._row.dtype.itemsize
 
   def init(self, num_envs: int) -> Replay:
     """An empty buffer for a device's share of the environments."""
-    return Replay(jnp.zeros((self.slots, num_envs, self.width)), jnp.zeros((), jnp.int32))
+    return Replay(jnp.zeros((self.slots, num_envs, *self._row.shape), self._row.dtype), jnp.zeros((), jnp.int32))
 
   def insert(self, replay: Replay, transitions: PyTree) -> Replay:
     """Puts in one step of all environments, a tree of [num_envs, ...], in the place of the oldest if it is full."""
@@ -68,7 +76,7 @@ class ReplayBuffer:
 
   def sample(self, replay: Replay, key: jax.Array, shape: tuple[int, ...]) -> PyTree:
     """Draws transitions, a tree of [*shape, ...], each of those held with the same probability."""
-    rows = replay.data.reshape(-1, self.width)
+    rows = replay.data.reshape(-1, *self._row.shape)
     held = self.held(replay) * replay.data.shape[1]
     drawn = jax.random.randint(key, (math.prod(shape),), 0, held)
     transitions = self._unravel(rows.at[drawn].get(mode="promise_in_bounds"))
@@ -86,9 +94,27 @@ class ReplayBuffer:
     start = oldest + jax.random.randint(start_key, (math.prod(shape),), 0, held - length + 1)
     env = jax.random.randint(env_key, (math.prod(shape),), 0, num_envs)
     rows = replay.data[(start + jnp.arange(length)[:, None]) % slots, env]
-    transitions = self._unravel(rows.reshape(-1, self.width))
+    transitions = self._unravel(rows.reshape(-1, *self._row.shape))
     return jax.tree.map(lambda x: x.reshape(length, *shape, *x.shape[1:]), transitions)
 
   def held(self, replay: Replay) -> jax.Array:
     """Slots in use, []: the first ones."""
     return jnp.minimum(replay.inserted, self.slots)
+
+
+def _bits(tree: PyTree) -> jax.Array:
+  """One transition as 16-bit words, [columns]: arrays rounded to bfloat16, single numbers as float32."""
+  leaves = [x.astype(jnp.bfloat16) if x.ndim else x for x in jax.tree.leaves(tree)]
+  return jnp.concatenate([jax.lax.bitcast_convert_type(x, jnp.uint16).ravel() for x in leaves])
+
+
+def _from_bits(example: PyTree, words: jax.Array) -> PyTree:
+  """The float32 transition, of the structure and shapes of `example`, that these words stand for."""
+  leaves, structure = jax.tree.flatten(example)
+  found, start = [], 0
+  for leaf in leaves:
+    count, shape, dtype = (leaf.size, leaf.shape, jnp.bfloat16) if leaf.ndim else (2, (2,), jnp.float32)
+    part = words[start : start + count].reshape(shape)
+    found.append(jax.lax.bitcast_convert_type(part, dtype).astype(jnp.float32))
+    start += count
+  return jax.tree.unflatten(structure, found)

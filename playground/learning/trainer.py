@@ -213,11 +213,11 @@ class Trainer:
     whole = "the whole training state"
     if self._buffer is None or template.replay is None or replay is None:
       return None, whole
-    shape = template.replay.data.shape
-    data = np.zeros(shape, np.float32)
+    shape, dtype = template.replay.data.shape, template.replay.data.dtype
+    data = np.zeros(shape, dtype)
     if checkpoint.has("replay"):
       held = min(int(replay.inserted), self._buffer.slots)
-      data[:held] = checkpoint.restore("replay", jax.ShapeDtypeStruct((held, *shape[1:]), jnp.float32))
+      data[:held] = checkpoint.restore("replay", jax.ShapeDtypeStruct((held, *shape[1:]), dtype))
       return Replay(data, replay.inserted), whole  # pyright: ignore[reportArgumentType]  # on the host
     refill = f"{self.config.prefill_updates * self.config.num_envs:,} transitions are collected before it learns on"
     empty = Replay(data, np.zeros_like(replay.inserted))  # pyright: ignore[reportArgumentType]

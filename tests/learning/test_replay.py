@@ -12,6 +12,8 @@ from playground.learning.replay import Replay, ReplayBuffer
 ENVS, SLOTS = 4, 5
 EXAMPLE = {"obs": {"state": np.zeros(3), "more": np.zeros((2, 2))}, "reward": np.zeros(())}
 BUFFER = ReplayBuffer(SLOTS * ENVS + 3, ENVS, EXAMPLE)
+HALF = ReplayBuffer(SLOTS * ENVS + 3, ENVS, EXAMPLE, dtype=jnp.bfloat16)
+both = pytest.mark.parametrize("buffer", [BUFFER, HALF], ids=["float32", "bfloat16"])
 
 
 def step(t: int) -> dict[str, Any]:
@@ -19,20 +21,37 @@ def step(t: int) -> dict[str, Any]:
   return jax.tree.map(lambda x: jnp.stack([jnp.full(x.shape, 10.0 * t + i) for i in range(ENVS)]), EXAMPLE)
 
 
-def filled(steps: int) -> Replay:
-  replay, insert = BUFFER.init(ENVS), jax.jit(BUFFER.insert)
+def filled(steps: int, buffer: ReplayBuffer = BUFFER) -> Replay:
+  replay, insert = buffer.init(ENVS), jax.jit(buffer.insert)
   for t in range(steps):
     replay = insert(replay, step(t))
   return replay
 
 
-def test_its_size_is_what_it_says() -> None:
-  assert (BUFFER.size, BUFFER.width) == (SLOTS * ENVS, 8)
-  assert BUFFER.nbytes == filled(0).data.nbytes
+@both
+def test_its_size_is_what_it_says(buffer: ReplayBuffer) -> None:
+  assert (buffer.size, buffer.width) == (SLOTS * ENVS, 8)
+  assert buffer.nbytes == buffer.init(ENVS).data.nbytes
+  assert buffer.nbytes == SLOTS * ENVS * (8 * 4 if buffer is BUFFER else 7 * 2 + 4)
 
 
-def test_only_what_was_put_in_is_drawn_and_all_of_it_alike() -> None:
-  drawn = BUFFER.sample(filled(2), jax.random.PRNGKey(0), (10, 400))
+def test_bfloat16_rounds_arrays_and_keeps_single_numbers() -> None:
+  draw = lambda i, *shape: 100 * jax.random.normal(jax.random.PRNGKey(i), (ENVS, *shape))
+  reward = draw(2).at[0].set(1 + 2.0**-20)
+  given = {"obs": {"state": draw(0, 3), "more": draw(1, 2, 2)}, "reward": reward}
+  replay = HALF.insert(HALF.init(ENVS), given)
+  drawn = HALF.sample(replay, jax.random.PRNGKey(0), (100,))
+  which = (drawn["reward"][:, None] == reward).argmax(axis=1)
+  assert set(np.unique(which)) == set(range(ENVS)), "rewards come out as they were"
+  for found, expected in zip(jax.tree.leaves(drawn), jax.tree.leaves(given), strict=True):
+    assert found.dtype == jnp.float32
+    rounded = expected.astype(jnp.bfloat16).astype(jnp.float32) if expected.ndim > 1 else expected
+    np.testing.assert_array_equal(found, rounded[which])
+
+
+@both
+def test_only_what_was_put_in_is_drawn_and_all_of_it_alike(buffer: ReplayBuffer) -> None:
+  drawn = buffer.sample(filled(2, buffer), jax.random.PRNGKey(0), (10, 400))
   assert drawn["obs"]["state"].shape == (10, 400, 3)
   assert drawn["obs"]["more"].shape == (10, 400, 2, 2)
   values, counts = np.unique(drawn["reward"], return_counts=True)
@@ -50,9 +69,10 @@ def test_the_newest_replace_the_oldest() -> None:
   assert (int(BUFFER.held(replay)), int(replay.inserted)) == (SLOTS, SLOTS + 2)
 
 
+@both
 @pytest.mark.parametrize(("steps", "starts"), [(3, [0]), (SLOTS, [0, 1, 2]), (SLOTS + 2, [2, 3, 4])])
-def test_windows_are_successive_steps_of_one_environment(steps: int, starts: list[int]) -> None:
-  drawn = BUFFER.sample_windows(filled(steps), jax.random.PRNGKey(0), (2, 300), 3)
+def test_windows_are_successive_steps_of_one_environment(steps: int, starts: list[int], buffer: ReplayBuffer) -> None:
+  drawn = buffer.sample_windows(filled(steps, buffer), jax.random.PRNGKey(0), (2, 300), 3)
   assert drawn["obs"]["more"].shape == (3, 2, 300, 2, 2)
   times = np.asarray(drawn["reward"]).reshape(3, -1)
   np.testing.assert_array_equal(np.diff(times, axis=0), 10)
