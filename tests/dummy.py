@@ -11,8 +11,10 @@ from playground.envs.base import Env, State
 from playground.envs.wrappers import MAX_VELOCITY
 from playground.hardware.mesh import make_mesh
 from playground.learning.hyperparameters import (
+  C51NetworkConfig,
+  FastSACConfig,
+  FastSACNetworkConfig,
   FastTD3Config,
-  FastTD3NetworkConfig,
   PPOConfig,
   REPPOConfig,
   REPPONetworkConfig,
@@ -119,11 +121,22 @@ SMALL_REPPO = REPPOConfig(
 SMALL_FAST_TD3 = FastTD3Config(
   num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, batch_size=32, grad_updates_per_step=2,
   min_replay_size=64, max_replay_size=500, learning_rate=3e-3, discounting=0.95, min_value=-30.0, max_value=10.0,
-  network=FastTD3NetworkConfig((16, 16), (16, 16), value_obs_key="privileged_state"),
+  network=C51NetworkConfig((16, 16), (16, 16), value_obs_key="privileged_state"),
 )  # fmt: skip
-SMALL = {"ppo": SMALL_PPO, "sac": SMALL_SAC, "reppo": SMALL_REPPO, "fast_td3": SMALL_FAST_TD3}
+SMALL_FAST_SAC = FastSACConfig(
+  num_timesteps=3200, num_evals=3, num_envs=16, num_eval_envs=16, batch_size=32, grad_updates_per_step=2,
+  policy_frequency=2, min_replay_size=64, max_replay_size=500, learning_rate=3e-3, discounting=0.95, min_value=-30.0,
+  max_value=10.0, network=FastSACNetworkConfig((16, 16), (16, 16), value_obs_key="privileged_state"),
+)  # fmt: skip
+SMALL = {
+  "ppo": SMALL_PPO,
+  "sac": SMALL_SAC,
+  "reppo": SMALL_REPPO,
+  "fast_td3": SMALL_FAST_TD3,
+  "fast_sac": SMALL_FAST_SAC,
+}
 
-Config = PPOConfig | SACConfig | REPPOConfig | FastTD3Config
+Config = PPOConfig | SACConfig | REPPOConfig | FastTD3Config | FastSACConfig
 
 
 def point_trainer(config: Config, num_devices: int = 1, **events: Any) -> Trainer:

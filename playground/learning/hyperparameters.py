@@ -76,6 +76,12 @@ class AgentConfig:
 class OffPolicyConfig(AgentConfig):
   """Hyperparameters of algorithms that learn from a replay buffer."""
 
+  batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 512
+  grad_updates_per_step: Annotated[int, count(1, 100_000), "gradient steps for each step of all environments"] = 8
+  num_steps: Annotated[int, count(1, 100), "policy steps whose rewards a target holds before the critic's value"] = 1
+  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
+  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each gradient step"] = 0.005
+  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
   min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 8192
   max_replay_size: Annotated[
     int, count(1, 2**40), "transitions kept over all devices, the newest; a run prints their memory"
@@ -83,6 +89,9 @@ class OffPolicyConfig(AgentConfig):
   checkpoint_replay: Annotated[
     bool, "whether the newest checkpoint holds the buffer, for an exact resume; else it is refilled"
   ] = True
+  replay_dtype: Annotated[
+    Literal["float32", "bfloat16"], "of observations and actions in the buffer; bfloat16 takes half of the memory"
+  ] = "float32"
 
   @property
   def prefill_updates(self) -> int:
@@ -95,6 +104,11 @@ class OffPolicyConfig(AgentConfig):
         raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must not be below agent.{name}={least}.")
     if self.max_replay_size // num_devices > _MOST:
       raise ConfigError(f"agent.max_replay_size={self.max_replay_size} must be at most {_MOST} for each device.")
+    if self.num_steps > 1 and min(self.prefill_updates, self.max_replay_size // self.num_envs) < self.num_steps:
+      raise ConfigError(
+        f"agent.num_steps={self.num_steps}: agent.min_replay_size={self.min_replay_size} and agent.max_replay_size="
+        f"{self.max_replay_size} must hold so many steps of agent.num_envs={self.num_envs} environments."
+      )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -257,15 +271,10 @@ class SACConfig(OffPolicyConfig):
     5_000_000
   )
   num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 128
-  batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 512
-  grad_updates_per_step: Annotated[int, count(1, 100_000), "gradient steps for each step of all environments"] = 8
   learning_rate: Annotated[float, positive(1), "of Adam, for actor and critics"] = 1e-3
   alpha_learning_rate: Annotated[
     float, positive(1), "of Adam, for the temperature, which holds the entropy at half a nat per action below zero"
   ] = 3e-4
-  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
-  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each gradient step"] = 0.005
-  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
   network: Annotated[SoftNetworkConfig, "actor and critics"] = dataclasses.field(default_factory=SoftNetworkConfig)
 
 
@@ -336,13 +345,14 @@ class REPPOConfig(AgentConfig):
 
 
 @dataclasses.dataclass(frozen=True)
-class FastTD3NetworkConfig:
-  """Sizes and inputs of FastTD3's actor and twin critics."""
+class C51NetworkConfig:
+  """Sizes and inputs of an actor and twin distributional critics; the defaults are FastTD3's."""
 
   policy_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"] = (512, 256, 128)
   q_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of each critic's hidden layers"] = (1024, 512, 256)
   activation: Annotated[str, "of the hidden layers"] = "relu"
-  policy_output_scale: Annotated[float, positive(), "standard deviation of the actor's last weights at first"] = 0.01
+  layer_norm: Annotated[bool, "whether the hidden layers, of actor and critics, are normalised"] = False
+  policy_output_scale: Annotated[float, at_least_0(), "standard deviation of the actor's last weights at first"] = 0.01
   policy_obs_key: Annotated[str, "observation group that the actor reads"] = "state"
   value_obs_key: Annotated[str, "observation group that the critics read; privileged_state for an asymmetric pair"] = (
     "state"
@@ -350,27 +360,35 @@ class FastTD3NetworkConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FastTD3Config(OffPolicyConfig):
+class C51Config(OffPolicyConfig):
+  """Hyperparameters of algorithms with distributional critics and a replay buffer."""
+
+  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
+  policy_frequency: Annotated[int, count(1, 100_000), "the actor is updated with every n-th critic update"] = 2
+  min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 10_240
+  learning_rate: Annotated[float, positive(1), "of AdamW, for actor and critics"] = 3e-4
+  weight_decay: Annotated[float, at_least_0(), "of AdamW"] = 0.1
+  min_value: Annotated[float, Limit(), "lowest atom of the critics; the atoms must hold the discounted return"] = -150.0
+  max_value: Annotated[float, Limit(), "highest atom of the critics"] = 150.0
+  num_atoms: Annotated[int, count(2, 10_000), "atoms of the critics' distributions"] = 101
+  network: Annotated[C51NetworkConfig, "actor and critics"] = dataclasses.field(default_factory=C51NetworkConfig)
+
+  def check(self, num_devices: int) -> None:
+    super().check(num_devices)
+    _check_values(self.min_value, self.max_value)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FastTD3Config(C51Config):
   """Hyperparameters of FastTD3; the defaults are those of public runs on DM Control."""
 
   algorithm = "playground.learning.fast_td3:FastTD3"
   traced = ("learning_rate", "discounting", "tau", "reward_scaling")
 
-  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
   deterministic_eval: Annotated[bool, "has no effect: the policy is deterministic"] = True
   batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 32_768
   grad_updates_per_step: Annotated[int, count(1, 100_000), "critic updates for each step of all environments"] = 2
-  policy_frequency: Annotated[int, count(1, 100_000), "the actor is updated with every n-th critic update"] = 2
-  min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 10_240
-  learning_rate: Annotated[float, positive(1), "of AdamW, for actor and critics"] = 3e-4
-  weight_decay: Annotated[float, at_least_0(), "of AdamW"] = 0.1
-  num_steps: Annotated[int, count(1, 100), "policy steps whose rewards a target holds before the critic's value"] = 1
-  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
   tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each critic update"] = 0.1
-  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
-  min_value: Annotated[float, Limit(), "lowest atom of the critics; the atoms must hold the discounted return"] = -150.0
-  max_value: Annotated[float, Limit(), "highest atom of the critics"] = 150.0
-  num_atoms: Annotated[int, count(2, 10_000), "atoms of the critics' distributions"] = 101
   min_noise: Annotated[
     float, at_least_0(), "standard deviation of the exploration noise in the quietest environment"
   ] = 0.001
@@ -380,20 +398,55 @@ class FastTD3Config(OffPolicyConfig):
   use_smaller_q: Annotated[
     bool, "whether targets are of the critic with the smaller value (clipped double Q-learning); else each its own"
   ] = True
-  network: Annotated[FastTD3NetworkConfig, "actor and critics"] = dataclasses.field(
-    default_factory=FastTD3NetworkConfig
+
+  def check(self, num_devices: int) -> None:
+    super().check(num_devices)
+    if self.max_noise < self.min_noise:
+      raise ConfigError(f"agent.max_noise={self.max_noise} must not be below agent.min_noise={self.min_noise}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class FastSACNetworkConfig(C51NetworkConfig):
+  """Sizes and inputs of FastSAC's actor and twin critics."""
+
+  q_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of each critic's hidden layers"] = (768, 384, 192)
+  activation: Annotated[str, "of the hidden layers"] = "swish"
+  layer_norm: Annotated[bool, "whether the hidden layers, of actor and critics, are normalised"] = True
+  policy_output_scale: Annotated[float, at_least_0(), "standard deviation of the actor's last weights at first"] = 0.0
+  min_log_std: Annotated[
+    float, Limit(), "logarithm of the smallest standard deviation of actions before squashing; the first is the middle"
+  ] = -5.0
+  max_log_std: Annotated[float, Limit(), "logarithm of the largest"] = 0.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FastSACConfig(C51Config):
+  """Hyperparameters of FastSAC: the published ones, and FastTD3's where those are for robots alone."""
+
+  algorithm = "playground.learning.fast_sac:FastSAC"
+  traced = ("learning_rate", "alpha_learning_rate", "discounting", "tau", "reward_scaling", "target_entropy")
+
+  deterministic_eval: Annotated[
+    bool, "whether eval/episode_reward is of the mode of the policy, and eval/sampled/... of samples; else the reverse"
+  ] = True
+  batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 8192
+  policy_frequency: Annotated[int, count(1, 100_000), "the actor is updated with every n-th critic update"] = 4
+  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each critic update"] = 0.125
+  weight_decay: Annotated[float, at_least_0(), "of AdamW"] = 0.001
+  alpha_learning_rate: Annotated[float, positive(1), "of Adam, for the temperature"] = 3e-4
+  initial_temperature: Annotated[float, positive(), "factor on the entropy bonus at first"] = 0.001
+  target_entropy: Annotated[
+    float, Limit(), "of the policy, nats an action in [-1, 1]; that of a standard deviation of 0.15 is -0.48"
+  ] = -0.48
+  network: Annotated[FastSACNetworkConfig, "actor and critics"] = dataclasses.field(
+    default_factory=FastSACNetworkConfig
   )
 
   def check(self, num_devices: int) -> None:
     super().check(num_devices)
-    _check_values(self.min_value, self.max_value)
-    if min(self.prefill_updates, self.max_replay_size // self.num_envs) < self.num_steps:
-      raise ConfigError(
-        f"agent.num_steps={self.num_steps}: agent.min_replay_size={self.min_replay_size} and agent.max_replay_size="
-        f"{self.max_replay_size} must hold so many steps of agent.num_envs={self.num_envs} environments."
-      )
-    if self.max_noise < self.min_noise:
-      raise ConfigError(f"agent.max_noise={self.max_noise} must not be below agent.min_noise={self.min_noise}.")
+    low, high = self.network.min_log_std, self.network.max_log_std
+    if high < low:
+      raise ConfigError(f"agent.network.max_log_std={high} must not be below agent.network.min_log_std={low}.")
 
 
 def _check_values(low: float, high: float) -> None:
@@ -445,6 +498,7 @@ _BUILT_IN: dict[str, type[AgentConfig]] = {
   "sac": SACConfig,
   "reppo": REPPOConfig,
   "fast_td3": FastTD3Config,
+  "fast_sac": FastSACConfig,
 }
 
 

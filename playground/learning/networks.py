@@ -17,8 +17,8 @@ from playground.envs.base import PIXELS, Observation
 from playground.errors import ConfigError, nearest
 from playground.learning.cnn import ESTIMATOR, PixelNetwork, check_cnn
 from playground.learning.hyperparameters import (
+  C51NetworkConfig,
   CNNConfig,
-  FastTD3NetworkConfig,
   NetworkConfig,
   REPPONetworkConfig,
   SoftNetworkConfig,
@@ -47,7 +47,7 @@ class Actor:
     obs_size: ObservationSize,
     action_size: int,
     hidden_layer_sizes: Sequence[int],
-    config: NetworkConfig | SoftNetworkConfig | REPPONetworkConfig | FastTD3NetworkConfig,
+    config: NetworkConfig | SoftNetworkConfig | REPPONetworkConfig | C51NetworkConfig,
     precision: str | None = None,
     layer_norm: bool = False,
   ):

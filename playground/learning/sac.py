@@ -10,130 +10,41 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training.acme import running_statistics
-from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from playground.envs.base import Env
-from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
-from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy
 from playground.learning.hyperparameters import SACConfig
-from playground.learning.networks import SoftActorCritic, SoftActorCriticParams, normalize
-from playground.learning.replay import ReplayBuffer
-from playground.learning.rollout import Environments
+from playground.learning.networks import SoftActorCritic, SoftActorCriticParams
+from playground.learning.off_policy import Learned, OffPolicy, Transition
 from playground.pytree import PyTree
 
 PARTS = ("critic_loss", "actor_loss", "alpha_loss", "alpha", "entropy")  # what `sac_loss` reports
 
 
-class Transition(struct.PyTreeNode):
-  """Steps of B environments.
-
-  Attributes:
-    obs: observations the actions were taken on, each [B, ...].
-    next_obs: observations after them, each [B, ...]; where an episode ended, its own last one.
-    action: in [-1, 1], [B, action_size].
-    reward: [B], unscaled.
-    discount: 0 where the task ended the episode, else 1 (after a time-out, too), [B].
-    nonfinite: 1 where a number that is not finite cut it, [B]; the critics learn nothing there.
-  """
-
-  obs: dict[str, jax.Array]
-  next_obs: dict[str, jax.Array]
-  action: jax.Array
-  reward: jax.Array
-  discount: jax.Array
-  nonfinite: jax.Array
-
-
-class SACState(AlgorithmState):
-  """A state (params: `SoftActorCriticParams`) with target critics."""
-
-  target_q: PyTree = None
-
-
-class SAC(Algorithm[SACConfig, SoftActorCritic, SACState]):
+class SAC(OffPolicy[SACConfig, SoftActorCritic]):
   """SAC for one task."""
 
+  logged = (*PARTS, "grad_norm")
+
   def __init__(self, env: Env, config: SACConfig, network_precision: str | None = None):
-    if config.prefill_updates * config.num_envs * env.action_repeat >= config.num_timesteps:
-      raise ConfigError(
-        f"agent.num_timesteps={config.num_timesteps} is over before agent.min_replay_size={config.min_replay_size} "
-        "transitions are collected, so nothing would be learned."
-      )
     networks = SoftActorCritic(env.observation_size, env.action_size, config.network, network_precision)
-    obs = {key: jax.ShapeDtypeStruct(size, jnp.float32) for key, size in networks.obs_sizes.items()}
-    scalar, action = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((env.action_size,), jnp.float32)
-    example = Transition(obs, obs, action, reward=scalar, discount=scalar, nonfinite=scalar)  # pyright: ignore
-    buffer = ReplayBuffer(config.max_replay_size, config.num_envs, example, config.checkpoint_replay)
-    super().__init__(config, networks, buffer)
-    self.buffer, self.optimizer = buffer, optax.scale_by_adam()
+    super().__init__(env, config, networks)
+    self.optimizer = optax.scale_by_adam()
 
-  def init(self, key: jax.Array, policy: Policy | None) -> SACState:
-    policy = policy or self.new_policy(key)
-    return SACState(
-      params=policy.params,
-      opt_state=self.optimizer.init(ravel_pytree(policy.params)[0]),
-      normalizer=policy.normalizer,
-      replay=self.buffer.init(self.config.num_envs // jax.lax.axis_size(AXIS)),
-      target_q=policy.params.q,
-    )
+  def init_optimizer(self, params: SoftActorCriticParams) -> PyTree:
+    return self.optimizer.init(ravel_pytree(params)[0])
 
-  def train_step(self, state: SACState, envs: Environments, key: jax.Array) -> tuple[SACState, Environments, Metrics]:
-    config, networks = self.config, self.networks
-    act_key, replay_key, noise_key = jax.random.split(key, 3)
-    assert state.replay is not None
+  def learn(self, start: Learned, batches: Transition, key: jax.Array, step: jax.Array) -> tuple[Learned, jax.Array]:
+    """Makes gradient steps, one for each batch.
 
-    # Collect: one step of every environment.
-    envs, transition = self._collect(state, envs, act_key)
-    normalizer = state.normalizer
-    if config.normalize_observations:
-      normalizer = running_statistics.update(normalizer, transition.obs, pmap_axis_name=AXIS)
-    replay = self.buffer.insert(state.replay, transition)
-
-    # Learn, once there is enough to learn from: what all gradient steps need is drawn and normalised in one go.
-    shape = (config.grad_updates_per_step, config.batch_size // jax.lax.axis_size(AXIS))
-    batches = self.buffer.sample(replay, replay_key, shape)
-    if config.normalize_observations:
-      obs, next_obs = normalize(batches.obs, normalizer), normalize(batches.next_obs, normalizer)
-      batches = batches.replace(obs=obs, next_obs=next_obs)
-    noise = jax.random.normal(noise_key, (shape[0], 2, shape[1], networks.action_size))
-    ready = state.replay.inserted >= config.prefill_updates
-    start = (state.params, state.target_q, state.opt_state)
-    idle = lambda start, *_: (start, jnp.zeros(len(PARTS) + 2))
-    (params, target_q, opt_state), parts = jax.lax.cond(ready, self._learn, idle, start, batches, noise)
-
-    names = (*PARTS, "grad_norm", "nonfinite_updates")
-    metrics: Metrics = dict(zip(names, jax.lax.pmean(parts, AXIS), strict=True))
-    metrics["learned"] = ready.astype(jnp.float32)
-    metrics["gradient_steps"] = metrics["learned"] * config.grad_updates_per_step
-    metrics["nonfinite_updates"] *= metrics["gradient_steps"]
-    learned = {"params": params, "target_q": target_q, "opt_state": opt_state}
-    return state.replace(**learned, normalizer=normalizer, replay=replay), envs, metrics
-
-  def _collect(self, state: SACState, envs: Environments, key: jax.Array) -> tuple[Environments, Transition]:
-    """Steps this device's environments once with sampled actions."""
-    before = envs.state
-    action = self.act(self.policy(state), before.obs, key, deterministic=False)
-    envs, final_obs = envs.step(action)
-    transition = Transition(
-      obs=self.networks.select(before.obs),
-      next_obs=self.networks.select(final_obs),
-      action=action,
-      reward=envs.state.reward,
-      discount=1 - envs.state.done * (1 - envs.state.info["truncation"]),
-      nonfinite=envs.state.info["nonfinite"],
-    )
-    return envs, transition
-
-  def _learn(
-    self, start: tuple[PyTree, PyTree, PyTree], batches: Transition, noise: jax.Array
-  ) -> tuple[PyTree, jax.Array]:
-    """Gradient steps, one for each batch. Parameters travel as one vector: a kernel for each array costs far more."""
+    Parameters travel as one vector: a kernel for each array costs far more.
+    """
     params, target_q, opt_state = start
     (flat, unravel), (flat_target, unravel_target) = ravel_pytree(params), ravel_pytree(target_q)
     config = self.config
+    updates, size = batches.reward.shape
+    noise = jax.random.normal(key, (updates, 2, size, self.networks.action_size))
     rates = (config.learning_rate, config.learning_rate, config.alpha_learning_rate)  # critics, actor, temperature
     rates = jax.tree.broadcast(SoftActorCriticParams(*rates), params)  # pyright: ignore[reportArgumentType]
     rates = ravel_pytree(jax.tree.map(jnp.full_like, params, rates))[0]

@@ -130,7 +130,7 @@ def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize(
   ("args", "shown"),
   [
-    (["agent", "agent=sac"], ["one of fast_td3, ppo,", "agent.num_envs 128 a whole number from 1"]),
+    (["agent", "agent=sac"], ["one of fast_sac, fast_td3, ppo,", "agent.num_envs 128 a whole number from 1"]),
     (["robot", "env=Go1Getup"], ["env.robot.root trunk body that is pushed", "env.robot.mjcf"]),
     (["env.action_scale", "env=Go1Getup"], ["env.action_scale 0.5 rad", "Values are those of Go1Getup"]),
     (["env.rewards", "env=Go1Getup"], ["factor on the function's value", "env.rewards.upright_exp"]),

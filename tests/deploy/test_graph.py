@@ -12,7 +12,9 @@ from playground.deploy.graph import OPSET, input_names, policy_graph
 from playground.deploy.policy import ExportedPolicy
 from playground.errors import ConfigError
 from playground.learning.cnn import _POOLS, CNNConfig
+from playground.learning.fast_sac import FastSACNetworks
 from playground.learning.networks import ACTIVATIONS, ActorCritic, NetworkConfig, SoftActorCritic, SoftNetworkConfig
+from tests.dummy import SMALL_FAST_SAC, PointTask
 
 OBS, ACTIONS = 6, 2
 SEEN = {"state": (OBS,), "pixels/eye": (17, 12, 3), "pixels/left-hand": (8, 9, 1)}
@@ -66,6 +68,19 @@ def test_same_actions(activation: str, soft: bool) -> None:
     theirs = nets.act(policy, seen, obs, jax.random.PRNGKey(0), deterministic=True)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(ours, theirs, atol=2e-6)
     assert np.abs(ours).max() > 0.1
+
+
+def test_same_actions_of_fast_sac() -> None:
+  nets = FastSACNetworks(PointTask(), SMALL_FAST_SAC, None)
+  rng = np.random.default_rng(0)
+  shapes = jax.eval_shape(nets.init, jax.random.PRNGKey(0)).policy
+  policy = jax.tree.map(lambda x: rng.normal(scale=0.4, size=x.shape).astype("f"), shapes)
+  normalizer = nets.init_normalizer()
+  obs = {key: rng.normal(size=(20, *size)).astype(np.float32) for key, size in nets.obs_sizes.items()}
+  layers, normalization = nets.mlp(policy, jax.device_get(normalizer))
+  model = policy_graph(layers, nets.policy_inputs, nets.activation_name, normalization)
+  theirs = nets.act(policy, normalizer, obs, jax.random.PRNGKey(0), deterministic=True)  # pyright: ignore[reportArgumentType]
+  np.testing.assert_allclose(exported(model, nets.policy_inputs).actions(obs["state"]), theirs, atol=2e-6)
 
 
 def test_clipped_observations_are_clipped_in_the_graph() -> None:

@@ -94,7 +94,7 @@ def test_what_comes_after_a_termination_is_worth_nothing_whatever_the_time(lengt
   @jax.jit
   def transition(state: Any, key: jax.Array) -> Any:
     envs = Environments(state.env_state, state.capture, MODEL, {}, trainer.env)
-    envs, step = algorithm(trainer)._collect(state.algorithm, envs, key)
+    envs, step = algorithm(trainer).collect(state.algorithm, envs, key)
     return envs.state, step
 
   state, discounts = trainer.init(jax.random.PRNGKey(0), MODEL, None, trainer.settings), []
@@ -121,7 +121,9 @@ def test_a_bad_gradient_is_left_out() -> None:
   batches = sac.buffer.sample(state.replay, jax.random.PRNGKey(0), (1, 32))
   batches = batches.replace(reward=batches.reward * np.nan)
   start = (state.algorithm.params, state.algorithm.target_q, state.algorithm.opt_state)
-  new, parts = jit_on_mesh(sac._learn, built().mesh, (P(), P(), P()), P())(start, batches, jnp.zeros((1, 2, 32, 2)))
+  new, parts = jit_on_mesh(sac.learn, built().mesh, (P(),) * 4, P())(
+    start, batches, jax.random.PRNGKey(0), np.int32(PREFILL)
+  )
   assert parts[-1] == 1
   assert np.isfinite(parts).all()
   for a, b in zip(numbers(start), numbers(new), strict=True):
@@ -150,10 +152,15 @@ def save(folder: Path, trainer: Trainer, *states: Any) -> list[Path]:
   return find_checkpoints(folder)
 
 
-@pytest.mark.parametrize("updates", [7, 40], ids=["half full", "full"])
-def test_the_newest_checkpoint_restores_everything(tmp_path: Path, updates: int) -> None:
-  trainer, state = built(), trained(updates)
-  newest, older = save(tmp_path, trainer, trained(3), state)
+@pytest.mark.parametrize(
+  ("updates", "dtype"),
+  [(7, "float32"), (40, "float32"), pytest.param(7, "bfloat16", marks=pytest.mark.slow)],
+  ids=["half full", "full", "in bfloat16"],
+)
+def test_the_newest_checkpoint_restores_everything(tmp_path: Path, updates: int, dtype: Any) -> None:
+  trainer = built() if dtype == "float32" else point_trainer(dataclasses.replace(SMALL_SAC, replay_dtype=dtype))
+  state = trained(updates, trainer)
+  newest, older = save(tmp_path, trainer, trained(3, trainer), state)
   assert Checkpoint(newest).has("replay")
   assert not Checkpoint(older).has("replay")
   template = trainer.template(MODEL)
@@ -227,6 +234,8 @@ def test_memory_is_stated_and_must_be_there(monkeypatch: pytest.MonkeyPatch) -> 
   assert point_trainer(config).notices() == [
     "Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device."
   ]
+  (said,) = point_trainer(dataclasses.replace(config, replay_dtype="bfloat16")).notices()
+  assert "17 numbers, 4.00 GB" in said, "14 numbers of 2 bytes; reward, discount and nonfinite of 4"
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from brax.training.agents.sac import networks as brax_networks
 
 from playground.learning.hyperparameters import SACConfig
 from playground.learning.networks import SoftActorCritic, SoftActorCriticParams, SoftNetworkConfig
-from playground.learning.sac import PARTS, Transition, sac_loss
+from playground.learning.off_policy import Transition
+from playground.learning.sac import PARTS, sac_loss
 
 B, OBS, ACTIONS = 12, 5, 3
 

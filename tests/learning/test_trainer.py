@@ -66,6 +66,10 @@ def run(
     ("sac", 1500, ("training/critic_loss", "training/entropy", "training/grad_norm", "eval/mode/episode_reward")),
     ("reppo", 150, ("training/critic_loss", "training/kl", "training/grad_norm", "eval/sampled/episode_reward")),
     ("fast_td3", 1500, ("training/critic_loss", "training/q_mean", "training/grad_norm")),
+    pytest.param(
+      *("fast_sac", 1500, ("training/critic_loss", "training/entropy", "eval/sampled/episode_reward")),
+      marks=pytest.mark.slow,
+    ),
   ],
 )
 def test_it_learns_and_reports(name: str, updates: int, names: tuple[str, ...]) -> None:

@@ -34,7 +34,7 @@ def point() -> Iterator[None]:
 
 
 # That the others resume bit for bit, tests/learning/test_trainer.py shows without the files of a run.
-AGENTS = ["ppo", "sac", *(pytest.param(name, marks=pytest.mark.slow) for name in ("reppo", "fast_td3"))]
+AGENTS = ["ppo", "sac", *(pytest.param(name, marks=pytest.mark.slow) for name in ("reppo", "fast_td3", "fast_sac"))]
 
 
 @pytest.fixture(scope="module", params=AGENTS)
@@ -63,7 +63,7 @@ def test_a_resumed_run_ends_as_if_it_had_never_stopped(
 ) -> None:
   run = tmp_path / "run"
   newest, *older = interrupted(run, f"agent={agent(whole)}")
-  has_replay = agent(whole) in ("sac", "fast_td3")
+  has_replay = agent(whole) in ("sac", "fast_td3", "fast_sac")
   assert Checkpoint(newest).has("replay") == has_replay
   assert not any(Checkpoint(path).has("replay") for path in older)
   capsys.readouterr()

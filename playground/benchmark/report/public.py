@@ -18,7 +18,7 @@ from playground.reporting.page import Block, Heading, Picture, Table, Text
 Points = list[tuple[float, float]]  # (environment steps, return), steps ascending
 SHARE = 0.95  # of the best public PPO at equal steps: below it a task counts as below
 _AS_SET = "as set"
-_AGENT = re.compile(r"(?<![a-z])(sac|reppo|fast_td3)(?![a-z])")
+_AGENT = re.compile(r"(?<![a-z])(fast_sac|fast_td3|reppo|sac)(?![a-z])")
 _OTHER_EPISODES = "kengz/SLM-Lab"  # whose manipulation tasks have episodes of other lengths
 
 
