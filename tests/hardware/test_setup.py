@@ -44,8 +44,9 @@ for name in NAMES:
   assert float(scores["episode_length"]) == 20 and recording["qpos"].shape == (20, 2, 2)
   assert float(scores["episode_reward"]) > -12 or name != "ppo", scores["episode_reward"]
 
-first, second = (np.asarray(shard.data) for shard in state.replay.data.addressable_shards)
-assert first.shape == (31, 8, 17) and (first[:30] != 0).any() and not (first[:30, :, :2] == second[:30, :, :2]).any()
+if name != "ppo":
+  first, second = (np.asarray(shard.data) for shard in state.replay.data.addressable_shards)
+  assert first.shape == (31, 8, 17) and (first[:30] != 0).any() and not (first[:30, :, :2] == second[:30, :, :2]).any()
 """
 
 AGENTS = """
@@ -105,8 +106,8 @@ def test_more_than_there_are_is_one_sentence() -> None:
 @pytest.mark.parametrize(
   "code",
   [
-    pytest.param('NAMES = ("ppo", "sac")' + TWO_DEVICES, id="parameters are equal, environments apart"),
-    pytest.param('NAMES = ("fast_td3", "fast_sac")' + TWO_DEVICES, id="also of the others", marks=pytest.mark.slow),
+    pytest.param('NAMES = ("ppo",)' + TWO_DEVICES, id="parameters are equal, environments apart"),
+    pytest.param('NAMES = ("fast_td3", "fast_sac", "sac")' + TWO_DEVICES, id="also off policy", marks=pytest.mark.slow),
     pytest.param(AGENTS, id="agents end as they do alone", marks=pytest.mark.slow),
   ],
 )

@@ -29,57 +29,87 @@ def networks() -> FastTD3Networks:
   return FastTD3Networks(PointTask(), SMALL, None)
 
 
+@pytest.fixture(scope="module")
+def params(networks: FastTD3Networks) -> tuple[Any, Any]:
+  """Of the networks, and of their targets."""
+  init = jax.jit(networks.init)
+  return init(jax.random.PRNGKey(0)), init(jax.random.PRNGKey(9))
+
+
 def batch(networks: FastTD3Networks, size: int = 16, **changes: Any) -> Transition:
-  draw = lambda i, *shape: jax.random.normal(jax.random.PRNGKey(i), (size, *shape))
+  """Made by NumPy, which compiles nothing."""
+  draw = lambda i, *shape: np.random.default_rng(i).normal(size=(size, *shape)).astype(np.float32)
   obs = {key: draw(0, *shape) for key, shape in networks.obs_sizes.items()}
-  action = jnp.tanh(draw(1, networks.action_size))
-  return Transition(obs, obs, action, draw(2), jnp.ones(size), jnp.zeros(size)).replace(**changes)
+  one = np.ones(size, np.float32)
+  return Transition(obs, obs, np.tanh(draw(1, networks.action_size)), draw(2), one, 0 * one).replace(**changes)
 
 
-def loss_of(networks: FastTD3Networks, config: FastTD3Config, data: Transition) -> float:
-  params, target = networks.init(jax.random.PRNGKey(0)), networks.init(jax.random.PRNGKey(9))
-  return float(critic_loss(params.q, target.q, params.policy, data, jax.random.PRNGKey(1), networks, config)[0])
+@pytest.fixture(scope="module")
+def critic(networks: FastTD3Networks, params: tuple[Any, Any]) -> Any:
+  """The critics' loss on a batch, for a configuration."""
+  loss = jax.jit(critic_loss, static_argnums=(5, 6))
+  one, target = params
+  return lambda data, config=SMALL: float(
+    loss(one.q, target.q, one.policy, data, jax.random.PRNGKey(1), networks, config)[0]
+  )
+
+
+@pytest.fixture(scope="module")
+def log_probs(networks: FastTD3Networks, params: tuple[Any, Any]) -> np.ndarray:
+  """Of the critics' atoms [2, 16, 21] for the steps of `batch`."""
+  data = batch(networks)
+  return np.asarray(
+    jax.jit(lambda q: jax.nn.log_softmax(networks.q(q, data.obs, data.action)))(params[0].q), np.float64
+  )
 
 
 @pytest.mark.parametrize("smaller", [True, False])
-def test_the_critics_learn_from_one_whole_distribution(networks: FastTD3Networks, smaller: bool) -> None:
+def test_the_critics_learn_from_one_whole_distribution(
+  networks: FastTD3Networks, params: tuple[Any, Any], critic: Any, log_probs: np.ndarray, smaller: bool
+) -> None:
   config = dataclasses.replace(SMALL, use_smaller_q=smaller, policy_noise=0.0)
-  data = batch(networks, discount=jnp.tile(jnp.array([0.0, 1.0]), 8))
-  params, target = networks.init(jax.random.PRNGKey(0)), networks.init(jax.random.PRNGKey(9))
-  action = networks.mode(params.policy, data.next_obs)
-  following = np.asarray(jax.nn.softmax(networks.q(target.q, data.next_obs, action)), np.float64)
-  log = np.asarray(jax.nn.log_softmax(networks.q(params.q, data.obs, data.action)), np.float64)
+  data = batch(networks, discount=np.tile(np.array([0.0, 1.0], np.float32), 8))
+
+  @jax.jit
+  def following(policy: Any, q: Any) -> jax.Array:
+    return jax.nn.softmax(networks.q(q, data.next_obs, networks.mode(policy, data.next_obs)))
+
+  after = np.asarray(following(params[0].policy, params[1].q), np.float64)
   expected = 0.0
   for i in range(16):
     discount = config.discounting * float(data.discount[i])
-    each = [projected(following[k, i], float(data.reward[i]), discount, -3, 3) for k in (0, 1)]
+    each = [projected(after[k, i], float(data.reward[i]), discount, -3, 3) for k in (0, 1)]
     values = [(one * np.linspace(-3, 3, 21)).sum() for one in each]
     for k in (0, 1):
       target_k = each[0 if values[0] < values[1] else 1] if smaller else each[k]
-      expected -= (target_k * log[k, i]).sum() / 16
-  assert loss_of(networks, config, data) == pytest.approx(expected, rel=1e-4)
+      expected -= (target_k * log_probs[k, i]).sum() / 16
+  assert critic(data, config) == pytest.approx(expected, rel=1e-4)
 
 
-def test_a_terminal_step_is_worth_its_reward(networks: FastTD3Networks) -> None:
-  data = batch(networks, discount=jnp.zeros(16), reward=jnp.full(16, 0.3))
-  params = networks.init(jax.random.PRNGKey(0))
-  log = jax.nn.log_softmax(networks.q(params.q, data.obs, data.action))
-  assert loss_of(networks, SMALL, data) == pytest.approx(float(-log[..., 11].mean(axis=1).sum()), rel=1e-4)
+def test_a_terminal_step_is_worth_its_reward(networks: FastTD3Networks, critic: Any, log_probs: np.ndarray) -> None:
+  data = batch(networks, discount=np.zeros(16, np.float32), reward=np.full(16, 0.3, np.float32))
+  assert critic(data) == pytest.approx(float(-log_probs[..., 11].mean(axis=1).sum()), rel=1e-4)
 
 
-def test_broken_steps_teach_nothing(networks: FastTD3Networks) -> None:
-  assert loss_of(networks, SMALL, batch(networks, nonfinite=jnp.ones(16))) == 0
+def test_broken_steps_teach_nothing(networks: FastTD3Networks, critic: Any) -> None:
+  assert critic(batch(networks, nonfinite=np.ones(16, np.float32))) == 0
 
 
-def test_the_actor_begins_near_0_and_climbs(networks: FastTD3Networks) -> None:
-  params, data = networks.init(jax.random.PRNGKey(0)), batch(networks)
-  assert float(jnp.abs(networks.mode(params.policy, data.obs)).max()) < 0.2
-  value = lambda policy: -policy_loss(policy, params.q, data, networks, SMALL)
-  slope = jax.grad(value)(params.policy)
-  moved = jax.tree.map(lambda p, g: p + 0.05 * g, params.policy, slope)
-  assert value(moved) > value(params.policy)
-  either = -policy_loss(params.policy, params.q, data, networks, dataclasses.replace(SMALL, use_smaller_q=False))
-  assert value(params.policy) < either
+def test_the_actor_begins_near_0_and_climbs(networks: FastTD3Networks, params: tuple[Any, Any]) -> None:
+  data, (policy, q) = batch(networks), (params[0].policy, params[0].q)
+
+  @jax.jit
+  def climbed(policy: Any) -> tuple[jax.Array, ...]:
+    value = lambda policy, config=SMALL: -policy_loss(policy, q, data, networks, config)
+    before, slope = jax.value_and_grad(value)(policy)
+    moved = jax.tree.map(lambda p, g: p + 0.05 * g, policy, slope)
+    either = value(policy, dataclasses.replace(SMALL, use_smaller_q=False))
+    return jnp.abs(networks.mode(policy, data.obs)).max(), before, value(moved), either
+
+  action, before, after, either = climbed(policy)
+  assert action < 0.2
+  assert after > before
+  assert before < either
 
 
 @pytest.mark.parametrize(

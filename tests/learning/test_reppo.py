@@ -35,11 +35,17 @@ def networks() -> REPPONetworks:
   return REPPONetworks(PointTask(), SMALL, None)
 
 
+@pytest.fixture(scope="module")
+def params(networks: REPPONetworks) -> Any:
+  return jax.jit(networks.init)(jax.random.PRNGKey(0))
+
+
 def batch(networks: REPPONetworks, size: int = 32, **changes: Any) -> Transition:
-  draw = lambda i, *shape: jax.random.normal(jax.random.PRNGKey(i), (size, *shape))
+  """Made by NumPy, which compiles nothing."""
+  draw = lambda i, *shape: np.random.default_rng(i).normal(size=(size, *shape)).astype(np.float32)
   obs = {key: draw(0, *shape) for key, shape in networks.obs_sizes.items()}
-  zero = jnp.zeros(size)
-  action = jnp.tanh(draw(1, networks.action_size))
+  zero = np.zeros(size, np.float32)
+  action = np.tanh(draw(1, networks.action_size))
   made = Transition(obs, obs, action, draw(2), zero, zero, zero + 1)
   made = made.replace(target=draw(3), next_embedding=draw(4, 16))
   return made.replace(**changes)
@@ -93,10 +99,10 @@ def test_returns_equal_a_loop(seed: int) -> None:
   np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-5)
 
 
-def test_the_critic_knows_nothing_at_first(networks: REPPONetworks) -> None:
-  params, data = networks.init(jax.random.PRNGKey(0)), batch(networks)
-  logits, _, _ = networks.q(params.q, data.obs, data.action)
-  assert float(jnp.abs(networks.bins.decode(logits)).max()) < 5e-3
+def test_the_critic_knows_nothing_at_first(networks: REPPONetworks, params: Any) -> None:
+  data = batch(networks)
+  value = jax.jit(lambda q: networks.bins.decode(networks.q(q, data.obs, data.action)[0]))(params.q)
+  assert float(np.abs(value).max()) < 5e-3
 
 
 def test_the_divergence_is_that_of_samples(networks: REPPONetworks) -> None:
@@ -109,61 +115,75 @@ def test_the_divergence_is_that_of_samples(networks: REPPONetworks) -> None:
   assert float(networks.kl(old, old)[0]) == pytest.approx(0, abs=1e-6)
 
 
-def actor_gradients(
-  networks: REPPONetworks, config: REPPOConfig, shift: float = 0.0
-) -> tuple[Any, Any, dict[str, Any]]:
+@pytest.fixture(scope="module")
+def actor_gradients(networks: REPPONetworks, params: Any) -> Any:
   """Gradients for the actor's parameters and the critic's, and what is logged; `shift` moves the old policy away."""
-  params, data = networks.init(jax.random.PRNGKey(0)), batch(networks)
-  actor = (params.policy, params.log_alpha, params.log_beta)
-  old = networks.logits(params.policy, data.obs) + shift
-  loss = lambda actor, q: actor_loss(actor, q, data, old, jax.random.PRNGKey(1), networks, config)
-  grads, log = jax.grad(loss, argnums=(0, 1), has_aux=True)(actor, params.q)
-  return grads[0], grads[1], dict(zip(ACTOR_LOSSES, log, strict=True))
+  data = batch(networks)
+
+  @jax.jit
+  def compiled(target_entropy: jax.Array, shift: jax.Array) -> Any:
+    config = dataclasses.replace(SMALL, target_entropy=target_entropy)
+    old = networks.logits(params.policy, data.obs) + shift
+    loss = lambda actor, q: actor_loss(actor, q, data, old, jax.random.PRNGKey(1), networks, config)
+    return jax.grad(loss, argnums=(0, 1), has_aux=True)((params.policy, params.log_alpha, params.log_beta), params.q)
+
+  def gradients(target_entropy: float = SMALL.target_entropy, shift: float = 0.0) -> tuple[Any, Any, dict[str, Any]]:
+    grads, log = compiled(jnp.float32(target_entropy), jnp.float32(shift))
+    return grads[0], grads[1], dict(zip(ACTOR_LOSSES, log, strict=True))
+
+  return gradients
 
 
-def test_the_multipliers_move_towards_their_targets(networks: REPPONetworks) -> None:
-  (_, alpha, beta), _, log = actor_gradients(networks, dataclasses.replace(SMALL, target_entropy=-5.0))
+def test_the_multipliers_move_towards_their_targets(networks: REPPONetworks, actor_gradients: Any) -> None:
+  (_, alpha, beta), _, log = actor_gradients(-5.0)
   assert log["entropy"] > -5.0 * networks.action_size
   assert alpha > 0, "too random: the temperature falls"
   assert log["kl"] < SMALL.kl_bound
   assert beta > 0, "near: the multiplier falls"
-  (_, alpha, beta), _, log = actor_gradients(networks, dataclasses.replace(SMALL, target_entropy=5.0), shift=3.0)
+  (_, alpha, beta), _, log = actor_gradients(5.0, shift=3.0)
   assert alpha < 0
   assert log["kl"] > SMALL.kl_bound
   assert beta < 0
   entropy = float(log["entropy"]) / networks.action_size
-  (_, alpha, _), _, _ = actor_gradients(networks, dataclasses.replace(SMALL, target_entropy=entropy))
+  (_, alpha, _), _, _ = actor_gradients(entropy)
   assert float(alpha) == pytest.approx(0, abs=1e-8), "at the target it stays"
 
 
-def test_the_actor_does_not_teach_the_critic(networks: REPPONetworks) -> None:
-  _, q, _ = actor_gradients(networks, SMALL)
+def test_the_actor_does_not_teach_the_critic(actor_gradients: Any) -> None:
+  _, q, _ = actor_gradients()
   assert all(float(jnp.abs(leaf).max()) == 0 for leaf in jax.tree.leaves(q))
 
 
-def test_too_far_away_only_the_divergence_counts(networks: REPPONetworks) -> None:
-  params, data = networks.init(jax.random.PRNGKey(0)), batch(networks)
-  old = networks.logits(params.policy, data.obs) + 3.0
-  actor = (params.policy, params.log_alpha, params.log_beta)
-  assert float(networks.kl(old, old - 3.0).min()) > SMALL.kl_bound
-  ours = jax.grad(lambda a: actor_loss(a, params.q, data, old, jax.random.PRNGKey(1), networks, SMALL)[0])(actor)[0]
-  beta = jnp.exp(params.log_beta)
-  expected = jax.grad(lambda p: beta * networks.kl(old, networks.logits(p, data.obs)).mean())(params.policy)
+def test_too_far_away_only_the_divergence_counts(networks: REPPONetworks, params: Any, actor_gradients: Any) -> None:
+  data = batch(networks)
+
+  @jax.jit
+  def divergence(policy: Any) -> tuple[jax.Array, Any]:
+    old = networks.logits(params.policy, data.obs) + 3.0
+    kl = lambda policy: networks.kl(old, networks.logits(policy, data.obs))
+    return kl(policy).min(), jax.grad(lambda policy: jnp.exp(params.log_beta) * kl(policy).mean())(policy)
+
+  smallest, expected = divergence(params.policy)
+  assert float(smallest) > SMALL.kl_bound
+  (ours, _, _), _, _ = actor_gradients(shift=3.0)
   jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7), ours, expected)
 
 
-def test_the_critic_learns_nothing_from_broken_steps(networks: REPPONetworks) -> None:
-  params = networks.init(jax.random.PRNGKey(0))
-  broken = batch(networks, valid=jnp.zeros(32))
-  grads = jax.grad(critic_loss, has_aux=True)(params.q, broken, networks, SMALL)[0]
-  assert all(float(jnp.abs(leaf).max()) == 0 for leaf in jax.tree.leaves(grads))
+@pytest.fixture(scope="module")
+def critic(networks: REPPONetworks, params: Any) -> Any:
+  """Gradients of the critic's loss on a batch, and what is logged."""
+  return jax.jit(lambda data: jax.grad(critic_loss, has_aux=True)(params.q, data, networks, SMALL))
 
 
-def test_the_auxiliary_loss_ends_with_the_episode(networks: REPPONetworks) -> None:
-  params = networks.init(jax.random.PRNGKey(0))
-  log = critic_loss(params.q, batch(networks, done=jnp.ones(32)), networks, SMALL)[1]
+def test_the_critic_learns_nothing_from_broken_steps(networks: REPPONetworks, critic: Any) -> None:
+  grads, _ = critic(batch(networks, valid=np.zeros(32, np.float32)))
+  assert all(float(np.abs(leaf).max()) == 0 for leaf in jax.tree.leaves(grads))
+
+
+def test_the_auxiliary_loss_ends_with_the_episode(networks: REPPONetworks, critic: Any) -> None:
+  _, log = critic(batch(networks, done=np.ones(32, np.float32)))
   assert float(log[2]) == 0
-  assert float(critic_loss(params.q, batch(networks), networks, SMALL)[1][2]) > 0
+  assert float(critic(batch(networks))[1][2]) > 0
 
 
 @pytest.mark.parametrize(
