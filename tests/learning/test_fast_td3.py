@@ -38,10 +38,11 @@ def params(networks: FastTD3Networks) -> tuple[Any, Any]:
 
 def batch(networks: FastTD3Networks, size: int = 16, **changes: Any) -> Transition:
   """Made by NumPy, which compiles nothing."""
-  draw = lambda i, *shape: np.random.default_rng(i).normal(size=(size, *shape)).astype(np.float32)
+  draw: Any = lambda i, *shape: np.random.default_rng(i).normal(size=(size, *shape)).astype(np.float32)
   obs = {key: draw(0, *shape) for key, shape in networks.obs_sizes.items()}
-  one = np.ones(size, np.float32)
-  return Transition(obs, obs, np.tanh(draw(1, networks.action_size)), draw(2), one, 0 * one).replace(**changes)
+  one: Any = np.ones(size, np.float32)
+  action: Any = np.tanh(draw(1, networks.action_size))
+  return Transition(obs, obs, action, draw(2), one, 0 * one).replace(**changes)
 
 
 @pytest.fixture(scope="module")

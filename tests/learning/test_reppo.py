@@ -42,10 +42,10 @@ def params(networks: REPPONetworks) -> Any:
 
 def batch(networks: REPPONetworks, size: int = 32, **changes: Any) -> Transition:
   """Made by NumPy, which compiles nothing."""
-  draw = lambda i, *shape: np.random.default_rng(i).normal(size=(size, *shape)).astype(np.float32)
+  draw: Any = lambda i, *shape: np.random.default_rng(i).normal(size=(size, *shape)).astype(np.float32)
   obs = {key: draw(0, *shape) for key, shape in networks.obs_sizes.items()}
-  zero = np.zeros(size, np.float32)
-  action = np.tanh(draw(1, networks.action_size))
+  zero: Any = np.zeros(size, np.float32)
+  action: Any = np.tanh(draw(1, networks.action_size))
   made = Transition(obs, obs, action, draw(2), zero, zero, zero + 1)
   made = made.replace(target=draw(3), next_embedding=draw(4, 16))
   return made.replace(**changes)
