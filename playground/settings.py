@@ -57,9 +57,19 @@ def settings(cls: type) -> dict[str, Setting]:
 
 def defaults(cls: type) -> dict[str, Plain]:
   """Returns the default values of a settings class as nested plain values; fields without one are left out."""
-  hints = get_type_hints(cls, include_extras=True)
+  hints = _hints(cls)
   values = {field.name: _default(field, hints[field.name]) for field in dataclasses.fields(cls)}
   return {name: value for name, value in values.items() if value is not dataclasses.MISSING}
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+  """The annotation of each field; one that only changes a default (`width: int = 64`) inherits limit and help."""
+  hints: dict[str, Any] = {}
+  for base in reversed(cls.__mro__):
+    own = get_type_hints(base, include_extras=True)
+    hints |= {name: hint for name, hint in own.items() if get_args(hints.get(name))[:1] != (hint,)}
+  return hints
 
 
 def build(cls: type[T], values: Section, key: str = "") -> T:
@@ -73,7 +83,8 @@ def build(cls: type[T], values: Section, key: str = "") -> T:
   Raises:
     UnknownNameError: the class, whose values are at `key`, has no such field.
   """
-  hints, known = get_type_hints(cls, include_extras=True), [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+  hints = _hints(cls)
+  known = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
   if key and (unknown := [name for name in values if name not in known]):
     raise UnknownNameError(f"{key}.{unknown[0]} does not exist.{nearest(unknown[0], known)}")
   fields = {name: values[name] for name in known if name in values}
@@ -112,7 +123,7 @@ def plain(value: Plain, finite: bool = False) -> Plain:
 
 
 def _settings(cls: type, prefix: str = "") -> Iterator[Setting]:
-  hints = get_type_hints(cls, include_extras=True)
+  hints = _hints(cls)
   for field in dataclasses.fields(cls):
     hint, name = hints[field.name], f"{prefix}{field.name}"
     metadata = get_args(hint)[1:] if get_origin(hint) is Annotated else ()

@@ -1,9 +1,10 @@
 """Limits of numbers: every key that takes one has them, and they allow what they say."""
 
+import dataclasses
 import inspect
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 import yaml
@@ -164,3 +165,19 @@ def test_a_sweeps_numbers_have_limits() -> None:
   for line in ("search=optuna search.seed=4294967296", "launcher.grace=-1", "search=optuna search.trials=1e30"):
     with pytest.raises(ConfigError, match="must be a"):
       compose_settings(line.split())
+
+
+def test_a_field_that_only_changes_a_default_inherits_limit_and_help() -> None:
+  @dataclasses.dataclass(frozen=True)
+  class Base:
+    width: Annotated[int, count(1, 64), "pixels"] = 8
+    height: Annotated[int, count(1, 64), "pixels"] = 8
+
+  @dataclasses.dataclass(frozen=True)
+  class Wide(Base):
+    width: int = 64
+    height: Annotated[int, count(0, 8), "rows"] = 4
+
+  width, height = settings(Wide).values()
+  assert (width.default, width.limit, width.help) == (64, count(1, 64), "pixels")
+  assert (height.default, height.limit, height.help) == (4, count(0, 8), "rows")

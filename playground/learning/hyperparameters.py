@@ -22,6 +22,10 @@ ELSEWHERE = {"rsl_rl_ppo": " RSL-RL trains through its own runner: docs/rsl-rl.m
 _MOST = 2**31 - 1  # transitions on a device: they are drawn by int32
 
 
+PolicyObsKey = Annotated[str, "observation group that the actor reads"]
+ValueObsKey = Annotated[str, "observation group that the critic reads; privileged_state for an asymmetric pair"]
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AgentConfig:
   """Hyperparameters that every algorithm has, for the trainer reads them. Subclasses are frozen dataclasses, too.
@@ -73,6 +77,26 @@ class AgentConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class OnPolicyConfig(AgentConfig):
+  """Hyperparameters of algorithms that learn from what the policy has just collected."""
+
+  unroll_length: Annotated[int, count(1, 100_000), "policy steps of one trajectory"] = 20
+  num_minibatches: Annotated[int, count(1, 100_000), "minibatches of an epoch"] = 32
+  num_updates_per_batch: Annotated[int, count(1, 100_000), "epochs over the collected trajectories"] = 4
+  learning_rate: Annotated[float, positive(1), "of Adam"] = 3e-4
+  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
+  gae_lambda: Annotated[float, SHARE, "decay of advantages (GAE), or of λ-returns, over later steps"] = 0.95
+  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
+  init_at_random_ep_len: Annotated[
+    bool, "whether a reset gives environments random ages, so that a batch holds all parts of episodes"
+  ] = False
+
+  @property
+  def random_episode_ages(self) -> bool:
+    return self.init_at_random_ep_len
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class OffPolicyConfig(AgentConfig):
   """Hyperparameters of algorithms that learn from a replay buffer."""
 
@@ -80,7 +104,7 @@ class OffPolicyConfig(AgentConfig):
   grad_updates_per_step: Annotated[int, count(1, 100_000), "gradient steps for each step of all environments"] = 8
   num_steps: Annotated[int, count(1, 100), "policy steps whose rewards a target holds before the critic's value"] = 1
   discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
-  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each gradient step"] = 0.005
+  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each critic update"] = 0.005
   reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
   min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 8192
   max_replay_size: Annotated[
@@ -142,9 +166,7 @@ class NetworkConfig:
   policy_obs_key: Annotated[
     str, 'observation group that the actor reads; "" reads images alone, where env.vision gives any'
   ] = "state"
-  value_obs_key: Annotated[str, "observation group that the critic reads; privileged_state for an asymmetric pair"] = (
-    "state"
-  )
+  value_obs_key: ValueObsKey = "state"
   estimated_obs_key: Annotated[str, 'observation group that the actor learns to estimate from images; "" is none'] = ""
   clip_observations: Annotated[
     float | None, positive(), "largest input of actor and critic, after normalisation; null: it is not clipped"
@@ -166,14 +188,12 @@ class SoftNetworkConfig:
   activation: Annotated[str, "of the hidden layers"] = "relu"
   policy_network_layer_norm: Annotated[bool, "whether the actor has layer normalisation"] = False
   q_network_layer_norm: Annotated[bool, "whether the critics have layer normalisation"] = True
-  policy_obs_key: Annotated[str, "observation group that the actor reads"] = "state"
-  value_obs_key: Annotated[str, "observation group that the critics read; privileged_state for an asymmetric pair"] = (
-    "state"
-  )
+  policy_obs_key: PolicyObsKey = "state"
+  value_obs_key: ValueObsKey = "state"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PPOConfig(AgentConfig):
+class PPOConfig(OnPolicyConfig):
   """Hyperparameters of PPO."""
 
   algorithm = "playground.learning.ppo:PPO"
@@ -187,16 +207,10 @@ class PPOConfig(AgentConfig):
     "reward_scaling",
   )
 
-  unroll_length: Annotated[int, count(1, 100_000), "policy steps of one trajectory"] = 20
   batch_size: Annotated[int, count(1, 2**24), "trajectories of one minibatch"] = 1024
-  num_minibatches: Annotated[int, count(1, 100_000), "minibatches of an epoch"] = 32
-  num_updates_per_batch: Annotated[int, count(1, 100_000), "epochs over the collected trajectories"] = 4
-  learning_rate: Annotated[float, positive(1), "of Adam"] = 3e-4
   max_grad_norm: Annotated[
     float | None, positive(), "gradients are scaled down to this global norm; null: they are not"
   ] = None
-  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
-  gae_lambda: Annotated[float, SHARE, "of generalised advantage estimation"] = 0.95
   entropy_cost: Annotated[float, at_least_0(), "factor on the entropy bonus"] = 1e-2
   clipping_epsilon: Annotated[float, positive(), "clip range of the ratio of probabilities"] = 0.3
   clipping_epsilon_value: Annotated[
@@ -226,13 +240,9 @@ class PPOConfig(AgentConfig):
   max_kl: Annotated[float | None, positive(), "KL divergence of an epoch after which no other follows; null: any"] = (
     None
   )
-  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
   normalize_advantage: Annotated[bool, "whether advantages are normalised in each minibatch"] = True
   bootstrap_on_timeout: Annotated[
     bool, "whether a time-out adds the discounted value of its state; else it is masked out"
-  ] = False
-  init_at_random_ep_len: Annotated[
-    bool, "whether a reset gives environments random ages, so that a batch holds all parts of episodes"
   ] = False
   mirror_augmentation: Annotated[
     bool, "whether every step is learned from its left-right mirror image, too (robots on legs)"
@@ -245,10 +255,6 @@ class PPOConfig(AgentConfig):
   @property
   def steps_per_update(self) -> int:
     return self.batch_size * self.num_minibatches * self.unroll_length
-
-  @property
-  def random_episode_ages(self) -> bool:
-    return self.init_at_random_ep_len
 
   def check(self, num_devices: int) -> None:
     if (self.batch_size * self.num_minibatches) % self.num_envs:
@@ -270,7 +276,7 @@ class SACConfig(OffPolicyConfig):
   num_timesteps: Annotated[int, count(1, 1e12), "environment steps in all, action repeats and prefill counted"] = (
     5_000_000
   )
-  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 128
+  num_envs: int = 128
   learning_rate: Annotated[float, positive(1), "of Adam, for actor and critics"] = 1e-3
   alpha_learning_rate: Annotated[
     float, positive(1), "of Adam, for the temperature, which holds the entropy at half a nat per action below zero"
@@ -286,31 +292,23 @@ class REPPONetworkConfig:
   q_hidden_layer_size: Annotated[int, count(1, 65536), "units of each of the critic's hidden layers"] = 512
   activation: Annotated[str, "of the actor's hidden layers"] = "swish"
   min_std: Annotated[float, positive(), "smallest standard deviation of actions before squashing"] = 0.1
-  policy_obs_key: Annotated[str, "observation group that the actor reads"] = "state"
-  value_obs_key: Annotated[str, "observation group that the critic reads; privileged_state for an asymmetric pair"] = (
-    "state"
-  )
+  policy_obs_key: PolicyObsKey = "state"
+  value_obs_key: ValueObsKey = "state"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class REPPOConfig(AgentConfig):
+class REPPOConfig(OnPolicyConfig):
   """Hyperparameters of REPPO; the defaults are the published ones for DM Control."""
 
   algorithm = "playground.learning.reppo:REPPO"
   traced = ("learning_rate", "discounting", "gae_lambda", "reward_scaling", "target_entropy")
 
-  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
-  deterministic_eval: Annotated[
-    bool, "whether eval/episode_reward is of the mode of the policy, and eval/sampled/... of samples; else the reverse"
-  ] = True
-  unroll_length: Annotated[int, count(1, 100_000), "policy steps of all environments in one training step"] = 128
-  num_minibatches: Annotated[int, count(1, 100_000), "minibatches of an epoch"] = 64
-  num_updates_per_batch: Annotated[int, count(1, 100_000), "epochs over the collected steps"] = 8
-  learning_rate: Annotated[float, positive(1), "of Adam, for actor and critic"] = 3e-4
+  num_envs: int = 1024
+  deterministic_eval: bool = True
+  unroll_length: int = 128
+  num_minibatches: int = 64
+  num_updates_per_batch: int = 8
   max_grad_norm: Annotated[float, positive(), "gradients of actor and critic are each scaled down to this norm"] = 0.5
-  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
-  gae_lambda: Annotated[float, SHARE, "of the critic's λ-returns"] = 0.95
-  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
   min_value: Annotated[float, Limit(), "lowest bin of the critic; the bins must hold the discounted return"] = 0.0
   max_value: Annotated[float, Limit(), "highest bin of the critic"] = 150.0
   num_bins: Annotated[int, count(2, 10_000), "bins of the critic's distribution"] = 151
@@ -321,18 +319,12 @@ class REPPOConfig(AgentConfig):
   target_entropy: Annotated[float, Limit(), "of the policy, nats an action"] = -0.5
   initial_temperature: Annotated[float, positive(), "factor on the entropy bonus at first"] = 0.01
   initial_kl_multiplier: Annotated[float, positive(), "factor on the KL divergence at first"] = 0.01
-  init_at_random_ep_len: Annotated[
-    bool, "whether a reset gives environments random ages, so that a batch holds all parts of episodes"
-  ] = True
+  init_at_random_ep_len: bool = True
   network: Annotated[REPPONetworkConfig, "actor and critic"] = dataclasses.field(default_factory=REPPONetworkConfig)
 
   @property
   def steps_per_update(self) -> int:
     return self.num_envs * self.unroll_length
-
-  @property
-  def random_episode_ages(self) -> bool:
-    return self.init_at_random_ep_len
 
   def check(self, num_devices: int) -> None:
     super().check(num_devices)
@@ -353,19 +345,17 @@ class C51NetworkConfig:
   activation: Annotated[str, "of the hidden layers"] = "relu"
   layer_norm: Annotated[bool, "whether the hidden layers, of actor and critics, are normalised"] = False
   policy_output_scale: Annotated[float, at_least_0(), "standard deviation of the actor's last weights at first"] = 0.01
-  policy_obs_key: Annotated[str, "observation group that the actor reads"] = "state"
-  value_obs_key: Annotated[str, "observation group that the critics read; privileged_state for an asymmetric pair"] = (
-    "state"
-  )
+  policy_obs_key: PolicyObsKey = "state"
+  value_obs_key: ValueObsKey = "state"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class C51Config(OffPolicyConfig):
   """Hyperparameters of algorithms with distributional critics and a replay buffer."""
 
-  num_envs: Annotated[int, count(1, 2**24), "environments in parallel, over all devices"] = 1024
+  num_envs: int = 1024
   policy_frequency: Annotated[int, count(1, 100_000), "the actor is updated with every n-th critic update"] = 2
-  min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 10_240
+  min_replay_size: int = 10_240
   learning_rate: Annotated[float, positive(1), "of AdamW, for actor and critics"] = 3e-4
   weight_decay: Annotated[float, at_least_0(), "of AdamW"] = 0.1
   min_value: Annotated[float, Limit(), "lowest atom of the critics; the atoms must hold the discounted return"] = -150.0
@@ -386,9 +376,9 @@ class FastTD3Config(C51Config):
   traced = ("learning_rate", "discounting", "tau", "reward_scaling")
 
   deterministic_eval: Annotated[bool, "has no effect: the policy is deterministic"] = True
-  batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 32_768
+  batch_size: int = 32_768
   grad_updates_per_step: Annotated[int, count(1, 100_000), "critic updates for each step of all environments"] = 2
-  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each critic update"] = 0.1
+  tau: float = 0.1
   min_noise: Annotated[
     float, at_least_0(), "standard deviation of the exploration noise in the quietest environment"
   ] = 0.001
@@ -409,10 +399,10 @@ class FastTD3Config(C51Config):
 class FastSACNetworkConfig(C51NetworkConfig):
   """Sizes and inputs of FastSAC's actor and twin critics."""
 
-  q_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of each critic's hidden layers"] = (768, 384, 192)
-  activation: Annotated[str, "of the hidden layers"] = "swish"
-  layer_norm: Annotated[bool, "whether the hidden layers, of actor and critics, are normalised"] = True
-  policy_output_scale: Annotated[float, at_least_0(), "standard deviation of the actor's last weights at first"] = 0.0
+  q_hidden_layer_sizes: Sequence[int] = (768, 384, 192)
+  activation: str = "swish"
+  layer_norm: bool = True
+  policy_output_scale: float = 0.0
   min_log_std: Annotated[
     float, Limit(), "logarithm of the smallest standard deviation of actions before squashing; the first is the middle"
   ] = -5.0
@@ -426,13 +416,11 @@ class FastSACConfig(C51Config):
   algorithm = "playground.learning.fast_sac:FastSAC"
   traced = ("learning_rate", "alpha_learning_rate", "discounting", "tau", "reward_scaling", "target_entropy")
 
-  deterministic_eval: Annotated[
-    bool, "whether eval/episode_reward is of the mode of the policy, and eval/sampled/... of samples; else the reverse"
-  ] = True
-  batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 8192
-  policy_frequency: Annotated[int, count(1, 100_000), "the actor is updated with every n-th critic update"] = 4
-  tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each critic update"] = 0.125
-  weight_decay: Annotated[float, at_least_0(), "of AdamW"] = 0.001
+  deterministic_eval: bool = True
+  batch_size: int = 8192
+  policy_frequency: int = 4
+  tau: float = 0.125
+  weight_decay: float = 0.001
   alpha_learning_rate: Annotated[float, positive(1), "of Adam, for the temperature"] = 3e-4
   initial_temperature: Annotated[float, positive(), "factor on the entropy bonus at first"] = 0.001
   target_entropy: Annotated[
