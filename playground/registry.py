@@ -94,7 +94,8 @@ def load(
 
 def build(env_config: TaskConfig) -> "Env":
   """Builds the task that a composed env section describes, with a camera if that says so (`env.vision`)."""
-  env = task_class(str(env_config.task))(env_config)
+  make = cast("Callable[[ConfigDict], Env]", task_class(str(env_config.task)))
+  env = make(env_config)
   if not sees(env_config):
     return env
   from playground.rendering.vision import Vision
@@ -102,7 +103,7 @@ def build(env_config: TaskConfig) -> "Env":
   return cast("Env", Vision(env))  # it is one in all but class
 
 
-def task_class(task: str) -> Callable[[ConfigDict], "Env"]:
+def task_class(task: str) -> "type[Env]":
   """Imports the task that `module:Class` names.
 
   Raises:
@@ -113,7 +114,7 @@ def task_class(task: str) -> Callable[[ConfigDict], "Env"]:
 
   if not (isinstance(found, type) and issubclass(found, Env)) or inspect.isabstract(found):
     raise ConfigError(f"env.task={task} is no task: it must be a class that completes playground.envs.base:Env.")
-  return cast("Callable[[ConfigDict], Env]", found)
+  return found
 
 
 class DomainRandomizer(Protocol):

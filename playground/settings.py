@@ -100,6 +100,11 @@ def nested(hint: object) -> type | None:
   return kind if dataclasses.is_dataclass(kind) and isinstance(kind, type) else None
 
 
+def below(key: str, values: Mapping[str, T]) -> dict[str, T]:
+  """Returns the values whose dotted keys begin with `key.`, by the rest of their keys."""
+  return {name.removeprefix(f"{key}."): value for name, value in values.items() if name.startswith(f"{key}.")}
+
+
 def plain(value: Plain, finite: bool = False) -> Plain:
   """Returns a value (dataclass, ConfigDict, tuple, path, array, …) as the dicts, lists and scalars of YAML and JSON.
 

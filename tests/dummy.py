@@ -42,6 +42,8 @@ class PointTask(Env):
   left (`nan_reset`).
   """
 
+  config: Any = None
+
   def __init__(
     self,
     episode_length: int = 20,

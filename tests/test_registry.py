@@ -253,8 +253,10 @@ def test_every_key_is_read_and_a_step_keeps_the_states_structure(overrides: list
   Randomizer(env.mj_model, recorder.get("events"))
   assert env.mj_model.ncam  # for env.vision
   env.physics = env.physics.without_dynamics()
-  state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-  after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+  settings = env.settings_of(config)  # as arguments: no branch in Python may depend on one
+  state = jax.eval_shape(lambda key, values: env.with_settings(values).reset(key), jax.random.PRNGKey(0), settings)
+  step = lambda state, action, values: env.with_settings(values).step(state, action)
+  after = jax.eval_shape(step, state, jnp.zeros(env.action_size), settings)
   assert jax.tree.structure(after) == jax.tree.structure(state)
   assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
   # The robot's description serves many tasks, none of which needs all of it; a task without a camera has no picture.

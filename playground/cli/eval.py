@@ -60,7 +60,7 @@ def evaluate_run(
   _, model = model_sampler(env, run, 1, count)(run.seed)
   act = lambda policy, obs, key: trained.trainer.act(policy, obs, key, deterministic or None)
   evaluate = make_evaluator(with_gait_metrics(env), act, count, hardware.mesh, 1 if film else 0)
-  scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model)
+  scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model, {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
 
   title = f"{trained.task}, {count} episodes, {checkpoint.step:,} steps trained"

@@ -113,7 +113,7 @@ def play(
   if opened.folder is not None:
     need_folder(opened.folder, str(opened.folder))
   evaluate = make_evaluator(with_gait_metrics(env), exported.act, episodes, make_mesh(1), 1 if film else 0)
-  scores, recording = evaluate({}, jax.random.PRNGKey(seed), {})
+  scores, recording = evaluate({}, jax.random.PRNGKey(seed), {}, {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
   origin = exported.contract["origin"]
   console.print(_table(exported.contract, episodes, scores))
@@ -189,7 +189,7 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
         f"{path} does not fit the task that its contract describes: the policy reads {theirs} and gives "
         f"{facts['action_size']} actions, the task has {ours} and takes {env.action_size}."
       )
-    jax.eval_shape(make_evaluator(env, exported.act, 1, make_mesh(1)), {}, jax.random.PRNGKey(0), {})
+    jax.eval_shape(make_evaluator(env, exported.act, 1, make_mesh(1)), {}, jax.random.PRNGKey(0), {}, {})
   except PlaygroundError:
     raise
   except Exception as error:  # of any kind: the file may say anything

@@ -32,7 +32,7 @@ class LocalConfig(LauncherConfig):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TogetherConfig(LocalConfig):
-  """One process for jobs that differ only in seeds, initial weights and numbers of the agent, else as `local`."""
+  """One process for jobs that differ only in seeds, initial weights and numbers, else as `local` (docs/sweeps.md)."""
 
   max_agents: Annotated[int, count(1), "most jobs in one process, which share its compiled program and memory"] = 16
 

@@ -4,16 +4,19 @@ import abc
 import copy
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import jax
 import mujoco
+import numpy as np
 from flax import struct
 
 from playground.envs.options import auto_impl, sees
 from playground.errors import ConfigError
+from playground.mdp.traced import traced_settings
 from playground.physics.backend import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.physics.warp_kernels import quiet_warp
+from playground.settings import below
 
 Observation = jax.Array | dict[str, jax.Array]
 PIXELS = "pixels/"  # what entries of an observation that are pictures begin with: [height, width, channels] uint8
@@ -57,6 +60,8 @@ class Env(abc.ABC):
   # Entries of `info` that belong to an episode: `AutoReset` sets them back to their values after reset. The others
   # (random key, command, gait, times of pushes) outlast an auto-reset.
   episode_info: ClassVar[tuple[str, ...]] = ()
+  # Attributes that manage terms, named as their part of the config: numbers there are settings of the programs.
+  managers: ClassVar[tuple[str, ...]] = ()
   # Whether `redraw` draws anything at the start of an episode that an auto-reset would not.
   redraws: bool = False
 
@@ -110,6 +115,25 @@ class Env(abc.ABC):
     """Returns `info` with what a new episode draws, for an auto-reset, which starts it from a stored state."""
     return info
 
+  @classmethod
+  def settings_of(cls, config: Any) -> dict[str, np.ndarray]:
+    """Returns the numbers of a config of this task that compiled programs take as arguments.
+
+    By dotted key, float32 arrays of shape [] or [numbers]. Tasks whose configs differ in nothing else have the same
+    programs. Raises ConfigError where one is invalid.
+    """
+    return traced_settings(config, cls.managers)
+
+  def with_settings(self, values: Mapping[str, jax.Array]) -> Self:
+    """Returns the same task with other values of settings (`settings_of`)."""
+    if not values:
+      return self
+    other = copy.copy(self)
+    vars(other).pop("jitted", None)  # which has our own values
+    for name in self.managers:
+      setattr(other, name, getattr(self, name).with_settings(below(name, values)))
+    return other
+
   @property
   def mjx_model(self) -> mjx.Model:
     """The model on the device, before any randomisation."""
@@ -134,14 +158,15 @@ class Env(abc.ABC):
 
   @functools.cached_property
   def jitted(self) -> tuple[Callable[..., State], Callable[..., State]]:
-    """`reset(key, fields)` and `step(state, action, fields)`, with randomised model fields by name ({} for none).
+    """`reset(key, fields, settings)` and `step(state, action, fields, settings)`.
 
-    Jitted inside whatever maps or scans over them: the task's Python is traced once, for all batch sizes.
+    `fields` are randomised model fields and `settings` values for `with_settings`, each by name, {} for none. Jitted
+    inside whatever maps or scans over them: the task's Python is traced once, for all batch sizes.
     """
     model: Callable[..., Any] = lambda fields: self.mjx_model.tree_replace(fields) if fields else None
-    reset = jax.jit(lambda key, fields: self.reset(key, model(fields)))
-    step = jax.jit(lambda state, action, fields: self.step(state, action, model(fields)))
-    return reset, step
+    reset = lambda key, fields, settings: self.with_settings(settings).reset(key, model(fields))
+    step = lambda state, action, fields, settings: self.with_settings(settings).step(state, action, model(fields))
+    return jax.jit(reset), jax.jit(step)
 
   @property
   def unwrapped(self) -> "Env":

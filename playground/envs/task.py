@@ -10,8 +10,14 @@ import mujoco
 from flax import struct
 
 from playground.envs.base import Env, State
-from playground.mdp import managers
 from playground.mdp.context import Robot, StepContext
+from playground.mdp.managers import (
+  CommandManager,
+  EventManager,
+  ObservationManager,
+  RewardManager,
+  TerminationManager,
+)
 from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
 from playground.randomization import Randomizer
 
@@ -49,6 +55,7 @@ class Task(Env):
 
   context: ClassVar[type[StepContext]] = StepContext
   episode_info = ("last_act", "last_last_act", "observation_buffers")
+  managers = ("rewards", "observations", "commands", "events")
 
   def __init__(self, config: Any, spec: mujoco.MjSpec):
     """Compiles the scene and binds the terms; raises ConfigError where a value is invalid or a name does not exist.
@@ -58,17 +65,17 @@ class Task(Env):
     self.spec = spec
     mj_model = spec.compile()
     self.prepare_model(mj_model, config)
-    self.rewards = managers.RewardManager(config.rewards)
-    self.terminations = managers.TerminationManager(config.terminations)
-    self.observations = managers.ObservationManager(
+    self.rewards = RewardManager(config.rewards)
+    self.terminations = TerminationManager(config.terminations)
+    self.observations = ObservationManager(
       config.observations, config.noise_level, config.observation_frames, config.observation_order
     )
     if any(not term.func.__module__.startswith("playground.") for term in self.terms()):
       self.derived = DERIVED_FIELDS  # another package's term may read any of them
     super().__init__(config, mj_model)
     self.robot = self.make_robot(mj_model, config)
-    self.commands = managers.CommandManager(config.get("commands"), self)
-    self.events = managers.EventManager(config.get("events"), self)
+    self.commands = CommandManager(config.get("commands"), self)
+    self.events = EventManager(config.get("events"), self)
     if isinstance(self.robot, Robot):
       for term in (*self.terms(), *self.events.resets):
         self.robot.check_names(term.params, f"{term.key}.params")

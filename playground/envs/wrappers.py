@@ -4,9 +4,10 @@ Each wrapper takes and returns batches of `State` (leading axis N). A randomised
 from field name ("geom_friction", dotted for nested ones) to values with leading axis N, or None for the task's own.
 """
 
+import copy
 import operator
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +43,12 @@ class Wrapper:
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
     return self.env.step(state, action, model)
 
+  def with_settings(self, values: Mapping[str, jax.Array]) -> Self:
+    """Returns the same with other values of the task's settings."""
+    other = copy.copy(self)
+    other.env = self.env.with_settings(values)
+    return other
+
   def __getattr__(self, name: str) -> Any:
     if name.startswith("__"):
       raise AttributeError(name)
@@ -60,14 +67,22 @@ class Vectorize(Wrapper):
     super().__init__(env)
     self._reset_one, self._step_one = env.jitted
     self._fields = fields or {}
+    self._settings: Mapping[str, jax.Array] = {}
     # On MJX's own backend nothing depends on the batch's size, and one trace serves all sizes.
     self._axis = WORLDS if env.impl == "warp" else None
 
+  def with_settings(self, values: Mapping[str, jax.Array]) -> Self:
+    other = copy.copy(self)
+    other._settings = values
+    return other
+
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
-    return jax.vmap(self._reset_one, axis_name=self._axis)(rng, dict(model or self._fields))
+    reset = jax.vmap(self._reset_one, (0, 0, None), axis_name=self._axis)
+    return reset(rng, dict(model or self._fields), dict(self._settings))
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    return jax.vmap(self._step_one, axis_name=self._axis)(state, action, dict(model or self._fields))
+    step = jax.vmap(self._step_one, (0, 0, 0, None), axis_name=self._axis)
+    return step(state, action, dict(model or self._fields), dict(self._settings))
 
 
 class FiniteGuard(Wrapper):

@@ -14,6 +14,7 @@ from playground.envs.wrappers import ModelFields, wrap_for_evaluation
 from playground.hardware.mesh import AXIS, jit_on_mesh
 from playground.learning.algorithm import Policy
 from playground.pytree import PyTree
+from playground.settings import below
 
 Act = Callable[[Policy, Observation, jax.Array], jax.Array]  # (policy, obs [N, ...], key) -> actions [N, action_size]
 Recording = dict[str, jax.Array]
@@ -40,7 +41,8 @@ def make_evaluator(
       from the same states on the same models and run side by side with those of `act`.
 
   Returns:
-    A function (policy, key, model fields [num_envs, ...]) -> (scalars, recording). The scalars: `episode_reward` and
+    A function (policy, key, model fields [num_envs, ...], settings) -> (scalars, recording). The settings are those of
+    `Trainer.settings`, {} for those that `env` was built with. The scalars: `episode_reward` and
     `episode_length` with their deviation over episodes (`_std`), the mean over episodes of every metric
     (`episode_<metric>`, see `wrappers.Episode`), and `nonfinite`, the number of episodes
     that ended in NaN. Those of another way to act are `<name>/<scalar>`, without its reward terms.
@@ -58,11 +60,14 @@ def make_evaluator(
     share = lambda i: jax.tree.map(lambda x: x[i * per_device : (i + 1) * per_device], obs)
     return jnp.concatenate([each(policy, share(i), key) for i, each in enumerate(acts)])
 
-  def evaluate(policy: Policy, key: jax.Array, model: ModelFields) -> tuple[dict[str, jax.Array], Recording]:
+  def evaluate(
+    policy: Policy, key: jax.Array, model: ModelFields, settings: Mapping[str, jax.Array]
+  ) -> tuple[dict[str, jax.Array], Recording]:
+    episodes = wrapped.with_settings(below("env", settings))
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
     reset_key, act_key = jax.random.split(key)
     model = repeat(model)
-    state = wrapped.reset(repeat(jax.random.split(reset_key, per_device)), model)
+    state = episodes.reset(repeat(jax.random.split(reset_key, per_device)), model)
     # Constants become of the type that may differ between devices, as in training: the task is traced once for both.
     always = jax.lax.axis_index(AXIS) >= 0
     state = jax.tree.map(lambda x: jax.lax.select(jax.lax.broadcast(always, x.shape), x, x), state)
@@ -86,7 +91,7 @@ def make_evaluator(
     def step(carry: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
       step, state, active, totals, recording = carry
       recording = jax.tree.map(lambda tape, x: tape.at[step].set(x), recording, view(state, active))
-      state = wrapped.step(state, act_all(policy, state.obs, jax.random.fold_in(act_key, step)), model)
+      state = episodes.step(state, act_all(policy, state.obs, jax.random.fold_in(act_key, step)), model)
       now = state.info["episode_metrics"] | {"nonfinite": totals["nonfinite"] + state.info["nonfinite"]}
       totals = {k: jnp.where(active > 0, now[k], total) for k, total in totals.items()}
       return step + 1, state, active * (1 - state.done), totals, recording
@@ -101,7 +106,7 @@ def make_evaluator(
       report |= {f"{name}/{k}": v for k, v in _scores(whole).items()}
     return report, recording
 
-  return jit_on_mesh(evaluate, mesh, (P(), P(), P(AXIS)), (P(), P(None, AXIS)))
+  return jit_on_mesh(evaluate, mesh, (P(), P(), P(AXIS), P()), (P(), P(None, AXIS)))
 
 
 def _scores(totals: Mapping[str, jax.Array]) -> dict[str, jax.Array]:

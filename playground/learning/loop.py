@@ -121,7 +121,7 @@ def compile_program(trainer: Trainer, evaluate: Wrapped, draw: Draw, policy: Pol
 
   Args:
     trainer: of the run.
-    evaluate: (policy, key, model fields) -> scores, jitted.
+    evaluate: (policy, key, model fields, settings) -> scores, jitted.
     draw: randomised model fields of the training and of the evaluation environments.
     policy: what a new run starts from, if it has any weights to start from.
   """
@@ -140,7 +140,7 @@ def compile_program(trainer: Trainer, evaluate: Wrapped, draw: Draw, policy: Pol
       others = [
         submit(init),
         submit(trainer.reset.trace(state, key, model)),
-        submit(evaluate.trace(trainer.policy(state), key, eval_model)),
+        submit(evaluate.trace(trainer.policy(state), key, eval_model, state.settings)),
         submit(trainer.copy.trace(state)),
       ]
       trace_s = time.perf_counter() - start
@@ -249,8 +249,8 @@ class Loop:
         done.captured = [first(i) for i in range(len(self.callbacks))]
     if event.evaluate:
       start = time.perf_counter()
-      policy = self.trainer.policy(state)
-      done.evaluated = self.functions.evaluate(policy, self._key(self._eval_key, event), self.functions.eval_model)
+      policy, key = self.trainer.policy(state), self._key(self._eval_key, event)
+      done.evaluated = self.functions.evaluate(policy, key, self.functions.eval_model, state.settings)
       jax.block_until_ready(done.evaluated)
       done.eval_s = time.perf_counter() - start
     if event.reset:

@@ -1,6 +1,6 @@
 """What is the same for all algorithms: the training state, its division over devices, training steps, checkpoints."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from playground.learning.hyperparameters import AgentConfig
 from playground.learning.replay import REPLAY_SPEC, Replay
 from playground.learning.rollout import Environments, NonfiniteCapture
 from playground.pytree import PyTree
+from playground.settings import below
 
 
 class TrainState(struct.PyTreeNode):
@@ -34,7 +35,7 @@ class TrainState(struct.PyTreeNode):
     key: of the next training step.
     env_state: a batch.
     capture: the first step with a number that is not finite.
-    settings: the values of `AgentConfig.traced`, each []; no checkpoint has them.
+    settings: of `trainer_settings`; no checkpoint has them.
   """
 
   algorithm: AlgorithmState
@@ -45,10 +46,24 @@ class TrainState(struct.PyTreeNode):
   settings: dict[str, jax.Array]
 
 
+Settings = Mapping[str, PyTree]
+
+
+def trainer_settings(config: AgentConfig, env: Settings) -> dict[str, PyTree]:
+  """Returns the numbers that the programs of a trainer take as arguments, float32 arrays by key.
+
+  Args:
+    config: of the algorithm, `AgentConfig.traced`; their keys are `agent.<name>`.
+    env: of the task (`Env.settings_of`); their keys become `env.<key>`.
+  """
+  agent = {f"agent.{name}": np.float32(getattr(config, name)) for name in config.traced}
+  return agent | {f"env.{key}": value for key, value in env.items()}
+
+
 class Trainer:
   """Trains one algorithm on one task over a mesh of devices.
 
-  It may train several agents at once, which differ in seeds, models, initial policies and traced settings. Then
+  It may train several agents at once, which differ in seeds, models, initial policies and settings. Then
   everything that the attributes' functions take and return has an axis of agents in front, but for the number of
   training steps; `join` and `agent` put it there and take it away.
 
@@ -70,7 +85,7 @@ class Trainer:
     config: AgentConfig,
     mesh: Mesh,
     network_precision: str | None = None,
-    agents: Sequence[AgentConfig] = (),
+    agents: Sequence[Settings] = (),
   ):
     """Builds the algorithm.
 
@@ -79,7 +94,7 @@ class Trainer:
       config: hyperparameters.
       mesh: devices, one axis named "data".
       network_precision: matrix-product precision of the networks.
-      agents: the hyperparameters of each of several agents, which differ from `config` in traced settings only.
+      agents: the settings of each of several agents (`trainer_settings`), in place of those of `config` and `env`.
 
     Raises:
       ConfigError: sizes that do not go together or do not divide over the devices, or networks that do not fit the
@@ -91,8 +106,8 @@ class Trainer:
     config.check(self.num_devices)
     self.algorithm = build_algorithm(env, config, network_precision)
     self.config, self.env = config, wrap_for_training(env)
-    values = [{name: np.float32(getattr(agent, name)) for name in config.traced} for agent in agents or [config]]
-    self.settings: dict[str, PyTree] = self.join(values)
+    own = trainer_settings(config, env.settings_of(env.config)) if not agents else {}
+    self.settings: dict[str, PyTree] = self.join([*agents] or [own])
     self.act, self.networks = self.algorithm.act, self.algorithm.networks
     self.steps_per_update = config.steps_per_update * env.action_repeat
     self._buffer = self.algorithm.replay
@@ -236,21 +251,21 @@ class Trainer:
     self, key: jax.Array, model: ModelFields, policy: Policy | None, settings: dict[str, jax.Array]
   ) -> TrainState:
     key, algorithm_key, env_key = jax.random.split(key, 3)
-    algorithm = self.algorithm.with_settings(settings).init(algorithm_key, policy)
-    env_state = self._reset_environments(env_key, model)
+    algorithm = self.algorithm.with_settings(below("agent", settings)).init(algorithm_key, policy)
+    env_state = self._reset_environments(env_key, model, settings)
     capture = NonfiniteCapture.empty(env_state, self.env.action_size, model)
     return _train_state(algorithm, key, env_state, capture, settings)
 
   def _reset(self, state: TrainState, key: jax.Array, model: ModelFields) -> TrainState:
-    fresh = self._reset_environments(key, model)
+    fresh = self._reset_environments(key, model, state.settings)
     kept = {k: v for k, v in state.env_state.info.items() if k == PRESERVE_INFO}
     return state.replace(env_state=fresh.replace(info=fresh.info | kept))
 
-  def _reset_environments(self, key: jax.Array, model: ModelFields) -> State:
+  def _reset_environments(self, key: jax.Array, model: ModelFields, settings: dict[str, jax.Array]) -> State:
     """Resets this device's share of the environments, with keys that no other device has."""
     device = jax.lax.axis_index(AXIS)
     reset_keys = jax.random.split(jax.random.fold_in(key, device), self.config.num_envs // self.num_devices)
-    state = self.env.reset(reset_keys, model)
+    state = self.env.with_settings(below("env", settings)).reset(reset_keys, model)
     if not self.config.random_episode_ages:
       return state
     age_key, steps = jax.random.fold_in(jax.random.split(key)[0], device), state.info["steps"]
@@ -273,8 +288,9 @@ class Trainer:
 
   def _train_step(self, state: TrainState, model: ModelFields) -> tuple[TrainState, Metrics]:
     key, shared = jax.random.split(state.key)
-    envs = Environments(state.env_state, state.capture, model, {}, self.env)
-    algorithm, envs, metrics = self.algorithm.with_settings(state.settings).train_step(
+    env = self.env.with_settings(below("env", state.settings))
+    envs = Environments(state.env_state, state.capture, model, {}, env)
+    algorithm, envs, metrics = self.algorithm.with_settings(below("agent", state.settings)).train_step(
       state.algorithm.replace(replay=state.replay), envs, jax.random.fold_in(shared, jax.lax.axis_index(AXIS))
     )
     metrics = {"learned": jnp.ones(())} | metrics | jax.lax.psum(envs.sums, AXIS)

@@ -43,7 +43,6 @@ class _VelocityCommand(abc.ABC):
     if any(a > b for a, b in zip(low, self.max, strict=True)):
       key = "env.commands.velocity.params"
       raise ConfigError(f"{key}.min={list(low)} must not be above {key}.max={list(self.max)}.")
-    self._range = jnp.array([low, self.max], jnp.float32)
     self._dt: float = env.dt
 
   def reset(self, key: jax.Array) -> Info:
@@ -64,7 +63,9 @@ class _VelocityCommand(abc.ABC):
     return jnp.round(seconds / self._dt).astype(jnp.int32)
 
   def _uniform(self, key: jax.Array) -> jax.Array:
-    return jax.random.uniform(key, (3,), minval=self._range[0], maxval=self._range[1])
+    high = jnp.array(self.max, jnp.float32)
+    low = -high if self.min is None else jnp.array(self.min, jnp.float32)
+    return jax.random.uniform(key, (3,), minval=low, maxval=high)
 
   def _first(self, key: jax.Array) -> jax.Array:
     return self._uniform(key)

@@ -285,7 +285,7 @@ class PushByForceRegularly(PushByForce):
 
   def times(self, interval_key: jax.Array, duration_key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Draws an episode's interval and its pushes' duration, both in control steps."""
-    steps = lambda key, reach: jax.random.randint(key, (), *(round(time / self.env.dt) for time in reach))
+    steps = lambda key, reach: jax.random.randint(key, (), *jnp.round(jnp.array(reach) / self.env.dt).astype(jnp.int32))
     return steps(interval_key, self.interval_s), steps(duration_key, self.duration_s)
 
   def step(self, data: PhysicsData, info: Info) -> tuple[PhysicsData, Info]:

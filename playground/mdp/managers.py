@@ -1,7 +1,8 @@
 """Managers: each computes the terms of one kind. `playground.envs.task.Task` calls them in every step."""
 
+import copy
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +15,15 @@ from playground.mdp.context import StepContext
 from playground.mdp.options import ObservationOptions, is_model_field
 from playground.mdp.terms import Term, bind, bind_one
 from playground.physics.backend import PhysicsData
+from playground.settings import below
 from playground.text import format_value
 
 ACTOR = "state"  # the observation group that the policy reads: noisy; the other groups are exact
 Info = dict[str, Any]
 _WHEN = ("command_above", "command_below")
 _NOISE = ("uniform", "gaussian", "same_as")
+Settings = Mapping[str, jax.Array]  # numbers in place of the config's, by key (`playground.mdp.traced`)
+_Generator = TypeVar("_Generator")
 
 
 class RewardManager:
@@ -36,6 +40,12 @@ class RewardManager:
         if not at_least_0().allows(value):
           raise ConfigError(f"{key}={format_value(value)} must be {at_least_0()}.")
     self.terms = [term for term in terms if term.options.weight != 0]
+
+  def with_settings(self, values: Settings) -> Self:
+    """Returns the same terms with other weights, `<term>.weight`."""
+    other = copy.copy(self)
+    other.terms = _terms_with(self.terms, values)
+    return other
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns weight * value of each term, by name, each shape []."""
@@ -98,6 +108,12 @@ class ObservationManager:
     if ACTOR not in self.groups:
       raise ConfigError(f"env.observations.{ACTOR} is missing or empty: the policy would read nothing.")
 
+  def with_settings(self, values: Settings) -> Self:
+    """Returns the same terms with other noise, `<group>.<term>.noise.<kind>`."""
+    other = copy.copy(self)
+    other.groups = {group: _terms_with(terms, below(group, values)) for group, terms in self.groups.items()}
+    return other
+
   def compute(self, c: StepContext, key: jax.Array, buffers: Info | None = None) -> tuple[Any, Info]:
     """Returns the observation and the buffers for the next step; `buffers` is None at the start of an episode.
 
@@ -134,7 +150,8 @@ class ObservationManager:
       value = value + drawn[str(size)]
     elif kind is not None:
       pattern = self._level * _per_element(f"{term.name}.noise.{kind}", size, value.size)
-      if pattern.any():  # a level of 0 computes nothing
+      # A level of 0 computes nothing, and a setting (an array of JAX) is none unless the level of all noise is.
+      if self._level and (isinstance(pattern, jax.Array) or pattern.any()):
         uniform = kind == "uniform"
         draw = jax.random.uniform(key, value.shape) * 2 - 1 if uniform else jax.random.normal(key, value.shape)
         drawn[term.name] = jnp.asarray(pattern) * draw
@@ -185,12 +202,12 @@ def _bind_observation(group: str, name: str, entry: Any, noisy: list[str]) -> Te
   return term
 
 
-def _per_element(name: str, numbers: Any, size: int) -> np.ndarray:
+def _per_element(name: str, numbers: Any, size: int) -> np.ndarray | jax.Array:
   """A number or a list of numbers for each of `size` elements; a shorter list repeats. Raises ConfigError."""
-  numbers = np.atleast_1d(numbers)
-  if size % numbers.size:
-    raise ConfigError(f"env.observations: {name} has {numbers.size} numbers, which do not divide its {size} elements.")
-  return np.tile(numbers, size // numbers.size)
+  count = np.size(numbers)
+  if size % count:
+    raise ConfigError(f"env.observations: {name} has {count} numbers, which do not divide its {size} elements.")
+  return (jnp if isinstance(numbers, jax.Array) else np).tile(numbers, size // count)
 
 
 def _is_actor(group: str, term: Term) -> bool:
@@ -224,6 +241,13 @@ class CommandManager:
     for generator in self._generators:
       generator.bind(env)
 
+  def with_settings(self, values: Settings) -> Self:
+    """Returns the same generators with other parameters, `<term>.params.<name>`."""
+    other = copy.copy(self)
+    pairs = zip(self.terms, self._generators, strict=True)
+    other._generators = [_generator_with(generator, below(term.name, values)) for term, generator in pairs]
+    return other
+
   def reset(self, key: jax.Array) -> Info:
     """Returns the entries of `info` that an episode starts with."""
     return _union(generator.reset(k) for generator, k in _with_keys(self._generators, key))
@@ -245,7 +269,7 @@ class EventManager:
   def __init__(self, section: Mapping[str, Any], env: Any):
     """Binds `env.events`; raises as `terms.bind`."""
     self.resets: list[Term] = []
-    self._intervals: list[Any] = []
+    self._intervals: dict[str, tuple[Any, bool]] = {}  # and whether it is enabled
     for name, entry in (section or {}).items():
       if entry is None or is_model_field(name, entry):
         continue
@@ -258,9 +282,18 @@ class EventManager:
       if term.options.mode == "interval":
         event = term.func(**term.params)
         event.bind(env)
-        self._intervals.append((event, term.options.enabled))
+        self._intervals[name] = event, term.options.enabled
       elif term.options.enabled:
         self.resets.append(term)
+
+  def with_settings(self, values: Settings) -> Self:
+    """Returns the same events with other parameters, `<term>.params.<name>`."""
+    other = copy.copy(self)
+    other.resets = _terms_with(self.resets, values)
+    other._intervals = {
+      name: (_generator_with(event, below(name, values)), enabled) for name, (event, enabled) in self._intervals.items()
+    }
+    return other
 
   def start(self, key: jax.Array, env: Any, initial: Any) -> Any:
     """Applies the reset events, in order, to the state that an episode starts with."""
@@ -270,16 +303,28 @@ class EventManager:
 
   def reset(self, key: jax.Array, model: Any) -> Info:
     """Returns the entries of `info` of the interval events that an episode starts with."""
-    return _union(event.reset(k, model) for (event, _), k in _with_keys(self._intervals, key))
+    return _union(event.reset(k, model) for (event, _), k in _with_keys([*self._intervals.values()], key))
 
   def step(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
     """Returns the physics after the interval events, and `info`."""
     changed = dict(info)
-    for event, enabled in self._intervals:
+    for event, enabled in self._intervals.values():
       if enabled:
         data, entries = event.step(data, changed)
         changed |= entries
     return data, changed
+
+
+def _terms_with(terms: Iterable[Term], values: Settings) -> list[Term]:
+  return [term.with_settings(below(term.name, values)) for term in terms]
+
+
+def _generator_with(generator: _Generator, values: Settings) -> _Generator:
+  """The same command or event with other values of its fields, what `bind` found included."""
+  other = copy.copy(generator)
+  for name, value in below("params", values).items():
+    setattr(other, name, value)
+  return other
 
 
 def _with_keys(terms: list[Any], key: jax.Array) -> Iterable[tuple[Any, jax.Array]]:

@@ -30,6 +30,7 @@ from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.limits import Limit
 from playground.mdp.moved import renamed_function
 from playground.mdp.options import OPTIONS, keys
+from playground.settings import below
 from playground.text import format_value
 from playground.trust import trusted_object
 
@@ -70,6 +71,13 @@ class Term(NamedTuple):
 
   def __call__(self, *args: Any) -> Any:
     return self.func(*args, **self.params)
+
+  def with_settings(self, values: Mapping[str, Any]) -> "Term":
+    """Returns the same term with other numbers: `weight`, `noise.<kind>`, `params.<name>`."""
+    options = {name: value for name, value in values.items() if "." not in name}
+    noise = below("noise", values)
+    options |= {"noise": noise} if noise else {}
+    return self._replace(params=self.params | below("params", values), options=self.options._replace(**options))
 
 
 @functools.cache
@@ -172,7 +180,7 @@ def check_params(func: Callable[..., Any], given: Any, key: str, skip: int = 1) 
     if name not in arguments:
       has = f"takes {', '.join(arguments)}" if arguments else "takes no parameters"
       raise UnknownNameError(f"{key}.{name} does not exist: {func.__name__} {has}.{nearest(name, arguments)}")
-    params[name] = _checked(f"{key}.{name}", value, _annotation(func, arguments[name]))
+    params[name] = _checked(f"{key}.{name}", value, annotation(func, arguments[name]))
   for name, argument in arguments.items():
     if argument.default is inspect.Parameter.empty and name not in params:
       raise ConfigError(f"{key}.{name} is missing: {func.__name__} needs it.")
@@ -186,7 +194,7 @@ def plain(value: Any) -> Any:
   return tuple(plain(entry) for entry in value) if isinstance(value, list | tuple) else value
 
 
-def _annotation(func: Callable[..., Any], argument: inspect.Parameter) -> Any:
+def annotation(func: Callable[..., Any], argument: inspect.Parameter) -> Any:
   """A parameter's annotation; one that is text (`from __future__ import annotations`) is looked up."""
   if not isinstance(argument.annotation, str):
     return argument.annotation
@@ -195,7 +203,7 @@ def _annotation(func: Callable[..., Any], argument: inspect.Parameter) -> Any:
 
 def _checked(key: str, value: Any, hint: Any) -> Any:
   """Returns a value, whole numbers as floats where the annotation says float; raises ConfigError if it must not be."""
-  kinds = [kind for kind in (typing.get_args(hint) if _is_union(hint) else (hint,)) if kind is not type(None)]
+  kinds = [kind for kind in alternatives(hint) if kind is not type(None)]
   if typing.get_origin(hint) is typing.Literal and value not in (known := typing.get_args(hint)):
     raise UnknownNameError(f"{key}={value!r} is unknown: choose from {', '.join(known)}.{nearest(str(value), known)}")
   problems = [_problem(value, kind) for kind in kinds]
@@ -204,8 +212,10 @@ def _checked(key: str, value: Any, hint: Any) -> Any:
   return _as_float(value) if any("float" in str(kind) for kind in kinds) else value
 
 
-def _is_union(hint: Any) -> bool:
-  return isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+def alternatives(hint: Any) -> tuple[Any, ...]:
+  """The types that a value of an annotation may have."""
+  is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+  return typing.get_args(hint) if is_union else (hint,)
 
 
 def _as_float(value: Any) -> Any:

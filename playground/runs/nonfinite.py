@@ -66,7 +66,7 @@ class Dump:
 
   def replay(self, env: Env) -> State:
     """Takes the step again, on this machine's backend."""
-    return env.jitted[1](self.state(env), self.action, self.model)
+    return env.jitted[1](self.state(env), self.action, self.model, {})
 
 
 def nonfinite_fields(tree: PyTree) -> list[str]:

@@ -40,7 +40,7 @@ def train_together(configs: Sequence["RunConfig"]) -> int:
     PlaygroundError: what keeps all of them from training.
   """
   if len({program_of(config) for config in configs}) > 1 or program_of(configs[0]) is None:
-    raise ConfigError("These runs cannot train together: they differ in more than seeds and numbers of the agent.")
+    raise ConfigError("These runs cannot train together: they differ in more than seeds and numbers of agent and task.")
   with Interrupts() as interrupts:
     try:
       hardware, groups = setup(configs[0].hardware), _by_step(configs)

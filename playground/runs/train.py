@@ -28,7 +28,7 @@ from playground.learning.loop import (
   longest_stretch,
   schedule,
 )
-from playground.learning.trainer import Trainer, TrainState
+from playground.learning.trainer import Trainer, TrainState, trainer_settings
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
 from playground.rendering.visuals import drawn_model
@@ -139,13 +139,13 @@ def prepare(
   """
   config, plan = configs[0], plans[0]
   preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
-  agents = [each.agent for each in configs]
-  agent = agents[0]
+  agent = config.agent
   agent.check(1 if together else hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
   need_camera(drawn, config.video.camera, "video.camera")
-  trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision, agents if together else ())
+  agents = [trainer_settings(each.agent, env.settings_of(each.env)) for each in configs] if together else ()
+  trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision, agents)
   samplers = [model_sampler(env, each, agent.num_envs, agent.num_eval_envs) for each in configs]
 
   def draw() -> tuple[ModelFields, ModelFields]:

@@ -60,7 +60,7 @@ def untraced(monkeypatch: pytest.MonkeyPatch) -> None:
   def traced(*args: Any) -> Any:
     evaluate = make(*args)
     zeros = lambda shapes: jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-    return lambda policy, key, model: zeros(jax.eval_shape(evaluate, policy, key, model))
+    return lambda *args: zeros(jax.eval_shape(evaluate, *args))
 
   composed = functools.cache(lambda *words: compose(words))
   monkeypatch.setattr(play, "make_evaluator", traced)

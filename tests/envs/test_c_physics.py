@@ -45,10 +45,10 @@ def test_one_control_step_is_that_of_mjx(name: str) -> None:
 def test_a_batch_is_its_environments_one_after_another() -> None:
   env = on_c("CartpoleBalance")
   keys, actions = jax.random.split(jax.random.PRNGKey(1), 4), jnp.linspace(-1, 1, 4)[:, None]
-  batch = jax.vmap(env.jitted[0], (0, None))(keys, {})
-  batch = jax.vmap(env.jitted[1], (0, 0, None))(batch, actions, {})
+  batch = jax.vmap(env.jitted[0], (0, None, None))(keys, {}, {})
+  batch = jax.vmap(env.jitted[1], (0, 0, None, None))(batch, actions, {}, {})
   for i in range(4):
-    one = env.jitted[1](env.jitted[0](keys[i], {}), actions[i], {})
+    one = env.jitted[1](env.jitted[0](keys[i], {}, {}), actions[i], {}, {})
     np.testing.assert_array_equal(batch.data.qpos[i], one.data.qpos)
     np.testing.assert_array_equal(jnp.asarray(batch.obs)[i], one.obs)
 
@@ -63,7 +63,7 @@ def test_an_unstable_simulation_shows_its_numbers() -> None:
 def test_a_randomised_model_is_refused() -> None:
   env = on_c("CartpoleBalance")
   with pytest.raises(ConfigError, match="nothing of it can be randomised"):
-    jax.eval_shape(env.jitted[0], jax.random.PRNGKey(0), {"dof_damping": jnp.ones(2)})
+    jax.eval_shape(env.jitted[0], jax.random.PRNGKey(0), {"dof_damping": jnp.ones(2)}, {})
 
 
 @pytest.mark.slow

@@ -129,6 +129,24 @@ def test_fields_of_the_model_may_be_drawn_in_each_episode(monkeypatch: pytest.Mo
   np.testing.assert_allclose(whole, 12.743448 - nominal[trunk] + first, rtol=1e-5)  # a push knows it
 
 
+def test_settings_stand_for_a_tasks_own_numbers() -> None:
+  pushed = load_task(TASK, {"events.push.enabled": True})
+  changes = {
+    "rewards.lin_vel_z_l2.weight": -7.0,
+    "observations.state.gyro.noise.uniform": 0.9,
+    "commands.velocity.params": {"max": [0.2, 0.1, 0.3], "resample_s": 0.1},
+    "events.push.params.interval_s": [8.0, 9.0],
+  }
+  other = load_task(TASK, changes | {"events.push.enabled": True})
+  same, state = pushed.with_settings(pushed.settings_of(other.config)), recorded(TASK)
+  for ours, theirs in zip(*(jax.tree.leaves(evaluate(env, state)) for env in (same, other)), strict=True):
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+  first = lambda env: env.commands.reset(KEYS[0]) | env.events.reset(KEYS[0], env.mjx_model)
+  for name, value in first(same).items():
+    np.testing.assert_allclose(value, first(other)[name], rtol=1e-5, err_msg=name)
+  assert first(same)["push_interval"] >= 400 > first(pushed)["push_interval"]
+
+
 def test_metrics_are_the_weighted_terms(pushed: Any) -> None:
   state = recorded(TASK)
   rewards, endings = pushed.config.rewards, pushed.config.terminations

@@ -40,7 +40,7 @@ for name in NAMES:
   count = state.algorithm.normalizer.count
   assert int(count.hi) == 0 and int(count.lo) == 30 * trainer.steps_per_update
   evaluate = make_evaluator(PointTask(), trainer.act, 16, trainer.mesh, 1)
-  scores, recording = evaluate(trainer.policy(state), jax.random.PRNGKey(1), {})
+  scores, recording = evaluate(trainer.policy(state), jax.random.PRNGKey(1), {}, trainer.settings)
   assert float(scores["episode_length"]) == 20 and recording["qpos"].shape == (20, 2, 2)
   assert float(scores["episode_reward"]) > -12 or name != "ppo", scores["episode_reward"]
 
@@ -53,12 +53,13 @@ AGENTS = """
 import dataclasses
 import jax, numpy as np
 from playground.hardware.mesh import make_mesh
-from playground.learning.trainer import Trainer
+from playground.learning.trainer import Trainer, trainer_settings
 from tests.dummy import SMALL_PPO, PointTask
 
 for count, devices in ((2, 1), (3, 2)):  # one agent on each device; all of them on both
   agents = [dataclasses.replace(SMALL_PPO, learning_rate=(i + 1) * 1e-3) for i in range(count)]
-  trainer = Trainer(PointTask(), SMALL_PPO, make_mesh(2), agents=agents)
+  settings = [trainer_settings(agent, {}) for agent in agents]
+  trainer = Trainer(PointTask(), SMALL_PPO, make_mesh(2), agents=settings)
   assert trainer.num_devices == devices
   state = trainer.init(np.stack([jax.random.PRNGKey(i) for i in range(count)]), {}, None, trainer.settings)
   state, _ = trainer.train(state, {}, np.int32(10))

@@ -42,7 +42,7 @@ def test_metrics_of_an_episode(action_repeat: int) -> None:
   act = lambda policy, obs, key: jnp.zeros((len(obs["state"]), 2))
   evaluate = make_evaluator(env, act, 8, make_mesh(1), 1)
   key = jax.random.PRNGKey(0)
-  scores, recording = evaluate(jnp.zeros(()), key, {})
+  scores, recording = evaluate(jnp.zeros(()), key, {}, {})
 
   steps = []
   reset_key = jax.random.split(jax.random.fold_in(key, 0))[0]
@@ -67,9 +67,9 @@ def test_both_ways_to_act_run_side_by_side_from_the_same_states() -> None:
   env, key = PointTask(), jax.random.PRNGKey(1)
   stay = lambda policy, obs, key: jnp.zeros((len(obs["state"]), 2))
   home = lambda policy, obs, key: -obs["state"]
-  both, recording = make_evaluator(env, stay, 8, make_mesh(1), 2, {"mode": home})(jnp.zeros(()), key, {})
+  both, recording = make_evaluator(env, stay, 8, make_mesh(1), 2, {"mode": home})(jnp.zeros(()), key, {}, {})
   for act, prefix in ((stay, ""), (home, "mode/")):
-    alone, recorded = make_evaluator(env, act, 8, make_mesh(1), 2)(jnp.zeros(()), key, {})
+    alone, recorded = make_evaluator(env, act, 8, make_mesh(1), 2)(jnp.zeros(()), key, {}, {})
     of_it = {name.removeprefix(prefix): x for name, x in both.items() if ("mode/" in name) == bool(prefix)}
     assert set(of_it) == set(alone)
     for name, value in alone.items():
@@ -102,7 +102,7 @@ class Seeing(Counting):
 def test_what_is_seen_is_recorded() -> None:
   env = Seeing(episode_length=20)
   act = lambda policy, obs, key: jnp.zeros((len(obs["state"]), 2))
-  _, recording = make_evaluator(env, act, 4, make_mesh(1), 2)(jnp.zeros(()), jax.random.PRNGKey(0), {})
+  _, recording = make_evaluator(env, act, 4, make_mesh(1), 2)(jnp.zeros(()), jax.random.PRNGKey(0), {}, {})
   tape = episodes_of(recording, 1)
   assert tape["seen"].shape == (len(tape["qpos"]), 3, 2, 1) and tape["seen"].dtype == np.uint8
   np.testing.assert_array_equal(tape["seen"][:, 0, 0, 0], np.arange(len(tape["qpos"])))

@@ -3,8 +3,9 @@
 import dataclasses
 import subprocess
 import sys
+from collections.abc import Mapping
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,10 @@ from playground.envs.wrappers import PRESERVE_INFO
 from playground.hardware.mesh import make_mesh
 from playground.learning.evaluation import make_evaluator
 from playground.learning.loop import CompiledFunctions, Loop, compile_program, schedule
-from playground.learning.trainer import Trainer
+from playground.learning.trainer import Trainer, trainer_settings
+from playground.mdp.context import StepContext
+from playground.mdp.managers import RewardManager
+from playground.physics.backend import PhysicsData
 from tests.dummy import (
   SMALL,
   Config,
@@ -176,19 +180,42 @@ def test_no_torch_is_imported() -> None:
   subprocess.run([sys.executable, "-c", code], check=True)
 
 
+class Weighted(PointTask):
+  """A point whose reward has a term with a weight."""
+
+  managers = ("rewards",)
+
+  def __init__(self, weight: float):
+    super().__init__()
+    self.config = {"rewards": {"action_l2": {"weight": weight}}}
+    self.rewards = RewardManager(self.config["rewards"])
+
+  def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
+    state, c = super().post_step(data, info, action), StepContext(cast(Any, self), data, info, action)
+    return state.replace(reward=sum(self.rewards.compute(c).values(), state.reward))
+
+
 @two_of_them
 def test_agents_of_one_program_end_as_they_do_alone(config: Config) -> None:
   faster = dataclasses.replace(config, learning_rate=2 * config.learning_rate)
-  agents = [(config, 3), (faster, 3), (config, 4)]
+  agents = [(config, 0.1, 3), (faster, 0.1, 3), (config, 0.1, 4), (config, -0.5, 3)]
   alone, callbacks = [Recorder() for _ in agents], [Recorder() for _ in agents]
-  expected = [run(each, recorder, seed=seed)[0] for (each, seed), recorder in zip(agents, alone, strict=True)]
+  env, marks = Weighted(0.1), schedule(12, 3, 1, 5)
+  settings = [trainer_settings(each, env.settings_of(Weighted(weight).config)) for each, weight, _ in agents]
 
-  env = point_trainer(config).env.unwrapped
-  trainer = Trainer(env, config, make_mesh(1), agents=[each for each, _ in agents])
-  others = trainer.algorithm.other_acts()
-  evaluate = make_evaluator(env, trainer.act, config.num_eval_envs, trainer.mesh, 1, others)
-  program = compile_program(trainer, evaluate, lambda: ({}, {}))
-  loop = Loop(trainer, program, schedule(12, 3, 1, 5), [seed for _, seed in agents], callbacks)
+  def compiled(trainer: Trainer) -> CompiledFunctions:
+    evaluate = make_evaluator(env, trainer.act, config.num_eval_envs, trainer.mesh, 1, trainer.algorithm.other_acts())
+    return compile_program(trainer, evaluate, lambda: ({}, {}))
+
+  expected, single = [], Trainer(env, config, make_mesh(1))
+  program = compiled(single)  # of the first agent: the settings of the others are other arguments
+  assert single.settings == settings[0]
+  for (_, _, seed), single.settings, recorder in zip(agents, settings, alone, strict=True):
+    loop = Loop(single, program, marks, [seed], [recorder])
+    expected.append(loop.run(loop.init())[0])
+
+  trainer = Trainer(env, config, make_mesh(1), agents=settings)
+  loop = Loop(trainer, compiled(trainer), marks, [seed for _, _, seed in agents], callbacks)
   state, completed = loop.run(loop.init())
   assert completed
   for i, (theirs, recorder) in enumerate(zip(expected, alone, strict=True)):
@@ -198,5 +225,6 @@ def test_agents_of_one_program_end_as_they_do_alone(config: Config) -> None:
     assert [step for step, _ in callbacks[i].rows] == [step for step, _ in recorder.rows]
     assert callbacks[i].rows[-1][1].keys() == recorder.rows[-1][1].keys()
     assert [update for update, _ in callbacks[i].saved] == [update for update, _ in recorder.saved]
-  first, faster = (numbers(trainer.policy(trainer.agent(state, i)))[0] for i in (0, 1))
-  assert not np.array_equal(first, faster)
+    if i:
+      first, other = (numbers(trainer.policy(trainer.agent(state, j)))[0] for j in (0, i))
+      assert not np.array_equal(first, other)

@@ -19,8 +19,9 @@ from playground.runs.train import train
 from tests.runs.helpers import TASK, resume
 
 STEPS = 2000
-BUDGET = [*TASK, f"agent.num_timesteps={STEPS}", "agent.num_evals=3"]
-AGENTS = {"a": ["seed=1"], "b": ["seed=2"], "c": ["seed=1", "agent.learning_rate=3e-3"]}
+EFFORT = "env.rewards.action_l2.weight"
+BUDGET = [*TASK, f"agent.num_timesteps={STEPS}", "agent.num_evals=3", f"{EFFORT}=-0.1"]
+AGENTS = {"a": ["seed=1"], "b": ["seed=2"], "c": ["seed=1", "agent.learning_rate=3e-3", f"{EFFORT}=-0.5"]}
 
 
 def configs(folder: Path) -> list[RunConfig]:
@@ -102,6 +103,9 @@ def test_what_ends_one_lets_the_others_go_on(
     ("seed=7", True),
     ("agent.learning_rate=1e-5", True),
     ("agent.discounting=0.9", True),
+    (f"{EFFORT}=-0.3", True),
+    (f"{EFFORT}=0", False),
+    ("env.rewards.action_rate_l2.weight=-0.3", False),
     ("run_dir=elsewhere", True),
     ("agent.unroll_length=7", False),
     ("agent.num_timesteps=500", False),
@@ -110,6 +114,25 @@ def test_what_ends_one_lets_the_others_go_on(
 )
 def test_what_a_program_depends_on(override: str, same: bool) -> None:
   assert (program_of(compose([*BUDGET, override])) == program_of(compose(BUDGET))) == same
+
+
+@pytest.mark.parametrize(
+  ("override", "same"),
+  [
+    ("env.rewards.lin_vel_z_l2.weight=-2", True),
+    ("env.commands.velocity.params.max=[1.0,0.5,0.7]", True),
+    ("env.events.push.params.interval_s=[2.0,4.0]", True),
+    ("env.events.floor_friction.params.range=[0.5,0.6]", True),  # drawn outside the program
+    ("env.observations.state.gyro.noise.uniform=0.1", True),
+    ("env.observations.state.gyro.noise.uniform=0", False),
+    ("env.events.push.enabled=true", False),
+    ("env.rewards.feet_air_time.params.threshold=0.2", False),
+    ("env.noise_level=0.5", False),
+  ],
+)
+def test_what_the_program_of_a_robot_depends_on(override: str, same: bool) -> None:
+  task = ["env=Go1JoystickFlatTerrain", "tuned=null", "randomization=go1", "agent.num_timesteps=1000"]
+  assert (program_of(compose([*task, override])) == program_of(compose(task))) == same
 
 
 @pytest.mark.parametrize("override", ["tracking=wandb", "profile.enable=true", "hardware=multi_node"])

@@ -38,7 +38,7 @@ def measure(
   with used_memory(facts, seeds[0]) if watch_memory else nullcontext():
     subject = Subject.build(facts, task, agent, overrides)
     trainer, conditions = subject.trainer, facts["conditions"]
-    no_evaluation = jax.jit(lambda policy, key, model: ())
+    no_evaluation = jax.jit(lambda policy, key, model, settings: ())
     program = compile_program(trainer, no_evaluation, partial(subject.draw, seeds[0]))
     facts.emit("trace_s", program.trace_s, "s", seed=seeds[0])
     facts.emit("compile_s", program.compile_s, "s", seed=seeds[0])

@@ -33,6 +33,7 @@ class SuiteTask(Env):
 
   domain: ClassVar[str]
   episode_info = ("last_act", "last_last_act")
+  managers = ("rewards",)
   robot = None
 
   def __init__(self, config: Any):
