@@ -75,6 +75,11 @@ def count(low: int, high: float = 1e6) -> Limit:
   return Limit(low, high, whole=True)
 
 
+def counts(low: int, high: float = 1e6) -> Limit:
+  """A list of whole numbers, from `low` on."""
+  return Limit(low, high, whole=True, form="list")
+
+
 def span(low: float = 0) -> Limit:
   """A range [from, to]."""
   return Limit(low, form="list", length=2, rising=True)

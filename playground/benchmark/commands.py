@@ -3,8 +3,8 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from playground.benchmark.arguments import option
 from playground.benchmark.jobs import Measurement, probe, run_jobs
 from playground.benchmark.options import TRAINING, Measuring, OfRuns, OfTasks
 from playground.benchmark.peer import PEERS, check_peer
@@ -12,6 +12,7 @@ from playground.benchmark.schema import Table
 from playground.config import compose
 from playground.errors import ConfigError
 from playground.files import need_folder
+from playground.limits import count, counts
 from playground.paper import tasks_of
 
 RESULTS = Path("results/benchmarks")
@@ -32,8 +33,8 @@ COMPARED_CONDITIONS = [f"env.ctrl_dt={1 / 60}", f"env.sim_dt={1 / 120}", "env.ep
 class Throughput(OfTasks):
   """Training steps/s of each task at the paper's hyperparameters on one device, compile and start time, memory."""
 
-  agent: str = option("ppo_paper", "ppo_paper, ppo or sac")
-  seeds: int = option(5, "trainings timed, seeds 1 to this")
+  agent: str = "ppo_paper"
+  seeds: Annotated[int, count(1), "trainings timed, seeds 1 to this"] = 5
 
   name = "throughput"
 
@@ -60,15 +61,15 @@ class Startup(OfTasks):
 class Scaling(OfTasks):
   """Environment and training steps/s and memory against the number of environments, one device."""
 
-  num_envs: tuple[int, ...] = option((256, 1024, 4096, 16384), "numbers of environments")
+  num_envs: Annotated[Sequence[int], counts(1), "numbers of environments"] = (256, 1024, 4096, 16384)
 
   name = "scaling"
 
   def jobs(self, devices: int) -> list[Measurement]:
     jobs = []
     for task in self.chosen():
-      for count in self.num_envs:
-        setting = self.with_envs(task, count)
+      for envs in self.num_envs:
+        setting = self.with_envs(task, envs)
         both = self.job("environment", task, setting), self.job("training", task, setting, seeds=[1])
         jobs += map(self.on_one_device, both)
     return jobs
@@ -90,9 +91,9 @@ class Breakdown(OfTasks):
 class Pixels(OfTasks):
   """Time of a step from pixels, as in the paper: state alone, with pictures, with inference, with training."""
 
-  sizes: tuple[int, ...] = option((32, 64, 128, 256), "sides of the pictures")
-  num_envs: tuple[int, ...] = option((1024,), "numbers of environments")
-  compared: bool = option(False, "up to pictures in steps of 1/60 s, as the paper compares simulators; for Cartpole")
+  sizes: Annotated[Sequence[int], counts(1), "sides of the pictures"] = (32, 64, 128, 256)
+  num_envs: Annotated[Sequence[int], counts(1), "numbers of environments"] = (1024,)
+  compared: Annotated[bool, "up to pictures in steps of 1/60 s, as the paper compares simulators; for Cartpole"] = False
 
   name = "pixels"
 
@@ -117,9 +118,9 @@ class Pixels(OfTasks):
     for task in self.chosen():
       conditions = COMPARED_CONDITIONS if self.compared else PIXEL_CONDITIONS.get(task, [])
       for size in self.sizes:
-        for count in self.num_envs:
+        for envs in self.num_envs:
           seen = [f"env.vision.width={size}", f"env.vision.height={size}"]
-          setting = [*conditions, *seen, *self.with_envs(task, count)]
+          setting = [*conditions, *seen, *self.with_envs(task, envs)]
           last = {"quantity": "seconds_per_step", "setting": " ".join((*self.overrides, *setting, f"part={until}"))}
           job = self.job("breakdown", task, setting, watch_memory=self.workers == 1, until=until)
           jobs.append(dataclasses.replace(self.on_one_device(job), last=last))
@@ -130,10 +131,12 @@ class Pixels(OfTasks):
 class Topology(OfRuns):
   """Training steps/s, and whole runs, on 1, 2, 4, ... devices, with hyperparameters as they are and scaled."""
 
-  devices: tuple[int, ...] = option((), "numbers of devices; none is 1, 2, 4, ... as many as there are")
-  hyperparameters: tuple[str, ...] = option(("fixed", "scaled"), "scaled: environments and batch times the devices")
-  seeds: int = option(3, "trainings timed, and whole runs of each, seeds 1 to this")
-  num_timesteps: int | None = option(None, "control steps of a whole run on each, after the rates; null is rates alone")
+  devices: Annotated[Sequence[int], counts(1), "numbers of devices; none is 1, 2, 4, ... as many as there are"] = ()
+  hyperparameters: Annotated[Sequence[str], "scaled: environments and batch times the devices"] = ("fixed", "scaled")
+  seeds: Annotated[int, count(1), "trainings timed, and whole runs of each, seeds 1 to this"] = 3
+  num_timesteps: Annotated[
+    int | None, count(1, 1e12), "control steps of a whole run on each, after the rates; null is rates alone"
+  ] = None
 
   name = "topology"
 
@@ -146,15 +149,15 @@ class Topology(OfRuns):
         raise ConfigError(f"hyperparameters={kind} must be fixed, scaled or both.")
 
   def jobs(self, devices: int) -> list[Measurement]:
-    counts = self.devices or [2**i for i in range(devices.bit_length())]
-    if max(counts) > devices:
-      raise ConfigError(f"devices={list(counts)}: this machine has {devices}.")
+    numbers = self.devices or [2**i for i in range(devices.bit_length())]
+    if max(numbers) > devices:
+      raise ConfigError(f"devices={list(numbers)}: this machine has {devices}.")
     seeds = list(range(1, self.seeds + 1))
     rates, runs = [], []
     for task in self.chosen():
-      for count in counts:
-        for kind in self.hyperparameters if count > 1 else ("fixed",):
-          setting = [f"hardware.devices={count}"]
+      for number in numbers:
+        for kind in self.hyperparameters if number > 1 else ("fixed",):
+          setting = [f"hardware.devices={number}"]
           setting += ["hardware.scale_envs=true"] * (kind == "scaled")
           rates.append(self.job("training", task, setting, seeds=seeds))
           runs += [self.whole_run(task, self.agent, seed, setting) for seed in seeds]
@@ -165,9 +168,9 @@ class Topology(OfRuns):
 class Chain(Measuring):
   """Runs a fine-tuning curriculum and reports each stage's return and time."""
 
-  experiment: str = option("go1_joystick_chain", "an experiment that is a chain")
-  runs: str = option(str(RESULTS / "chains"), "folder of the run directories; an unfinished one is resumed")
-  seeds: int = option(1, "runs, seeds 1 to this")
+  experiment: Annotated[str, "an experiment that is a chain"] = "go1_joystick_chain"
+  runs: Annotated[str, "folder of the run directories; an unfinished one is resumed"] = str(RESULTS / "chains")
+  seeds: Annotated[int, count(1), "runs, seeds 1 to this"] = 1
 
   name = "chain"
   alone = True
@@ -193,11 +196,11 @@ class Chain(Measuring):
 class BesidePeer(OfTasks):
   """Options of commands that also measure another package, with its hyperparameters on both sides."""
 
-  peer: str = option("playground020", "the package to compare with")
-  peer_python: str = option("python3", "interpreter of the environment that it is installed in")
-  peer_path: str = option("", "PYTHONPATH of that interpreter")
-  peer_menagerie: str = option("", "folder of its robot models, where it should not fetch them")
-  backends: tuple[str, ...] = option(("jax", "warp"), "the peer's backends; ours is the task's own choice")
+  peer: Annotated[str, "the package to compare with"] = "playground020"
+  peer_python: Annotated[str, "interpreter of the environment that it is installed in"] = "python3"
+  peer_path: Annotated[str, "PYTHONPATH of that interpreter"] = ""
+  peer_menagerie: Annotated[str, "folder of its robot models, where it should not fetch them"] = ""
+  backends: Annotated[Sequence[str], "the peer's backends; ours is the task's own choice"] = ("jax", "warp")
 
   agents = ("ppo",)  # that can be compared
 
@@ -227,7 +230,7 @@ class BesidePeer(OfTasks):
 class Compare(BesidePeer):
   """Ours and the public package's PPO, in turn, on one machine in one call; the best of the repeats counts."""
 
-  repeats: int = option(3, "turns")
+  repeats: Annotated[int, count(1), "turns"] = 3
 
   name = "compare"
   alone = True
@@ -248,11 +251,11 @@ class Compare(BesidePeer):
 class Learning(BesidePeer, OfRuns):
   """Ours and the public package trained for as many steps, with their own evaluations: returns, wall-clock."""
 
-  backends: tuple[str, ...] = option(("warp",), "the peer's backends; ours is the task's own choice")
-  num_timesteps: int | None = option(
-    None, "control steps that each side trains for; null is the task's own budget in 0.2.0's set"
-  )
-  seeds: int = option(1, "trainings of each side, seeds 1 to this")
+  backends: Sequence[str] = ("warp",)
+  num_timesteps: Annotated[
+    int | None, count(1, 1e12), "control steps that each side trains for; null is the task's own budget in 0.2.0's set"
+  ] = None
+  seeds: Annotated[int, count(1), "trainings of each side, seeds 1 to this"] = 1
 
   name = "learning"
   agents = ("ppo", "sac")

@@ -5,10 +5,11 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import yaml
 
-from playground.benchmark.arguments import check_amounts, option
+from playground.benchmark.arguments import check_limits
 from playground.benchmark.jobs import Measurement, Plan, probe, run_jobs
 from playground.benchmark.schema import Table
 from playground.config import compose
@@ -23,13 +24,13 @@ _KEYS = ("run", "metrics", "from")
 class Options(Plan):
   """Trains the runs of a set and fails (exit code 1) where a metric's last value is outside its window."""
 
-  set: str = option("cpu", "cpu (2 cores, under 15 minutes) or gpu (one H200, under 30 minutes)")
-  only: tuple[str, ...] = option((), "names of runs, all of the set if none")
-  rerun: bool = option(True, "train again what the CSV has already; false goes on where minutes= ended")
-  cache: bool = option(True, "reuse compiled programs")
-  table: str | None = option(None, "YAML of the sets; null is benchmarks/golden.yaml")
-  out: str | None = option(None, "CSV that rows are added to; null is results/benchmarks/golden.csv")
-  overrides: tuple[str, ...] = option((), "of every run's configuration")
+  set: Annotated[str, "cpu (2 cores, under 15 minutes) or gpu (one H200, under 30 minutes)"] = "cpu"
+  only: Annotated[Sequence[str], "names of runs, all of the set if none"] = ()
+  rerun: Annotated[bool, "train again what the CSV has already; false goes on where minutes= ended"] = True
+  cache: bool = True
+  table: Annotated[str | None, "YAML of the sets; null is benchmarks/golden.yaml"] = None
+  out: Annotated[str | None, "CSV that rows are added to; null is results/benchmarks/golden.csv"] = None
+  overrides: Annotated[Sequence[str], "of every run's configuration"] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +56,7 @@ def run(options: Options) -> int:
   Raises:
     PlaygroundError: an invalid option, or a file of sets that is not one.
   """
-  check_amounts(options)
+  check_limits(options)
   path = Path(options.table) if options.table else shipped("benchmarks") / "golden.yaml"
   runs = lookup(read(path), options.set, "set")
   chosen = [lookup(runs, name, "only") for name in options.only] or list(runs.values())

@@ -9,14 +9,14 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from playground.benchmark.arguments import option
 from playground.benchmark.schema import Table, commit_of
 from playground.benchmark.worker import ROW
 from playground.config.sweep_options import LocalConfig
 from playground.errors import HardwareError
 from playground.interpreter import PYTHON
+from playground.limits import count, counts, positive
 from playground.runs.provenance import git_state
 from playground.sweep.folder import FAILED, Job, JobState, SweepDirectory
 from playground.sweep.local import ALL, LocalLauncher, Slot
@@ -63,13 +63,13 @@ class Measurement:
 class Plan:
   """How measurements are run."""
 
-  rerun: bool = option(False, "measure again what the CSV has already")
-  minutes: float | None = option(None, "stop after this long; the same command again measures the rest")
-  workers: int = option(1, "processes at once: they compile side by side, one at a time is timed on a device")
-  gpus: tuple[int, ...] = option((), "GPUs that the processes are spread over; none is all of them to each")
-  cache: bool = option(False, "reuse compiled programs; compile and start times are then not those of a cold start")
-  commit: str | None = option(None, "what to record where there is no git")
-  note: str = option("", "added to the conditions of every row")
+  rerun: Annotated[bool, "measure again what the CSV has already"] = False
+  minutes: Annotated[float | None, positive(), "stop after this long; the same command again measures the rest"] = None
+  workers: Annotated[int, count(1), "processes at once: they compile side by side, a device times one at a time"] = 1
+  gpus: Annotated[Sequence[int], counts(0), "GPUs that the processes are spread over; none is all of them to each"] = ()
+  cache: Annotated[bool, "reuse compiled programs; compile and start times are then not those of a cold start"] = False
+  commit: Annotated[str | None, "what to record where there is no git"] = None
+  note: Annotated[str, "added to the conditions of every row"] = ""
 
 
 class _Rows(View):

@@ -3,12 +3,14 @@
 import abc
 import dataclasses
 from collections.abc import Sequence
+from typing import Annotated
 
-from playground.benchmark.arguments import check_amounts, option
+from playground.benchmark.arguments import check_limits
 from playground.benchmark.jobs import Measurement, Plan
 from playground.config import RunConfig, compose
 from playground.config.files import task_names
 from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.limits import count, positive
 from playground.paper import SUITES, tasks_of
 
 TRAINING = "training_steps_per_s"
@@ -25,8 +27,8 @@ QUANTITY = {  # the last row of a measurement
 class Measuring(Plan, abc.ABC):
   """Options of all commands that measure."""
 
-  out: str | None = option(None, "CSV that rows are added to; null is results/benchmarks/<command>.csv")
-  overrides: tuple[str, ...] = option((), "of the run's configuration")
+  out: Annotated[str | None, "CSV that rows are added to; null is results/benchmarks/<command>.csv"] = None
+  overrides: Annotated[Sequence[str], "of the run's configuration"] = ()
 
   name = "measuring"
   alone = False  # whether no other measurement may run at the same time
@@ -37,7 +39,7 @@ class Measuring(Plan, abc.ABC):
 
   def check(self) -> None:
     """Raises PlaygroundError for invalid options, before anything expensive."""
-    check_amounts(self)
+    check_limits(self)
     if self.alone and self.workers > 1:
       raise ConfigError(f"workers={self.workers}: {self.name} wants the machine to itself, workers=1.")
 
@@ -50,10 +52,10 @@ class Measuring(Plan, abc.ABC):
 class OfTasks(Measuring):
   """Options of commands that measure tasks with one algorithm."""
 
-  suite: str | None = option(None, "dm_control, locomotion, manipulation or all: the tasks of the paper's tables")
-  tasks: tuple[str, ...] = option((), "tasks by name, instead of a suite or on top")
-  agent: str = option("ppo", "ppo, ppo_paper or sac")
-  seconds: float = option(4.0, "how long to time each number, at least one update")
+  suite: Annotated[str | None, "dm_control, locomotion, manipulation or all: the tasks of the paper's tables"] = None
+  tasks: Annotated[Sequence[str], "tasks by name, instead of a suite or on top"] = ()
+  agent: Annotated[str, "ppo, ppo_paper or sac"] = "ppo"
+  seconds: Annotated[float, positive(), "how long to time each number, at least one update"] = 4.0
 
   sets_devices = True  # whether the command sets hardware.devices
 
@@ -109,7 +111,7 @@ class OfTasks(Measuring):
 class OfRuns(OfTasks):
   """Options of commands that also train whole runs."""
 
-  num_timesteps: int | None = option(None, "control steps of a whole run")
+  num_timesteps: Annotated[int | None, count(1, 1e12), "control steps of a whole run"] = None
 
   def check(self) -> None:
     super().check()

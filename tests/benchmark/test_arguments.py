@@ -1,39 +1,42 @@
 """`key=value` arguments: types, lists, overrides of the run, and what is said about mistakes."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import pytest
 
-from playground.benchmark.arguments import help_of, option, parse
+from playground.benchmark.arguments import check_limits, help_of, parse
 from playground.errors import ConfigError, UnknownNameError
+from playground.limits import counts, positive
 
 
 @dataclasses.dataclass(frozen=True)
 class Some:
   """A command."""
 
-  tasks: tuple[str, ...] = option((), "names")
-  counts: tuple[int, ...] = option((1, 2), "numbers")
-  seconds: float = option(4.0, "time")
-  out: str | None = option(None, "file")
-  rerun: bool = option(False, "again")
-  overrides: tuple[str, ...] = option((), "of the run")
+  tasks: Annotated[Sequence[str], "names"] = ()
+  sizes: Annotated[Sequence[int], counts(1), "numbers"] = (1, 2)
+  seconds: Annotated[float, positive(), "time"] = 4.0
+  out: Annotated[str | None, "file"] = None
+  rerun: Annotated[bool, "again"] = False
+  overrides: Annotated[Sequence[str], "of the run"] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Plain:
   """A command that runs nothing."""
 
-  out: str = option("here", "folder")
+  out: Annotated[str, "folder"] = "here"
 
 
 def test_types_and_lists():
-  given = ["tasks=A,B", "counts=[4, 1e3]", "seconds=2", "rerun=true", "agent.num_envs=64", "hardware=cpu"]
+  given = ["tasks=A,B", "sizes=[4, 1e3]", "seconds=2", "rerun=true", "agent.num_envs=64", "hardware=cpu"]
   assert parse("some", Some, given) == Some(
     ("A", "B"), (4, 1000), 2.0, rerun=True, overrides=("agent.num_envs=64", "hardware=cpu")
   )
   assert parse("some", Some, ["out=null"]).out is None
-  assert parse("some", Some, ["tasks=A,B,A", "counts=2,2.0"]) == Some(("A", "B"), (2,)), "each once"
+  assert parse("some", Some, ["tasks=A,B,A", "sizes=2,2.0"]) == Some(("A", "B"), (2,)), "each once"
   assert parse("some", Some, []) == Some()
 
 
@@ -42,8 +45,9 @@ def test_types_and_lists():
   [
     ("task=A", "Did you mean 'tasks'?"),
     ("tasks", "write key=value"),
-    ("seconds=soon", "seconds=soon must be a number."),
-    ("counts=1.5", "must be a whole number"),
+    ("seconds=soon", "seconds=soon must be a number above 0"),
+    ("seconds=1,2", "seconds=1,2 must be a number above 0"),
+    ("sizes=1.5", "sizes=1.5 must be a list of whole numbers from 1"),
     ("rerun=1", "must be true or false"),
     ("overrides=x", "no key"),
   ],
@@ -51,6 +55,20 @@ def test_types_and_lists():
 def test_a_mistake_is_a_sentence(argument: str, message: str):
   with pytest.raises(ConfigError, match=message.replace("?", r"\?")):
     parse("some", Some, [argument])
+
+
+@pytest.mark.parametrize(
+  ("changes", "message"),
+  [
+    ({"seconds": float("nan")}, "seconds=nan must be a number above 0"),
+    ({"sizes": (1, 0)}, r"sizes=\[1, 0\] must be a list of whole numbers from 1"),
+    ({"sizes": ()}, "sizes= is empty: name at least one"),
+  ],
+)
+def test_what_is_not_within_its_limits_is_a_sentence(changes: dict[str, Any], message: str):
+  check_limits(Some())
+  with pytest.raises(ConfigError, match=message):
+    check_limits(Some(**changes))
 
 
 def test_keys_are_given_once_and_overrides_only_where_something_runs():

@@ -10,14 +10,15 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from playground.benchmark.arguments import check_amounts, option
+from playground.benchmark.arguments import check_limits
 from playground.config.files import shipped
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.files import need_folder, write_text
+from playground.limits import count
 
 if TYPE_CHECKING:
   from playground.benchmark.gate.checks import Pair, Timed
@@ -27,10 +28,10 @@ if TYPE_CHECKING:
 class Options:
   """Fails (exit code 1) where a quick set of ratios, measured on the CPU, is far above the committed ones."""
 
-  checks: tuple[str, ...] = option((), "names of checks, those of the table if none")
-  repeats: int = option(15, "turns of ours and the reference; the median of their ratios counts")
-  update: bool = option(False, "write the ratios measured into the table instead of comparing")
-  table: str | None = option(None, "CSV of check, ratio, tolerance; null is benchmarks/gate.csv")
+  checks: Annotated[Sequence[str], "names of checks, those of the table if none"] = ()
+  repeats: Annotated[int, count(1), "turns of ours and the reference; the median of their ratios counts"] = 15
+  update: Annotated[bool, "write the ratios measured into the table instead of comparing"] = False
+  table: Annotated[str | None, "CSV of check, ratio, tolerance; null is benchmarks/gate.csv"] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +54,7 @@ def run(options: Options) -> int:
   """Measures and compares, or writes the table; returns the exit code."""
   path = Path(options.table) if options.table else shipped("benchmarks") / "gate.csv"
   limits = _read(path)
-  check_amounts(options)
+  check_limits(options)
   if not (limits or options.update):
     raise ConfigError(f"table={path} holds no check: `playground-bench gate update=true table={path}` adds them.")
   if options.update:

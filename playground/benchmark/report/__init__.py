@@ -1,9 +1,10 @@
 """`playground-bench report`: one page from everything that was measured, and the tables of the result pages."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from playground.benchmark.arguments import option
 from playground.benchmark.report import sections
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.pixels import pixels
@@ -26,9 +27,9 @@ SECTIONS = (
 class Options:
   """One page, report.md and report.html: the paper's tables with our column, curves, bars, conditions."""
 
-  out: str = option("results/benchmarks", "folder of the page")
-  rows: tuple[str, ...] = option(ROWS, "folders whose CSVs it is made of")
-  pages: str | None = option(None, "instead: folder of the result pages (docs) whose tables of runs to write anew")
+  out: Annotated[str, "folder of the page"] = "results/benchmarks"
+  rows: Annotated[Sequence[str], "folders whose CSVs it is made of"] = ROWS
+  pages: Annotated[str | None, "instead: folder of the result pages (docs) whose tables of runs to write anew"] = None
 
 
 def run(options: Options) -> int:
