@@ -34,7 +34,7 @@ def test_the_committed_sets() -> None:
   sets = read(shipped("benchmarks") / "golden.yaml")
   assert set(sets) == {"cpu", "gpu"}
   agents = {text for each in sets["cpu"].values() for text in each.overrides if text.startswith("agent=")}
-  assert agents == {"agent=ppo", "agent=sac", "agent=reppo", "agent=fast_td3"}
+  assert agents == {"agent=ppo", "agent=sac", "agent=reppo", "agent=fast_td3", "agent=fast_sac"}
   assert len(sets["gpu"]) == 8
 
 
