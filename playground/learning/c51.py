@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 from brax.training import networks as brax_networks
 
-from playground.envs.base import PIXELS, Env
-from playground.errors import ConfigError
+from playground.envs.base import Env
 from playground.learning.hyperparameters import C51Config
-from playground.learning.networks import Actor
+from playground.learning.networks import Actor, refuse_pictures
 from playground.learning.off_policy import Transition
 from playground.pytree import PyTree
 
@@ -50,8 +49,7 @@ class C51Networks(Actor):
       ConfigError: a task with pictures, an unknown activation, or an observation entry that the task does not have.
     """
     sizes, network = env.observation_size, config.network
-    if not isinstance(sizes, int) and any(key.startswith(PIXELS) for key in sizes):
-      raise ConfigError(f"agent={agent} reads no pictures: choose agent=ppo, or env.vision.enable=false.")
+    refuse_pictures(sizes, agent)
     hidden, norm = network.policy_hidden_layer_sizes, network.layer_norm
     super().__init__(sizes, env.action_size, hidden, network, precision, norm)
     self.atoms = Atoms(config.min_value, config.max_value, config.num_atoms)

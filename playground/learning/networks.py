@@ -286,8 +286,7 @@ class SoftActorCritic(Actor):
     self, obs_size: ObservationSize, action_size: int, config: SoftNetworkConfig, precision: str | None = None
   ):
     """Builds the networks; see `Actor` for the arguments and errors."""
-    if isinstance(obs_size, Mapping) and any(key.startswith(PIXELS) for key in obs_size):
-      raise ConfigError("agent=sac reads no pictures: choose agent=ppo, or env.vision.enable=false.")
+    refuse_pictures(obs_size, "sac")
     self.batched = jax.default_backend() == "gpu"
     sizes, norm = tuple(config.hidden_layer_sizes), config.policy_network_layer_norm
     super().__init__(obs_size, action_size, sizes, config, precision, norm)
@@ -316,6 +315,12 @@ class SoftActorCritic(Actor):
     normal = self.distribution.create_dist(logits)
     raw_action = normal.loc + normal.scale * noise
     return self.distribution.postprocess(raw_action), self.distribution.log_prob(logits, raw_action)
+
+
+def refuse_pictures(obs_size: ObservationSize, agent: str) -> None:
+  """Raises ConfigError for a task with pictures, which this agent does not read."""
+  if isinstance(obs_size, Mapping) and any(key.startswith(PIXELS) for key in obs_size):
+    raise ConfigError(f"agent={agent} reads no pictures: choose agent=ppo, or env.vision.enable=false.")
 
 
 def normalize(obs: Mapping[str, jax.Array], normalizer: Normalizer | None) -> dict[str, jax.Array]:

@@ -18,12 +18,11 @@ from brax.training.distribution import NormalTanhDistribution
 from flax import linen, struct
 from jax.flatten_util import ravel_pytree
 
-from playground.envs.base import PIXELS, Env
-from playground.errors import ConfigError
+from playground.envs.base import Env
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy, gradient_step
 from playground.learning.hyperparameters import REPPOConfig
-from playground.learning.networks import Actor, Normalizer, normalize
+from playground.learning.networks import Actor, Normalizer, normalize, refuse_pictures
 from playground.learning.rollout import Environments
 from playground.pytree import PyTree
 
@@ -125,8 +124,7 @@ class REPPONetworks(Actor):
       ConfigError: a task with pictures, an unknown activation, or an observation entry that the task does not have.
     """
     sizes = env.observation_size
-    if not isinstance(sizes, int) and any(key.startswith(PIXELS) for key in sizes):
-      raise ConfigError("agent=reppo reads no pictures: choose agent=ppo, or env.vision.enable=false.")
+    refuse_pictures(sizes, "reppo")
     network = config.network
     super().__init__(sizes, env.action_size, network.hidden_layer_sizes, network, precision, layer_norm=True)
     self.distribution = NormalTanhDistribution(env.action_size, min_std=network.min_std)

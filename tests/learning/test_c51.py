@@ -55,7 +55,7 @@ class Seen(PointTask):
     return {"state": (2,), "pixels/eye": (6, 6, 2)}
 
 
-@pytest.mark.parametrize("agent", ["fast_td3", "fast_sac"])
+@pytest.mark.parametrize("agent", ["reppo", "fast_td3", "fast_sac"])
 def test_pictures_are_refused(agent: str) -> None:
   with pytest.raises(ConfigError, match=f"agent={agent} reads no pictures: choose agent=ppo"):
     build_algorithm(Seen(), config_class(agent)(), None)
