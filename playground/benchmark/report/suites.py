@@ -22,7 +22,7 @@ PAGES = {  # page -> the tables that it shows
 BEGIN, END = "<!-- runs: written by `playground-bench report pages=docs` -->", "<!-- end of runs -->"
 GALLERY = "gallery.md"
 GRID_BEGIN, GRID_END = "<!-- grid {}: written by `playground-bench report pages=docs` -->", "<!-- end of grid -->"
-_GRID_WIDTH = 4  # pictures in a row
+_GRID_WIDTH = 4  # loops in a row
 _TITLES = {"open": "Not learnt yet", "learning": "Learning", "solved": "Solved"}
 # What a row says in columns of its own.
 _BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env=\w+| \(learning\)")
@@ -72,12 +72,13 @@ def _replaced(path: Path, text: str, begin: str, end: str, content: str) -> str:
 
 
 def _grid(suite: str) -> str:
-  """A table of pictures, with each task's name, status and best return."""
+  """A table of loops, with each task's name, status, best return and robot; docs/gallery.js filters by these lines."""
   cells = []
   for task, entry in entries().items():
     if entry.suite == suite:
       score = "" if entry.reference_return is None else f", {entry.reference_return:.4g}"
-      cells.append(f"![{task}](gallery/{task}.webp)<br>{task}<br>{entry.status}{score}")
+      robot = f"<br>{entry.robot}" if entry.robot else ""
+      cells.append(f"![{task}](gallery/{task}.webp)<br>{task}<br>{entry.status}{score}{robot}")
   rows = [cells[i : i + _GRID_WIDTH] for i in range(0, len(cells), _GRID_WIDTH)]
   full = [[*row, *[""] * (_GRID_WIDTH - len(row))] for row in rows]
   return "\n".join(f"| {' | '.join(row)} |" for row in [[""] * _GRID_WIDTH, ["---"] * _GRID_WIDTH, *full]) + "\n"

@@ -95,7 +95,7 @@ class Panel:
         sliders.append(slider)
         for key, change in ((more, STEP), (less, -STEP)):
           self._add_key(f"{label}: {change:+g}", key, lambda by=change, it=slider: _set(it, it.value + by))
-      self.leave = self._add_button("Leave it to the task", "T", leave)
+      self.leave = self._add_button("Automatic commands", "T", leave)
     return sliders
 
   def _add_time(self) -> None:
@@ -109,7 +109,7 @@ class Panel:
       most = max(0.5, session.push_speed)
       self.push_speed = self._gui.add_slider("Push, m/s", 0.1, most, 0.1, 0.5, hint="which the robot gains at once")
       self.push = self._add_button("Push", "P", self._push)
-      self.reset = self._add_button("Begin anew", "R", session.reset)
+      self.reset = self._add_button("Reset", "R", session.reset)
 
   def _add_choices(self) -> None:
     session = self._session
