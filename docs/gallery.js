@@ -14,7 +14,11 @@ document.addEventListener("DOMContentLoaded", () => {
       const figure = document.createElement("figure");
       figure.append(...cell.childNodes);
       grid.append(figure);
-      figures.push({ figure, task, suite: heading.firstChild.textContent, robot, status: result.split(",")[0] });
+      const named = [...document.querySelectorAll("article li > strong")].find((name) => name.textContent === task);
+      figures.push({
+        task, robot, status: result.split(",")[0], suite: heading.firstChild.textContent, heading,
+        parts: [figure, named && named.parentElement].filter(Boolean),
+      });
     }
     outer.replaceWith(grid);
   }
@@ -33,8 +37,12 @@ document.addEventListener("DOMContentLoaded", () => {
   });
   form.append(count);
   const filter = () => {
-    for (const entry of figures) entry.figure.hidden = menus.some((menu) => menu.value && entry[menu.name] !== menu.value);
-    count.value = `${figures.filter((entry) => !entry.figure.hidden).length} of ${figures.length} tasks`;
+    const shown = figures.filter((entry) => menus.every((menu) => !menu.value || entry[menu.name] === menu.value));
+    for (const entry of figures) {
+      for (const part of entry.parts) part.hidden = !shown.includes(entry);
+      entry.heading.hidden = !shown.some((other) => other.suite === entry.suite);
+    }
+    count.value = `${shown.length} of ${figures.length} tasks`;
   };
   form.addEventListener("change", filter);
   filter();

@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import itertools
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import yaml
@@ -11,11 +12,13 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from playground.catalog import entries
 from playground.config.comments import flow, keys_and_comments
-from playground.config.definitions import RunSettings, defined
+from playground.config.definitions import RunSettings, defined, definition
 from playground.config.files import task_experiments
 from playground.config.sweep_options import SweepConfig
 from playground.envs.options import TermsConfig
+from playground.mdp.terms import MODULES, registered
 from playground.settings import Setting, settings
 
 ROOT = Path(__file__).parents[1]
@@ -45,15 +48,17 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
   """Puts the generated pages into the navigation."""
   assert config.nav is not None, "mkdocs.yml has one"
   api = [{title: _uri("api", title)} for title in API]
-  groups = [{group or "config.yaml": _uri("configs", group or "config")} for group in _groups()]
-  config.nav.append({"Reference": [{"Python": api}, {"Configuration": groups}]})
+  groups = [{"config.yaml" if title == "config" else title: _uri("configs", title)} for title in _groups()]
+  terms = {"Terms of a task": _uri("configs", "terms")}
+  config.nav.append({"Reference": [{"Python": api}, {"Configuration": [*groups, terms]}]})
   return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
   """Adds the generated pages."""
   pages = {_uri("api", title): _api_page(title, modules) for title, modules in API.items()}
-  pages |= {_uri("configs", group or "config"): _group_page(group) for group in _groups()}
+  pages |= {_uri("configs", title): _group_page(title, group, paths) for title, (group, paths) in _groups().items()}
+  pages[_uri("configs", "terms")] = _terms_page()
   pages["first_policy.md"] = _notebook_page()
   for uri, content in pages.items():
     files.append(File.generated(config, uri, content=content))
@@ -85,36 +90,101 @@ def _api_page(title: str, modules: list[str]) -> str:
   return f"# {title}\n\n" + "\n\n".join(f"::: {name}" for name in names) + "\n"
 
 
-def _groups() -> list[str]:
-  """The configuration's groups, that of config.yaml itself ("") first, and each tuned set's agent as a group."""
+def _groups() -> dict[str, tuple[str, list[Path]]]:
+  """The group and the files that each page shows, by title: config.yaml, then a page for each group and tuned set.
+
+  Tasks have a page for each suite, and the files that they build on another.
+  """
   configs = ROOT / "configs"
   of_files = {path.parent.relative_to(configs).as_posix() for path in configs.glob("*/**/*.yaml")}
-  return ["", *sorted(of_files | set(defined()))]
+  pages = {"config": ("", sorted(configs.glob("*.yaml")))}
+  for group in sorted(of_files | set(defined())):
+    for path in sorted((configs / group).glob("*.yaml")):
+      known = entries().get(path.stem) if group == "env" else None
+      pages.setdefault(f"{group} {known.suite}" if known else group, (group, []))[1].append(path)
+    pages.setdefault(group, (group, []))
+  return pages
 
 
-def _group_page(group: str) -> str:
-  """Every option of a group, those of classes first: what it is, its keys, their values and what is said of them."""
-  parts = [f"# {f'configs/{group}' if group else 'config.yaml'}\n"]
+def _group_page(title: str, group: str, paths: list[Path]) -> str:
+  """Every option of a page, those of classes first: its keys, their values and their meaning."""
+  parts = [f"# {f'configs/{title}' if group else 'config.yaml'}\n"]
   classes = (
-    defined().get(group, {})
+    (defined().get(group, {}) if title == group else {})
     if group
     else {"A run": RunSettings, "env of a task made of terms": TermsConfig, "A sweep": SweepConfig}
   )
   parts += [_class_section(name, cls) for name, cls in classes.items()]
   parts += [_experiments()] if group == "experiment" else []
   shared_first = lambda path: (path.stem[0].isupper(), path.stem)
-  for path in sorted((ROOT / "configs" / group).glob("*.yaml"), key=shared_first):
-    lines = path.read_text(encoding="utf-8").splitlines()
-    head = list(itertools.takewhile(lambda line: line.startswith("#"), lines))
+  for path in sorted(paths, key=shared_first):
+    text = path.read_text(encoding="utf-8")
+    head = list(itertools.takewhile(lambda line: line.startswith("#"), text.splitlines()))
     said = " ".join(line[1:].strip() for line in head if not line.startswith("# @package"))
+    package = next((line.split()[-1] for line in head if line.startswith("# @package")), group)
     parts.append(f"## {path.stem}\n\n{_text(said)}\n")
-    keys = list(keys_and_comments("\n".join(lines)))
+    keys = list(keys_and_comments(text))
     bases = [base for key, value, _ in keys if key == "defaults" for base in yaml.safe_load(value) if base != "_self_"]
     if bases:
       parts.append("On top of " + ", ".join(_code(flow(base)) for base in bases) + ".\n")
-    rows = [f"| {_code(key)} | {_code(value)} | {_text(said)} |" for key, value, said in keys if key != "defaults"]
+    prefix, names = "" if package == "_global_" else f"{package}.", {"agent": _agent(group, path)}
+    rows = [
+      f"| {_code(term)} | {_code(entry)} | {_text(said or _help(prefix + term, entry, names))} |"
+      for key, value, said in keys
+      if key != "defaults"
+      for term, entry in _terms(prefix, key, value)
+    ]
     if rows:
-      parts.append("\n".join(["| key | value | |", "|---|---|---|", *rows]) + "\n")
+      parts.append("\n".join(["| key | value | meaning |", "|---|---|---|", *rows]) + "\n")
+  return "\n".join(parts)
+
+
+def _agent(group: str, path: Path) -> str:
+  """The agent whose keys a file of `agent` or `tuned/<agent>` sets; PPO, whose keys experiments set, for others."""
+  name = path.stem if group == "agent" else group.removeprefix("tuned/")
+  return next((agent for agent in defined()["agent"] if name.startswith(agent)), "ppo")
+
+
+def _terms(prefix: str, key: str, value: str) -> Iterator[tuple[str, str]]:
+  """Yields each term of a section that a file writes on one line, other keys as they are."""
+  entry = yaml.safe_load(value) if value else None
+  kind, *inside = (prefix + key).removeprefix("env.").split(".")
+  if isinstance(entry, dict) and kind in MODULES and len(inside) < (2 if kind == "observations" else 1):
+    for name, term in entry.items():
+      yield from _terms(prefix, f"{key}.{name}", flow(term))
+  else:
+    yield key, value
+
+
+def _help(key: str, value: str, names: dict[str, object]) -> str:
+  """The help of a setting, or the first line of the docstring of the function that a term names; else empty."""
+  kind, *inside = key.removeprefix("env.").split(".")
+  if kind in MODULES and len(inside) == (2 if kind == "observations" else 1):
+    entry = yaml.safe_load(value) if value else None
+    name = entry.get("func", inside[-1]) if isinstance(entry, dict) else inside[-1]
+    return "removes the term" if value == "null" else _summary(registered(kind).get(name))
+  setting = definition(key, names)
+  return setting.help if setting else ""
+
+
+def _summary(function: Callable[..., object] | None) -> str:
+  """The first line of a docstring; empty for a function of another package."""
+  return (inspect.getdoc(function) or "").partition("\n")[0] if function else ""
+
+
+def _terms_page() -> str:
+  """The registered functions of each kind, with their parameters."""
+  parts = [
+    "# Terms of a task\n",
+    "The registered functions. [Add a reward](../../add-a-reward.md) shows how to use them.\n",
+  ]
+  for kind in MODULES:
+    rows = []
+    for name, func in sorted(registered(kind).items()):
+      first = 3 if kind == "events" and not inspect.isclass(func) else 0 if inspect.isclass(func) else 1
+      params = ", ".join(list(inspect.signature(func).parameters)[first:])
+      rows.append(f"| {_code(name)} | {_code(params)} | {_text(_summary(func))} |")
+    parts.append("\n".join([f"## {kind}\n", "| function | parameters | meaning |", "|---|---|---|", *rows, ""]))
   return "\n".join(parts)
 
 
@@ -129,7 +199,7 @@ def _class_section(name: str, cls: type) -> str:
   """The settings that a class defines."""
   head = [f"## {name}\n", f"{_text(inspect.getdoc(cls) or '')}\n"]
   rows = [_setting_row(setting) for setting in settings(cls).values() if setting.default is not dataclasses.MISSING]
-  return "\n".join([*head, "| key | default | allowed | |", "|---|---|---|---|", *filter(None, rows), ""])
+  return "\n".join([*head, "| key | default | allowed | meaning |", "|---|---|---|---|", *filter(None, rows), ""])
 
 
 def _setting_row(setting: Setting) -> str:

@@ -22,6 +22,7 @@ from playground.catalog import entries
 from playground.cli.main import _parser
 from playground.config import compose, config_dict, override_section
 from playground.errors import UnknownNameError
+from playground.mdp import terms
 from playground.physics.backend import Physics
 from playground.randomization import Randomizer
 from playground.rendering.gl import find_gl
@@ -287,6 +288,10 @@ def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   assert (
     'src="../../iframe-worker.js"' in page and "unpkg" not in page and (tmp_path / "site/iframe-worker.js").is_file()
   )
+  page = (tmp_path / "site/reference/configs/env-locomotion.html").read_text(encoding="utf-8")
+  assert "Warp: constraint rows of one environment" in page  # beside a field of EnvConfig
+  page = (tmp_path / "site/reference/configs/terms.html").read_text(encoding="utf-8")
+  assert all(f'id="{kind}"' in page for kind in terms.MODULES) and "feet_air_time" in page
   page = (tmp_path / "site/reference/api/parts-of-tasks.html").read_text(encoding="utf-8")
   assert 'id="playground.mdp.tolerance.tolerance"' in page
 
