@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import yaml
@@ -156,7 +156,7 @@ def _terms(prefix: str, key: str, value: str) -> Iterator[tuple[str, str]]:
     yield key, value
 
 
-def _help(key: str, value: str, names: dict[str, object]) -> str:
+def _help(key: str, value: str, names: Mapping[str, object]) -> str:
   """The help of a setting, or the first line of the docstring of the function that a term names; else empty."""
   kind, *inside = key.removeprefix("env.").split(".")
   if kind in MODULES and len(inside) == (2 if kind == "observations" else 1):

@@ -154,6 +154,18 @@ def test_every_pip_finds_the_extras_that_are_told():
   assert {"rsl-rl", "deploy", "web", "cuda13", "dev"} <= names <= set(extras)
 
 
+def test_the_images_and_the_cloud_task_name_known_extras():
+  """Neither can be run here."""
+  text = (REPOSITORY / "Dockerfile").read_text(encoding="utf-8")
+  assert re.findall(r"^FROM \S+ AS (\S+)$", text, re.M) == ["base", "cpu", "cuda"]
+  task = yaml.safe_load((REPOSITORY / "sky.yaml").read_text(encoding="utf-8"))
+  assert set(task) == {"name", "resources", "workdir", "envs", "setup", "run"}
+  compose(shlex.split(task["envs"]["RUN"]))
+  project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+  named = re.findall(r"'\.\[([\w,-]+)\]'", text + task["setup"])
+  assert len(named) == 3 and set(",".join(named).split(",")) <= set(project["optional-dependencies"])
+
+
 def test_the_tutorials_mistake_is_answered_as_it_says():
   (words,) = (words for words in run_commands() if names(words, MISTAKE))
   with pytest.raises(UnknownNameError) as caught:

@@ -120,8 +120,8 @@ class Physics:
       mj_model: the compiled model; its `opt.timestep` is the physics step in seconds.
       impl: 'jax' or 'warp'.
       derived: the names out of `DERIVED_FIELDS` that the task reads.
-      naconmax_per_env, naccdmax_per_env, njmax: Warp's buffers, see `EnvConfig`. The environments of a batch, the axis
-        `WORLDS` of the `jax.vmap` around, share the contacts.
+      **buffers: `naconmax_per_env`, `naccdmax_per_env` and `njmax`: Warp's buffers, see `EnvConfig`. The environments
+        of a batch, the axis `WORLDS` of the `jax.vmap` around, share the contacts.
     """
     self.mj_model = mj_model
     self.impl = impl
