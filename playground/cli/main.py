@@ -10,6 +10,7 @@ from playground.errors import ConfigError, PlaygroundError, UnknownNameError, ne
 from playground.limits import SEED, count
 from playground.pretrained import working_copy
 from playground.rendering.gl import withhold_gl
+from playground.runs.wandb_artifacts import local_path
 from playground.trust import trust
 
 # Of all commands' options.
@@ -28,7 +29,7 @@ _PROGRAMS = {
   "train": ("playground.cli.run", "Train a policy, or sweep with -m; the same as playground-run."),
   "bench": ("playground.cli.bench", "Measure speed and memory; the same as playground-bench."),
 }
-_RUN = "run directory, checkpoint, or a task, which stands for its pretrained policy"
+_RUN = "run directory, checkpoint, a task for its pretrained policy, or wandb:<entity>/<project>/<run>"
 _CAMERA = "camera of --video (default: one that shows the whole scene)"
 
 
@@ -184,11 +185,16 @@ def _doctor(args: argparse.Namespace) -> int:
   return doctor()
 
 
+def _run_path(name: str) -> str:
+  """The path of a run that a command line names: a path, a pretrained policy or one on W&B."""
+  return working_copy(local_path(name), registry.names())
+
+
 def _eval(args: argparse.Namespace) -> int:
   from playground.cli.eval import evaluate_run
 
   return evaluate_run(
-    working_copy(args.run, registry.names()),
+    _run_path(args.run),
     episodes=args.episodes,
     seed=args.seed,
     deterministic=args.deterministic,
@@ -200,7 +206,7 @@ def _eval(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
   from playground.deploy.export import export_run
 
-  return export_run(working_copy(args.run, registry.names()), out=args.out)
+  return export_run(_run_path(args.run), out=args.out)
 
 
 def _play(args: argparse.Namespace) -> int:
@@ -210,7 +216,7 @@ def _play(args: argparse.Namespace) -> int:
     near = nearest(args.policy, registry.names())
     raise UnknownNameError(f"--agent={args.agent} acts on a task, and {args.policy} is none.{near}")
   return play(
-    args.policy if args.agent else working_copy(args.policy, registry.names()),
+    args.policy if args.agent else _run_path(args.policy),
     agent=args.agent,
     episodes=args.episodes,
     seed=args.seed,

@@ -39,6 +39,7 @@ from playground.config import (
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, one_sentence
 from playground.gc_pause import gc_paused
 from playground.rendering.gl import withhold_gl
+from playground.runs.wandb_artifacts import local_path
 from playground.settings import Plain
 from playground.trust import trust
 
@@ -89,6 +90,7 @@ def _main(argv: Sequence[str]) -> int:
     return _hydra_app(flags, overrides)
   if args.help:
     return _help(words, overrides)
+  overrides = [_downloaded(text) for text in overrides]
   if args.multirun:
     return _sweep(overrides, args.cfg, trusted)
   config = compose(overrides)
@@ -119,6 +121,12 @@ def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
     from playground.runs.together import train_together
 
   return train_together(configs)
+
+
+def _downloaded(override: str) -> str:
+  """The override with the local path of a policy on W&B, so that a configuration never names W&B."""
+  key, equals, value = override.partition("=")
+  return f"{key}={local_path(value)}" if key == "init_from" and equals else override
 
 
 def _help(keys: Sequence[str], overrides: Sequence[str]) -> int:

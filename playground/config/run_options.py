@@ -18,6 +18,7 @@ class WandbConfig:
   name: Annotated[str | None, "the run's name; null is that of the run directory"] = None
   tags: Annotated[Sequence[str], "words to find the run by"] = ()
   mode: Annotated[str, "auto is online if logged in, else offline; or online, offline, disabled"] = "auto"
+  upload: Annotated[bool, "whether the policy, videos and plots are uploaded when the run ends"] = False
 
 
 @dataclasses.dataclass(frozen=True)

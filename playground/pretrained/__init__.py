@@ -110,6 +110,15 @@ def is_pretrained(folder: Path) -> bool:
   return (folder / CARD).is_file()
 
 
+def copy_policy(run: Path, folder: Path) -> None:
+  """Copies a run's newest policy with its configuration and metrics, without what only resuming needs."""
+  step = max((run / "checkpoints").glob("[0-9]*"), key=lambda path: int(path.name))
+  folder.mkdir(parents=True)
+  for name in ("config.yaml", "overrides.yaml", "manifest.json", "metrics.csv"):
+    shutil.copyfile(run / name, folder / name)
+  shutil.copytree(step, folder / "checkpoints" / step.name, ignore=shutil.ignore_patterns("state", "replay"))
+
+
 def add(run: Path, task: str, facts: Section) -> Path:
   """Copies a run's policy into the package and writes its card.
 
@@ -122,13 +131,8 @@ def add(run: Path, task: str, facts: Section) -> Path:
     The folder.
   """
   folder = POLICIES / task
-  step = max((run / "checkpoints").glob("[0-9]*"), key=lambda path: int(path.name))
   shutil.rmtree(folder, ignore_errors=True)
-  folder.mkdir(parents=True)
-  for name in ("config.yaml", "overrides.yaml", "manifest.json", "metrics.csv"):
-    shutil.copyfile(run / name, folder / name)
-  keep = shutil.ignore_patterns("state", "replay")
-  shutil.copytree(step, folder / "checkpoints" / step.name, ignore=keep)
+  copy_policy(run, folder)
   (folder / "export").mkdir()
   for name in ("policy.onnx", "policy.yaml"):
     shutil.copyfile(run / "export" / name, folder / "export" / name)

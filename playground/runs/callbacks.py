@@ -131,12 +131,12 @@ class RunCallbacks:
     wall_clock_s = self.wall_clock_s
     if self._video:
       self._video.result()
+    plot_learning_curve(self._run_dir.metrics_csv, self._run_dir.plots)
     self.close("finished" if completed else "preempted")
     if self._rejected:
       self._progress.print(
         f"{self._rejected:,} gradient steps were NaN or infinite and left out (training/nonfinite_updates)."
       )
-    plot_learning_curve(self._run_dir.metrics_csv, self._run_dir.plots)
     if self._config.profile.enable and self._profile.is_dir():  # a run of one row has traced nothing
       for line in format_ops(write_top_ops(self._profile)):
         self._progress.print(line)

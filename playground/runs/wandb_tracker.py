@@ -58,6 +58,8 @@ class WandbTracker:
 
   def __init__(self, options: Section, folder: Path, config: Section, notify: Callable[[str], None] = print):
     self._notify = notify
+    self._folder = folder
+    self._upload = options["upload"]
     self._run: wandb.Run | None = None
     self._guard(lambda: self._start(options, folder, config))
 
@@ -67,6 +69,8 @@ class WandbTracker:
 
   def close(self, status: str) -> None:
     if (run := self._run) is not None:
+      if self._upload and status == "finished":
+        self._guard(lambda: self._log_files(run))
       self._guard(lambda: run.finish(exit_code=0 if status == "finished" else 1))
       self._run = None
 
@@ -91,19 +95,31 @@ class WandbTracker:
     except Exception as error:
       if mode != "online":
         raise
-      self._notify(f"W&B cannot be reached ({_reason(error)}): this run is recorded offline.")
+      self._notify(f"W&B cannot be reached ({reason(error)}): this run is recorded offline.")
       wandb.teardown()  # its service still holds the id
       self._run = wandb.init(**start, mode="offline")
     if recorded := sorted(folder.glob("wandb/offline-run-*")):  # the names begin with the time
       self._notify(f"W&B records this run offline; to upload it: wandb sync {recorded[-1]}")
+
+  def _log_files(self, run: "wandb.Run") -> None:
+    import wandb
+
+    from playground.runs.wandb_artifacts import upload
+
+    for video in sorted(self._folder.glob("videos/*.mp4"))[-1:]:
+      run.log({"video": wandb.Video(str(video), format="mp4")})
+    for plot in sorted(self._folder.glob("plots/*.png")):
+      run.log({f"plots/{plot.stem}": wandb.Image(str(plot))})
+    upload(run, self._folder)
 
   def _guard(self, call: Callable[[], object]) -> None:
     try:
       call()
     except Exception as error:  # whatever a third-party service throws, training is worth more
       self._run = None
-      self._notify(f"W&B tracking is off for the rest of this run ({_reason(error)}); metrics.csv goes on.")
+      self._notify(f"W&B tracking is off for the rest of this run ({reason(error)}); metrics.csv goes on.")
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
+  """The first line of an error's message."""
   return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")

@@ -16,7 +16,16 @@ from playground.runs.run_dir import RunDirectory
 from playground.runs.trackers import make_trackers
 from playground.runs.wandb_tracker import WandbTracker
 
-WANDB = {"enable": False, "project": "p", "entity": None, "group": None, "name": None, "tags": ["t"], "mode": "auto"}
+WANDB = {
+  "enable": False,
+  "project": "p",
+  "entity": None,
+  "group": None,
+  "name": None,
+  "tags": ["t"],
+  "mode": "auto",
+  "upload": False,
+}
 CONFIG = {"seed": 1, "tracking": {"tensorboard": False, "wandb": WANDB}}
 
 
