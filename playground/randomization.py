@@ -97,6 +97,7 @@ class _Draw(NamedTuple):
 
   def __call__(self, key: jax.Array) -> jax.Array:
     # One flat draw, a scalar if single: the order and shapes of Playground 0.2.0, so that the numbers are the same.
+    axes = None
     if self.term.operation == "rotate":
       key, axis_key = jax.random.split(key)
       shape = (*(() if self.term.shared else self.shape), 3)
@@ -108,7 +109,7 @@ class _Draw(NamedTuple):
     scalar = self.count == 1
     draw = _DISTRIBUTIONS[self.term.distribution](key, () if scalar else (self.count,), *self.term.parameters)
     draw = draw if scalar else draw.reshape(self.shape)
-    if self.term.operation == "rotate":
+    if axes is not None:
       axes = axes / jnp.linalg.norm(axes, axis=-1, keepdims=True)
       return jnp.broadcast_to(jnp.asarray(draw)[..., None] * axes, (*self.shape, 3))
     return draw

@@ -77,11 +77,13 @@ def policy_graph(
   if len(features) > 1:
     graph.value = features[0]
     graph.apply("Concat", *features[1:], axis=1)
+  size = 0
   for i, name in enumerate(layers):
     kernel, bias = np.asarray(params[name]["kernel"]), np.asarray(params[name]["bias"])
     last = i == len(layers) - 1
     if last:  # mean and deviation of the actions before they are squashed: the mean is the mode
-      kernel, bias = kernel[:, : len(bias) // 2], bias[: len(bias) // 2]
+      size = len(bias) // 2
+      kernel, bias = kernel[:, :size], bias[:size]
     graph.apply("Gemm", graph.constant(kernel), graph.constant(bias))
     if not last:
       ACTIVATIONS[activation](graph)
@@ -93,7 +95,7 @@ def policy_graph(
   graph.nodes[-1].output[0] = OUTPUT
   kinds = {entry: TensorProto.UINT8 if entry in pictures else TensorProto.FLOAT for entry in inputs}
   sources = [helper.make_tensor_value_info(names[entry], kinds[entry], [1, *inputs[entry]]) for entry in inputs]
-  sink = helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, [1, len(bias)])
+  sink = helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, [1, size])
   proto = helper.make_graph(graph.nodes, "policy", sources, [sink], graph.weights)
   model = helper.make_model(proto, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="playground-run")
   model.ir_version = IR_VERSION

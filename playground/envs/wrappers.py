@@ -235,19 +235,21 @@ class AutoReset(Wrapper):
     after = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action, model)
     own[PREFIX + "done_count"] += after.done.astype(jnp.int32)
     own |= {FINAL_OBS: after.obs} if self.keep_final_obs else {}
-    redraws = self.env.unwrapped.redraws
-    if self.full_reset or redraws:
+
+    def new_keys() -> jax.Array:
       keys = jax.vmap(jax.random.split)(own[PREFIX + "rng"])
       own[PREFIX + "rng"] = keys[:, 0]
+      return keys[:, 1]
+
     if self.full_reset:
       # A reset costs a forward pass over the whole batch: skip it in the steps in which nobody is done.
-      after = jax.lax.cond(after.done.any(), self._restart, lambda s, *_: s, after, keys[:, 1], model)
+      after = jax.lax.cond(after.done.any(), self._restart, lambda s, *_: s, after, new_keys(), model)
     else:
       data = after.data.replace(**where_done(after.done, own[PREFIX + "first_data"], start_of(after)))
       first = own[PREFIX + "first_info"]
       info = after.info | where_done(after.done, first, {name: after.info[name] for name in first})
-      if redraws:
-        info = jax.lax.cond(after.done.any(), self._redraw, lambda _, info, __: info, after.done, info, keys[:, 1])
+      if self.env.unwrapped.redraws:
+        info = jax.lax.cond(after.done.any(), self._redraw, lambda _, info, __: info, after.done, info, new_keys())
       after = after.replace(data=data, obs=where_done(after.done, own[PREFIX + "first_obs"], after.obs), info=info)
     return after.replace(info=after.info | own)
 

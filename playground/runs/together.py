@@ -4,9 +4,10 @@ import contextlib
 import sys
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, cast
 
 import jax
+from jax.stages import Compiled
 
 from playground.errors import CheckpointError, ConfigError, HardwareError, PlaygroundError
 from playground.hardware.mesh import device_memory
@@ -108,7 +109,7 @@ def memory_needed(program: CompiledFunctions, hardware: Hardware) -> str:
   Raises:
     HardwareError: a device has less.
   """
-  needs, limit = program.train.memory_analysis(), device_memory(hardware.mesh)
+  needs, limit = cast(Compiled, program.train).memory_analysis(), device_memory(hardware.mesh)
   if needs is None or limit is None:
     return ""
   size = needs.argument_size_in_bytes + needs.temp_size_in_bytes

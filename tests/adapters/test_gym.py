@@ -1,5 +1,8 @@
 """gymnasium's view of tasks: its own checker, its registry, and a batch whose episodes begin anew."""
 
+# pyright: reportPossiblyUnboundVariable=false
+# Loops of a constant length run at least once.
+
 import os
 import subprocess
 import sys

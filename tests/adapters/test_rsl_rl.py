@@ -1,5 +1,8 @@
 """The bridge to RSL-RL: nothing is copied, time-outs are no terminations, and RSL-RL's own runner trains on it."""
 
+# pyright: reportPossiblyUnboundVariable=false
+# Loops of a constant length run at least once.
+
 # torch is in an extra, which the type checker may not find
 # pyright: reportMissingImports=false
 
