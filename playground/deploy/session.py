@@ -72,6 +72,11 @@ class Session:
       if self.player.seconds <= self.player.period:  # of a new episode: nothing lies between it and the last
         self.previous_qpos = np.asarray(self.player.state.data.qpos)
 
+  def step(self) -> None:
+    """Lets the policy act once, and shows the state after it."""
+    self.player.decide()
+    self._begin()
+
   def qpos(self) -> np.ndarray:
     """The joints' positions at this instant, which lies between the last two decisions' [nq]."""
     model = self.player.env.mj_model

@@ -1,10 +1,12 @@
 """The viewer in the browser: its controls without one, then the page in a real Chromium."""
 
 import contextlib
+import gzip
 import importlib.util
 import shutil
 import socket
 import threading
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -83,6 +85,38 @@ def test_time(watch: Watch, session: Session) -> None:
   watch.panel.reset.value = True
   watch.frame()
   assert player.seconds <= 0.12  # a frame passes at most 0.1 s
+
+
+def test_a_single_step_pauses(watch: Watch, session: Session) -> None:
+  watch.panel.paused.value = False
+  watch.panel.step.value = True
+  session.carry_out()
+  assert session.paused and session.player.seconds == pytest.approx(session.player.period)
+  np.testing.assert_allclose(session.qpos(), session.player.state.data.qpos, atol=1e-6)
+
+
+def test_what_is_shown(watch: Watch, session: Session) -> None:
+  view = watch.view
+  watch.panel.command[0].value = 0.5
+  watch.frame()
+  arrow = view.arrows["commanded"]
+  tail, tip = arrow.points[0]
+  assert arrow.visible and np.linalg.norm(tip - tail) == pytest.approx(0.5, rel=1e-5) and tail[2] > 0
+  assert view.scene.camera_tracking_enabled and not view.scene.show_contact_forces
+  view.boxes["contacts"].value, view.boxes["velocity"].value, view.boxes["follow"].value = True, False, False
+  watch.frame()
+  assert view.scene.show_contact_forces and not arrow.visible and not view.scene.camera_tracking_enabled
+  view.boxes["contacts"].value, view.boxes["velocity"].value, view.boxes["follow"].value = False, True, True
+  watch.panel.leave.value = True
+  watch.frame()
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "identity"])
+def test_the_page_has_the_tasks_name(watch: Watch, encoding: str) -> None:
+  request = urllib.request.Request(watch.url, headers={"Accept-Encoding": encoding})
+  page = urllib.request.urlopen(request).read()
+  page = gzip.decompress(page) if encoding == "gzip" else page
+  assert b"<title>Go1JoystickFlatTerrain</title>" in page
 
 
 def test_push(watch: Watch, session: Session) -> None:

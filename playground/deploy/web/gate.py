@@ -6,7 +6,9 @@ of requests and messages, in the places that `websockets` has for it.
 """
 
 import asyncio
+import gzip
 import hmac
+import html
 import http
 import ipaddress
 import secrets
@@ -79,8 +81,15 @@ class Gate:
     url: the address to open, with the token where one is asked for.
   """
 
-  def __init__(self, host: str, port: int):
-    """Starts viser's server behind the gate; a token is asked for unless only this machine can connect."""
+  def __init__(self, host: str, port: int, title: str = "playground"):
+    """Starts viser's server behind the gate; a token is asked for unless only this machine can connect.
+
+    Args:
+      host: the address to listen at.
+      port: its port.
+      title: of the page.
+    """
+    self._title = title
     self._host, self._cookie = host, f"playground-{port}"
     self._token = None if _is_loopback(host, port) else secrets.token_urlsafe(24)
     self.server = self._start(host, port)
@@ -146,7 +155,7 @@ class Gate:
 
     websockets.asyncio.server.serve = guarded
     try:
-      server = viser.ViserServer(host, port, label="playground", verbose=False)
+      server = viser.ViserServer(host, port, label=self._title, verbose=False)
     finally:
       websockets.asyncio.server.serve = serve
     if not began:
@@ -160,6 +169,8 @@ class Gate:
     if refusal := self.check(request):
       return connection.respond(http.HTTPStatus.FORBIDDEN, f"Refused: {refusal}.\n")
     response = process_request(connection, request)
+    if response is not None and response.headers.get("Content-Type", "").startswith("text/html"):
+      _set_title(response, self._title)
     if response is not None and self._token is not None:  # the page's own connection has no token in its address
       response.headers["Set-Cookie"] = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
     return response
@@ -187,6 +198,17 @@ def need_port(host: str, port: int) -> None:
   except (OSError, OverflowError, UnicodeError) as error:
     reason = getattr(error, "strerror", None) or str(error)
     raise ConfigError(f"--web cannot listen on --host={host} --port={port}: {reason}; try another port.") from None
+
+
+def _set_title(response: Response, title: str) -> None:
+  """Replaces the title of viser's page, for which viser has no option."""
+  packed = response.headers.get("Content-Encoding") == "gzip"
+  page = gzip.decompress(response.body) if packed else response.body
+  page = page.replace(b"<title>Viser</title>", f"<title>{html.escape(title)}</title>".encode())
+  response.body = gzip.compress(page) if packed else page
+  if "Content-Length" in response.headers:
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
 
 
 def _is_loopback(host: str, port: int) -> bool:

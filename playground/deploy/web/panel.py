@@ -23,6 +23,15 @@ AXES: tuple[tuple[str, Key, Key], ...] = (
   ("left, m/s", "U", "O"),
   ("turn, rad/s", "J", "L"),
 )
+_KEYS = """
+I K, U O, J L: command; T: automatic commands
+
+space: pause; N: one step; R: reset; P: push
+
+W A S D, Q E, arrows, mouse: camera; ctrl K: all commands
+
+Gamepad: left stick moves, right stick turns; first button pushes, second resets, start pauses
+"""
 _ELSE = 1.0  # m/s and rad/s: the sliders' range for a task that does not tell one
 
 
@@ -39,6 +48,8 @@ class Panel:
     self._add_choices()
     with self._gui.add_folder("Return"):
       self.plots = Plots(self._gui, session.player)
+    with self._gui.add_folder("Keys and gamepad", expand_by_default=False):
+      self._gui.add_markdown(_KEYS)
     self._gamepads = Gamepads(
       server, session.ask, self._steer, {0: self._push, 1: session.reset, 9: self._toggle_pause}
     )
@@ -54,9 +65,8 @@ class Panel:
   def draw(self) -> None:
     """Shows where the session stands."""
     session, player = self._session, self._session.player
-    contract = player.exported.contract
     lines = [
-      f"**{contract['task']}**, {session.acting} steps trained",
+      f"{session.acting} steps trained",
       f"{player.seconds:.1f} s, return {player.episode_return:.2f}",
     ]
     if player.takes_commands:
@@ -104,6 +114,7 @@ class Panel:
       self.paused = self._gui.add_checkbox("Paused", False, hint="key space")
       self.paused.on_update(lambda _: setattr(session, "paused", self.paused.value))
       self._add_key("Pause", "space", self._toggle_pause)
+      self.step = self._add_button("Step", "N", self._step)
       self.speed = self._gui.add_slider("Speed", 0.05, 2.0, 0.05, 1.0, hint="simulated seconds in one")
       self.speed.on_update(lambda _: setattr(session, "speed", self.speed.value))
       most = max(0.5, session.push_speed)
@@ -141,6 +152,10 @@ class Panel:
 
   def _push(self) -> None:
     self._session.player.push(self.push_speed.value)
+
+  def _step(self) -> None:
+    self.paused.value = True
+    self._session.step()
 
   def _toggle_pause(self) -> None:
     self.paused.value = not self.paused.value

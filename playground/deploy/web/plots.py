@@ -19,7 +19,7 @@ class Plots:
     self._rows: list[list[float]] = []
     self.charts = [self._add("return", ["return"])]
     if player.term_sums:
-      self.charts.append(self._add("weighted terms of the reward, summed up", list(player.term_sums)))
+      self.charts.append(self._add("sums of weighted reward terms", list(player.term_sums)))
 
   def record(self, player: Player) -> None:
     """Notes where the episode stands."""

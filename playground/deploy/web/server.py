@@ -27,10 +27,10 @@ class Watch:
     """
     need_port(host, port)
     self.session = session
-    gate = Gate(host, port)
+    gate = Gate(host, port, session.player.exported.contract["task"])
     self.server, self.url = gate.server, gate.url
     self.panel = Panel(self.server, session)
-    self._view = View(self.server)
+    self.view = View(self.server)
     self._now = time.perf_counter()
     self._drawn = 0.0
 
@@ -47,7 +47,7 @@ class Watch:
       self.panel.say("This did not work", str(error))
     session.advance(min(self._now - last, _LONGEST))
     self.panel.record()
-    self._view.show(session.player, session.qpos())
+    self.view.show(session.player, session.qpos())
     if self._now - self._drawn > _DRAW:
       self.panel.draw()
       self._drawn = self._now
