@@ -52,6 +52,12 @@ def trusted_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
+def nothing_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+  """A stored program is found by the code in files, which is not what runs where a test replaces some of it."""
+  monkeypatch.setattr("playground.runs.train.stored_program", lambda *_, **__: None)
+
+
+@pytest.fixture(autouse=True)
 def logging_as_before() -> Iterator[None]:
   """Hydra's `--info` and hydra.verbose=true give the root logger a level, and a handler on what pytest closes."""
   root = logging.getLogger()

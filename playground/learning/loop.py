@@ -3,19 +3,20 @@
 The device is not kept waiting: a thread of its own logs and saves what was done while the next stretch runs.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
-from jax.stages import Wrapped
+from jax.stages import Compiled, Traced, Wrapped
 
 from playground.envs.wrappers import ModelFields
 from playground.gc_pause import gc_paused
@@ -24,8 +25,10 @@ from playground.hardware.mesh import divide, put
 from playground.learning.algorithm import Policy
 from playground.learning.evaluation import Evaluate, Recording
 from playground.learning.rollout import Step
+from playground.learning.stored_program import LoweredFunction, StoredProgram, UnusableProgramError
 from playground.learning.trainer import Trainer, TrainState
 from playground.pytree import PyTree
+from playground.text import first_line
 
 Metrics = dict[str, float]
 Draw = Callable[[], tuple[ModelFields, ModelFields]]  # randomised models, of the training and of the evaluation
@@ -99,7 +102,7 @@ class CompiledFunctions:
     evaluate: see `evaluation.make_evaluator`.
     model: randomised model fields of the training environments, each [num_envs, ...].
     eval_model: of the evaluation environments.
-    trace_s: how long tracing took.
+    trace_s: how long tracing took, 0 where an earlier start had stored the functions.
     compile_s: how long the compilers took from then.
     notice: a sentence on what went wrong with it, or None.
   """
@@ -116,43 +119,110 @@ class CompiledFunctions:
   notice: str | None
 
 
-def compile_program(trainer: Trainer, evaluate: Wrapped, draw: Draw, policy: Policy | None = None) -> CompiledFunctions:
-  """Traces each function once and compiles them side by side, Warp's kernels too, ahead of the first step.
+def compile_program(
+  trainer: Trainer,
+  evaluate: Wrapped,
+  draw: Draw,
+  policy: Policy | None = None,
+  stored: StoredProgram | None = None,
+) -> CompiledFunctions:
+  """Compiles all functions side by side, Warp's kernels too, ahead of the first step.
+
+  Each is traced once, unless an earlier start has stored them.
 
   Args:
     trainer: of the run.
     evaluate: (policy, key, model fields, settings) -> scores, jitted.
     draw: randomised model fields of the training and of the evaluation environments.
     policy: what a new run starts from, if it has any weights to start from.
+    stored: where the lowered functions are kept, None where they are not.
   """
-  agents = (trainer.num_agents,) if trainer.num_agents else ()
-  key, count = jax.ShapeDtypeStruct((*agents, 2), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
-  start = time.perf_counter()
-  pool = ThreadPoolExecutor(thread_name_prefix=COMPILER)
+  start, notices = time.perf_counter(), []
   kernels = trainer.env.unwrapped.physics.compile_ahead()
-  submit = lambda traced: pool.submit(traced.lower().compile)
+  pool = ThreadPoolExecutor(thread_name_prefix=COMPILER)
   try:
+    if stored is not None:
+      try:
+        if loaded := _compile_stored(trainer, draw, stored, pool):
+          return loaded
+      except UnusableProgramError as error:
+        notices.append(str(error))
     with gc_paused():  # tracing makes millions of objects
-      model, eval_model = jax.eval_shape(draw)
-      init = trainer.init.trace(key, model, policy, trainer.settings)
-      state = init.out_info
-      train = submit(trainer.train.trace(state, model, count))  # first, for it takes XLA longest
-      others = [
-        submit(init),
-        submit(trainer.reset.trace(state, key, model)),
-        submit(evaluate.trace(trainer.policy(state), key, eval_model, state.settings)),
-        submit(trainer.copy.trace(state)),
-      ]
+      futures = _trace(trainer, evaluate, draw, policy, stored, pool)
       trace_s = time.perf_counter() - start
-      models = divide(draw(), trainer.mesh)  # takes seconds, which XLA needs anyway
-      compiled = [future.result() for future in (train, *others)]
-    notice = None if kernels is None else kernels.wait()
+      model, eval_model = divide(draw(), trainer.mesh)  # takes seconds, which XLA needs anyway
+      results = {name: future.result() for name, future in futures.items()}
+    if kernels is not None:
+      notices.append(kernels.wait())
   finally:
     if kernels is not None:
       kernels.stop()
     pool.shutdown(wait=False, cancel_futures=True)  # an interrupted run does not wait for its compiler
   compile_s = time.perf_counter() - start - trace_s
-  return CompiledFunctions(*compiled, *models, trace_s=trace_s, compile_s=compile_s, notice=notice)
+  lowered = {name: function for name, (_, function) in results.items() if function is not None}
+  if stored is not None and len(lowered) == len(results):
+    try:
+      stored.save(lowered)
+    except OSError as error:
+      notices.append(f"The program was not stored, so the next start traces again: {first_line(error)}.")
+  compiled = {name: function for name, (function, _) in results.items()}
+  notice = " ".join(filter(None, notices)) or None
+  return CompiledFunctions(
+    **compiled, model=model, eval_model=eval_model, trace_s=trace_s, compile_s=compile_s, notice=notice
+  )
+
+
+def _compile_stored(
+  trainer: Trainer, draw: Draw, stored: StoredProgram, pool: ThreadPoolExecutor
+) -> CompiledFunctions | None:
+  """Compiles what is stored, None if nothing is; raises UnusableProgramError."""
+  start = time.perf_counter()
+  functions = stored.load()
+  if functions is None:
+    return None
+  futures = {name: pool.submit(function.compile, trainer.mesh) for name, function in functions.items()}
+  model, eval_model = divide(draw(), trainer.mesh)
+  try:
+    compiled = {name: future.result() for name, future in futures.items()}
+  except Exception as error:  # of any kind: JAX and XLA read a file
+    raise stored.discard(error) from error
+  compile_s = time.perf_counter() - start
+  return CompiledFunctions(
+    **compiled, model=model, eval_model=eval_model, trace_s=0.0, compile_s=compile_s, notice=None
+  )
+
+
+def _trace(
+  trainer: Trainer,
+  evaluate: Wrapped,
+  draw: Draw,
+  policy: Policy | None,
+  stored: StoredProgram | None,
+  pool: ThreadPoolExecutor,
+) -> dict[str, Future[tuple[Compiled, LoweredFunction | None]]]:
+  """Traces all functions and has the pool compile them: name to the function and what can be stored of it."""
+  agents = (trainer.num_agents,) if trainer.num_agents else ()
+  key, count = jax.ShapeDtypeStruct((*agents, 2), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
+
+  def compile_traced(function: Wrapped, traced: Traced, *args: PyTree) -> tuple[Compiled, LoweredFunction | None]:
+    if stored is not None:
+      with contextlib.suppress(ValueError, NotImplementedError):  # it calls what cannot be stored
+        lowered = LoweredFunction.of(function, traced, *args)
+        return lowered.compile(trainer.mesh), lowered
+    return traced.lower().compile(), None
+
+  def submit(function: Wrapped, *args: PyTree) -> Future[tuple[Compiled, LoweredFunction | None]]:
+    return pool.submit(compile_traced, function, function.trace(*args), *args)
+
+  model, eval_model = jax.eval_shape(draw)
+  state = trainer.init.trace(key, model, policy, trainer.settings).out_info
+  return {
+    "train": submit(trainer.train, state, model, count),  # first, for it takes XLA longest
+    "init": submit(trainer.init, key, model, policy, trainer.settings),
+    "reset": submit(trainer.reset, state, key, model),
+    "evaluate": submit(evaluate, trainer.policy(state), key, eval_model, state.settings),
+    "copy": submit(trainer.copy, state),
+  }
 
 
 @dataclasses.dataclass

@@ -1,13 +1,21 @@
-"""Which runs have the same compiled program, and so can train together."""
+"""Which runs have the same compiled program: they can train together, and a later start loads what one compiled."""
 
 import json
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from playground import fingerprint
 from playground.errors import ConfigError
+from playground.hardware.distributed import several
+from playground.hardware.setup import Hardware
+from playground.learning.stored_program import StoredProgram
+from playground.learning.trainer import Trainer
 from playground.mdp.options import is_model_field
 from playground.registry import task_class
-from playground.settings import Plain
+from playground.settings import Plain, below
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
@@ -23,13 +31,59 @@ def program_of(config: "RunConfig") -> str | None:
   alone = config.stages or config.tracking.wandb.enable or config.profile.enable or config.hardware.distributed.enable
   if alone:
     return None
+  names = [name for name in config.resolved if name not in ("seed", "run_dir", "resume", "init_from")]
   try:
-    traced = [f"agent.{name}" for name in config.agent.traced]
-    traced += [f"env.{name}" for name in task_class(config.resolved["env"]["task"]).settings_of(config.env)]
+    return _structure(config, names, config.init_from is not None)
   except ConfigError:  # which the run itself says, and nobody else's does
     return None
-  resolved = without(config.resolved, ["seed", "run_dir", "resume", *traced, *_startup_ranges(config)])
-  resolved["init_from"] = config.init_from is not None
+
+
+def stored_program(
+  config: "RunConfig", trainer: Trainer, hardware: Hardware, from_policy: bool
+) -> StoredProgram | None:
+  """Returns where a run's compiled functions are kept: in a file that is named by the hash of all that shapes them.
+
+  These are the sections of the configuration that `train.prepare` builds from, without the numbers that are arguments;
+  the task's values and arrays; the code, the versions and the machine (`fingerprint`).
+
+  Args:
+    config: of the run.
+    trainer: of the run.
+    hardware: of the process.
+    from_policy: whether the initial state is made from a policy.
+
+  Returns:
+    None where none are kept: without JAX's cache of compiled programs, on several machines, on Warp (its functions hold
+    addresses of this process), and for a task from a notebook.
+  """
+  env, cache = trainer.env.unwrapped, hardware.facts["compilation_cache"]
+  if not cache or "://" in str(cache) or several() or env.impl == "warp":
+    return None
+  placeholders = {name: np.ones_like(value) for name, value in trainer.settings.items()}
+  try:
+    parts = {
+      "settings": _structure(config, ["env", "agent", "hardware", "video"], from_policy),
+      "task": fingerprint.of_values(env.with_settings(below("env", placeholders)), without=[env.config]),
+      "arguments": [(name, value.shape) for name, value in placeholders.items()],
+      "agents": trainer.num_agents,
+      "code": fingerprint.of_code(),
+      **fingerprint.of_machine(trainer.mesh),
+    }
+  except fingerprint.NoFingerprintError:
+    return None
+  return StoredProgram(Path(str(cache), "programs", f"{fingerprint.digest(parts)}.program"))
+
+
+def _structure(config: "RunConfig", sections: list[str], from_policy: bool) -> str:
+  """Sections of a run's configuration without the numbers that are no constants of the program, as text.
+
+  Raises:
+    ConfigError: a term's number is invalid.
+  """
+  traced = [f"agent.{name}" for name in config.agent.traced]
+  traced += [f"env.{name}" for name in task_class(config.resolved["env"]["task"]).settings_of(config.env)]
+  resolved = without({name: config.resolved[name] for name in sections}, [*traced, *_startup_ranges(config)])
+  resolved["init_from"] = from_policy
   return json.dumps(resolved, sort_keys=True, default=str)
 
 

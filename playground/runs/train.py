@@ -28,6 +28,7 @@ from playground.learning.loop import (
   longest_stretch,
   schedule,
 )
+from playground.learning.stored_program import StoredProgram
 from playground.learning.trainer import Trainer, TrainState, trainer_settings
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
@@ -35,6 +36,7 @@ from playground.rendering.visuals import drawn_model
 from playground.runs.callbacks import NonMainCallbacks, RunCallbacks
 from playground.runs.chain import train_chain
 from playground.runs.interrupts import Interrupted, Interrupts, exit_code
+from playground.runs.programs import stored_program
 from playground.runs.progress import Progress, format_return
 from playground.runs.provenance import process_age_s
 from playground.runs.restore_plan import RestorePlan
@@ -91,7 +93,7 @@ class Training:
     trainer: of the task and the algorithm.
     events: the schedule.
     evaluate: see `evaluation.make_evaluator`.
-    draw: see `loop.compile_program`.
+    draw, stored: see `loop.compile_program`.
   """
 
   env: Env
@@ -100,6 +102,7 @@ class Training:
   events: list[ScheduleEvent]
   evaluate: Wrapped
   draw: Draw
+  stored: StoredProgram | None
 
   @property
   def steps(self) -> int:
@@ -108,7 +111,7 @@ class Training:
 
   def compile(self, plans: Sequence[RestorePlan]) -> CompiledFunctions:
     """Compiles what it needs; `plans` say what each agent starts from."""
-    return compile_program(self.trainer, self.evaluate, self.draw, self._policies(plans))
+    return compile_program(self.trainer, self.evaluate, self.draw, self._policies(plans), self.stored)
 
   def run(self, loop: Loop, plans: Sequence[RestorePlan], interrupts: Interrupts) -> tuple[TrainState, bool]:
     """Trains from where the runs begin; returns the last state, and whether the schedule was completed."""
@@ -165,7 +168,8 @@ def prepare(
   num_recorded = min(config.video.episodes, agent.num_eval_envs // trainer.num_devices) * config.video.enable
   other_acts = trainer.algorithm.other_acts()
   evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, trainer.mesh, num_recorded, other_acts)
-  return Training(env, drawn, trainer, events, evaluate, draw)
+  stored = stored_program(config, trainer, hardware, from_policy=plan.policy is not None)
+  return Training(env, drawn, trainer, events, evaluate, draw, stored)
 
 
 def _train_locked(
