@@ -60,10 +60,12 @@ def stored_program(
   if not cache or "://" in str(cache) or several() or env.impl == "warp":
     return None
   placeholders = {name: np.ones_like(value) for name, value in trainer.settings.items()}
+  task = env.with_settings(below("env", placeholders))
+  numbers = [env.config, *(getattr(env, name) for name in env.managers)]  # methods that are bound to `env` have them
   try:
     parts = {
       "settings": _structure(config, ["env", "agent", "hardware", "video"], from_policy),
-      "task": fingerprint.of_values(env.with_settings(below("env", placeholders)), without=[env.config]),
+      "task": fingerprint.of_values(task, without=numbers),
       "arguments": [(name, value.shape) for name, value in placeholders.items()],
       "agents": trainer.num_agents,
       "code": fingerprint.of_code(),

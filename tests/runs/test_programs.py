@@ -39,8 +39,8 @@ def test_it_lies_beside_jax_programs(known: Path):
 def test_a_reward_weight_is_an_argument():
   robot = ("env=Go1JoystickFlatTerrain",)
   one = stored("/cache", *robot)
-  assert one == stored("/cache", *robot, "env.rewards.track_linear_velocity.weight=2.0")
-  assert one != stored("/cache", *robot, "env.rewards.track_linear_velocity.weight=0")
+  assert one == stored("/cache", *robot, "env.rewards.action_rate_l2.weight=2.0")
+  assert one != stored("/cache", *robot, "env.rewards.action_rate_l2.weight=0")
 
 
 @pytest.mark.parametrize("override", ["seed=2", "agent.learning_rate=1e-5", "tracking=csv", "checkpoint.keep=3"])
