@@ -47,8 +47,8 @@ def batch(networks: FastSACNetworks, size: int = 16, **changes: Any) -> Transiti
 
 
 def test_the_policy_begins_at_0_with_a_small_deviation(networks: FastSACNetworks) -> None:
-  params, data = networks.init(jax.random.PRNGKey(0)), batch(networks)
-  logits = networks.logits(params.policy, data.obs)
+  params, data = jax.jit(networks.init)(jax.random.PRNGKey(0)), batch(networks)
+  logits = jax.jit(networks.logits)(params.policy, data.obs)
   np.testing.assert_array_equal(networks.distribution.mode(logits), 0)
   np.testing.assert_allclose(networks.distribution.create_dist(logits).scale, np.exp(-2.5), rtol=1e-6)
   assert float(params.log_alpha) == pytest.approx(np.log(0.001))
@@ -68,8 +68,8 @@ def test_log_probabilities_are_those_of_the_squashed_actions() -> None:
 
 def test_each_critic_learns_soft_values_from_its_own_target(networks: FastSACNetworks) -> None:
   data = batch(networks, discount=jnp.tile(jnp.array([0.0, 1.0]), 8))
-  params, target = networks.init(jax.random.PRNGKey(0)), networks.init(jax.random.PRNGKey(9))
-  action, log_prob = networks.sample(params.policy, data.next_obs, jax.random.PRNGKey(1))
+  params, target = (jax.jit(networks.init)(jax.random.PRNGKey(seed)) for seed in (0, 9))
+  action, log_prob = jax.jit(networks.sample)(params.policy, data.next_obs, jax.random.PRNGKey(1))
   alpha = 0.2
   following = np.asarray(jax.nn.softmax(networks.q(target.q, data.next_obs, action)), np.float64)
   log = np.asarray(jax.nn.log_softmax(networks.q(params.q, data.obs, data.action)), np.float64)
@@ -79,10 +79,8 @@ def test_each_critic_learns_soft_values_from_its_own_target(networks: FastSACNet
     reward = float(data.reward[i]) - discount * alpha * float(log_prob[i])
     for k in (0, 1):
       expected -= (projected(following[k, i], reward, discount, -3, 3) * log[k, i]).sum() / 16
-  loss = lambda data, alpha: float(
-    critic_loss(params.q, target.q, data, action, log_prob, jnp.float32(alpha), networks, SMALL)[0]
-  )
-  assert loss(data, alpha) == pytest.approx(expected, rel=1e-4)
+  loss = jax.jit(lambda data, alpha: critic_loss(params.q, target.q, data, action, log_prob, alpha, networks, SMALL)[0])
+  assert float(loss(data, alpha)) == pytest.approx(expected, rel=1e-4)
   over = data.replace(discount=jnp.zeros(16))
   assert loss(over, alpha) == loss(over, 9.0), "no entropy bonus after the end"
   assert loss(data.replace(nonfinite=jnp.ones(16)), alpha) == 0
@@ -97,13 +95,13 @@ def test_the_temperature_follows_the_entropy() -> None:
 
 
 def test_the_actor_climbs_the_mean_of_both_critics_and_keeps_its_entropy(networks: FastSACNetworks) -> None:
-  params, data, key = networks.init(jax.random.PRNGKey(0)), batch(networks), jax.random.PRNGKey(1)
-  action, log_prob = networks.sample(params.policy, data.obs, key)
-  values = networks.atoms.mean(jax.nn.softmax(networks.q(params.q, data.obs, action)))
-  loss = lambda policy, alpha: policy_loss(policy, params.q, jnp.float32(alpha), data, key, networks)
+  params, data, key = jax.jit(networks.init)(jax.random.PRNGKey(0)), batch(networks), jax.random.PRNGKey(1)
+  action, log_prob = jax.jit(networks.sample)(params.policy, data.obs, key)
+  values = networks.atoms.mean(jax.nn.softmax(jax.jit(networks.q)(params.q, data.obs, action)))
+  loss = jax.jit(lambda policy, alpha: policy_loss(policy, params.q, alpha, data, key, networks))
   expected = float((0.5 * log_prob - values.mean(axis=0)).mean())
   assert float(loss(params.policy, 0.5)) == pytest.approx(expected, rel=1e-5)
-  slope = jax.grad(loss)(params.policy, 0.0)
+  slope = jax.jit(jax.grad(loss))(params.policy, 0.0)
   moved = jax.tree.map(lambda p, g: p - 0.05 * g, params.policy, slope)
   assert loss(moved, 0.0) < loss(params.policy, 0.0)
 

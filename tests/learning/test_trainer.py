@@ -30,15 +30,15 @@ from tests.dummy import (
   point_trainer,
 )
 
-every_algorithm = pytest.mark.parametrize("config", SMALL.values(), ids=SMALL)
-# Each compiles a trainer of its own: PPO and SAC for those on and off policy, all by `make test-slow`.
-two_of_them = pytest.mark.parametrize(
-  "config",
-  [
-    pytest.param(config, id=name, marks=[pytest.mark.slow] * (name not in ("ppo", "sac")))
-    for name, config in SMALL.items()
-  ],
-)
+
+def algorithms(*fast: str) -> pytest.MarkDecorator:
+  """A parameter `config`, of every algorithm: those that are not named only by `make test-slow`."""
+  marks = {name: [pytest.mark.slow] * (name not in fast) for name in SMALL}
+  return pytest.mark.parametrize("config", [pytest.param(SMALL[name], id=name, marks=marks[name]) for name in SMALL])
+
+
+every_algorithm = algorithms("ppo", "sac", "reppo", "fast_td3")  # FastSAC's training step is SAC's and FastTD3's
+two_of_them = algorithms("ppo", "sac")  # where each compiles a trainer of its own: one on and one off policy
 
 
 @cache
