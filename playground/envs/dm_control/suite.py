@@ -37,7 +37,7 @@ class SuiteTask(Env):
   robot = None
 
   def __init__(self, config: Any):
-    """Compiles the scene and binds the terms. `config`: the task's, e.g. `configs/env/_walker.yaml`."""
+    """Compiles the scene and binds the terms. `config`: the task's, e.g. `configs/env/WalkerStand.yaml`."""
     for name, entry in (config.get("events") or {}).items():
       if entry is not None and entry.get("mode") != "startup":
         raise ConfigError(f"env.events.{name}.mode={entry.get('mode')}: tasks of this suite have startup events only.")
