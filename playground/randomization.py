@@ -8,10 +8,6 @@ events:
     mode: startup
     func: model_field
     params: {field: body_mass, target: all, operation: scale, range: [0.9, 1.1]}
-  payload:
-    mode: startup
-    func: model_field
-    params: {field: body_mass, target: trunk, operation: add, distribution: normal, mean: 0.0, std: 0.5}
 ```
 
 Those of mode `startup` are drawn once an environment and become model fields with a batch axis; those of mode `reset`
@@ -39,21 +35,10 @@ from playground.mdp.options import MODEL_FIELD, is_model_field
 from playground.mdp.terms import bind_one
 from playground.text import format_value
 
-# Whose rows a field has, by the prefix of its name: object type and number of objects.
-_OBJECTS = {
-  "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
-  "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
-  "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
-  "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
-  "tendon": (mujoco.mjtObj.mjOBJ_TENDON, "ntendon"),
-  "pair": (mujoco.mjtObj.mjOBJ_PAIR, "npair"),
-  "light": (mujoco.mjtObj.mjOBJ_LIGHT, "nlight"),
-  "cam": (mujoco.mjtObj.mjOBJ_CAMERA, "ncam"),
-  "mat": (mujoco.mjtObj.mjOBJ_MATERIAL, "nmat"),
-  "jnt": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
-  "dof": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
-  "qpos": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
-}
+# Whose rows a field has, by the prefix of its name: kind of object, where the prefix is not its name.
+_PREFIXES = {"cam": "camera", "mat": "material", "jnt": "joint", "dof": "joint", "qpos": "joint"}
+_PREFIXES |= {name: name for name in ("geom", "body", "site", "actuator", "tendon", "pair", "light")}
+_COUNTERS = {"actuator": "nu", "dof": "njnt", "qpos": "njnt"}  # of objects, where it is not n<prefix>
 # What stands in two fields: (field, column, sign) of each. A servo pulls with gain * ctrl + bias * q, so its position
 # gain is in both with opposite signs; a body that is denser has more inertia in proportion.
 _LINKED: dict[str, tuple[tuple[str, int | None, float], ...]] = {
@@ -238,7 +223,7 @@ def _randomizable(mj_model: mujoco.MjModel) -> list[str]:
   """Fields of numbers or switches that are arrays (not constants) of an `mjx.Model`, with a row per object."""
   fields = dataclasses.fields(mjx.Model)  # pyright: ignore[reportArgumentType]  # MJX's own dataclass decorator
   names = [field.name for field in fields if field.type in (jax.Array, "jax.Array")]
-  arrays = {name: getattr(mj_model, name, None) for name in names if _prefix(name) in _OBJECTS}
+  arrays = {name: getattr(mj_model, name, None) for name in names if _prefix(name) in _PREFIXES}
   return [n for n, a in arrays.items() if isinstance(a, np.ndarray) and a.dtype.kind in "fb" and a.ndim in (1, 2)]
 
 
@@ -249,10 +234,8 @@ def _prefix(field: str) -> str:
 def _rows(mj_model: mujoco.MjModel, term: ModelField, key: str) -> np.ndarray:
   """Rows of a term's field that belong to its target."""
   prefix = _prefix(term.field)
-  kind, counter = _OBJECTS[prefix]
-  count = getattr(mj_model, counter)
-  starts = np.arange(count)
-  end = count
+  kind, count = _PREFIXES[prefix], getattr(mj_model, _COUNTERS.get(prefix, f"n{prefix}"))
+  starts, end = np.arange(count), count
   if prefix in ("dof", "qpos"):  # a joint has as many rows as it has degrees of freedom, or coordinates
     starts = getattr(mj_model, f"jnt_{prefix}adr")
     end = mj_model.nv if prefix == "dof" else mj_model.nq
@@ -260,16 +243,15 @@ def _rows(mj_model: mujoco.MjModel, term: ModelField, key: str) -> np.ndarray:
   if term.target == "all":
     chosen = spans
   elif term.target == "joints":
-    if kind != mujoco.mjtObj.mjOBJ_JOINT:
+    if kind != "joint":
       raise ConfigError(f"{key}.target='joints' needs a field of joints (jnt_*, dof_*, qpos*), not {term.field!r}.")
     chosen = [s for s, t in zip(spans, mj_model.jnt_type, strict=True) if t != mujoco.mjtJoint.mjJNT_FREE]
   else:
-    ids = {name: i for i in range(count) if (name := mujoco.mj_id2name(mj_model, kind, i))}
+    ids = {name: i for i in range(count) if (name := getattr(mj_model, kind)(i).name)}
     targets = [term.target] if isinstance(term.target, str) else list(dict.fromkeys(term.target))
     for name in targets:
       if name not in ids:
-        what = kind.name.removeprefix("mjOBJ_").lower()
-        raise UnknownNameError(f"{key}.target {name!r} is no {what} of the model.{nearest(str(name), ids)}")
+        raise UnknownNameError(f"{key}.target {name!r} is no {kind} of the model.{nearest(str(name), ids)}")
     chosen = [spans[ids[name]] for name in targets]
   rows = np.array([row for span in chosen for row in span], dtype=np.int32)
   if not rows.size:

@@ -1,19 +1,21 @@
 """Playground 0.2.0's arms, upstream bugs included."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco.mjx._src.math import axis_angle_to_quat, quat_to_mat
+from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul, quat_to_mat
 
+from playground.envs.base import State
 from playground.envs.manipulation import arm, handover, peg, pick_cartesian, push
 from playground.envs.manipulation.arm import TabletopTask
 from playground.envs.task import InitialState
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.mdp.manipulators import ArmContext, ArmRobot
 from playground.physics.backend import PhysicsData, mjx
-from playground.robots.panda.kinematics import JOINT_RANGE
+from playground.robots.panda.kinematics import JOINT_RANGE, inverse_kinematics
 
 
 class _NoForward(TabletopTask):
@@ -77,15 +79,17 @@ class PickCubeCartesian(_NoForward, pick_cartesian.PickCubeCartesian):
     super().__init__(config)
     self._guide_tip = self._tip
 
-  @property
-  def box_height(self) -> jax.Array:
-    return jnp.zeros(())
+  def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
+    initial = super().initial_state(key, model)
+    return initial.replace(qpos=initial.qpos.at[self.robot.free_joint("box").stop - 1].set(0.0))
 
-  def _tip_after(self, before: jax.Array, planned: jax.Array, solved: jax.Array) -> jax.Array:
-    return planned
-
-  def _is_solved(self, joints: jax.Array) -> jax.Array:
-    return jnp.isfinite(joints).all()
+  def _plan(
+    self, ctrl: jax.Array, info: Mapping[str, Any], action: jax.Array
+  ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    step = self._action_scale * jnp.array([0.0, action[0], action[1]])
+    tip = jnp.clip(info["current_pos"] + step, *pick_cartesian.WORKSPACE)
+    joints = inverse_kinematics(tip, self.attitude, ctrl[6], near=ctrl[:7])
+    return tip, joints, jnp.isfinite(joints).all()
 
 
 class PickCubeCartesianVision(PickCubeCartesian, pick_cartesian.PickCubeCartesianVision):
@@ -113,7 +117,7 @@ class PushCube(_NoForward, push.PushCube):
 
   def __init__(self, config: Any):
     super().__init__(config)
-    self.arm_spread = push._ARM_SPREAD * JOINT_RANGE
+    self.arm_spread = push.ARM_SPREAD * JOINT_RANGE
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     return super().first_info(data, key, model)
@@ -127,10 +131,13 @@ class PushCube(_NoForward, push.PushCube):
   def _next_level(self, c: ArmContext) -> jax.Array:
     return c.info[PRESERVE_INFO]["curriculum_id"] + self.goal_reached(c)
 
-  def _next_goal(
-    self, place_key: jax.Array, turn_key: jax.Array, data: PhysicsData, level: jax.Array
-  ) -> tuple[jax.Array, jax.Array]:
-    return super()._next_goal(place_key, place_key, data, level)
+  def pre_step(self, state: State) -> State:
+    data, level = state.data, state.info[PRESERVE_INFO]["curriculum_id"]
+    _, key, _ = jax.random.split(state.info["rng"], 3)
+    quat = quat_mul(data.xquat[self.mj_model.body("box").id], push.draw_yaw(key, self.angles[level]))
+    quat = jnp.where(state.info["goal_reached"], quat, data.mocap_quat[0])[None]
+    state = super().pre_step(state)
+    return state.replace(data=state.data.replace(mocap_quat=quat))
 
 
 # Terms of PushCube.

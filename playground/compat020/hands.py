@@ -13,7 +13,7 @@ from playground.envs.manipulation import reorient, rotate
 from playground.envs.manipulation.in_hand import HandTask
 from playground.envs.task import InitialState
 from playground.mdp import events
-from playground.mdp.poses import Pose, sensed_pose
+from playground.mdp.poses import Pose, sensed_pose, uniform_quat
 from playground.physics.backend import PhysicsData, mjx
 
 
@@ -22,8 +22,11 @@ class _HandTask(HandTask):
 
   episode_info = ()
 
-  def prepare_goal(self, goal: mujoco.MjsBody) -> None:
-    del goal
+  def scene(self, config: Any) -> mujoco.MjSpec:
+    spec = super().scene(config)
+    block = spec.body("goal").geoms[-1]
+    block.contype = block.conaffinity = 1
+    return spec
 
   def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:
     del model
@@ -41,8 +44,12 @@ class Reorient(_HandTask, reorient.Reorient):
   def sense_cube(self, info: Mapping[str, Any], pose: Pose) -> Pose:
     if not self.pose_noise:
       return pose
-    turn = lambda key, quat, size: normalize(quat + size * jax.random.normal(key, (4,)))
-    return sensed_pose(info["pose_key"], pose, self.pose_noise, self.config.noise_level, turn)
+    noise, level = self.pose_noise, self.config.noise_level
+    pos, _ = sensed_pose(info["pose_key"], pose, noise, level)
+    _, quat_key, wrong_key, _, wrong_quat_key = jax.random.split(info["pose_key"], 5)
+    quat = normalize(pose[1] + level * noise.angle * jax.random.normal(quat_key, (4,)))
+    wrong = level * jax.random.bernoulli(wrong_key, noise.injection)
+    return pos, quat * (1 - wrong) + uniform_quat(wrong_quat_key) * wrong
 
 
 @dataclasses.dataclass

@@ -62,7 +62,7 @@ class Env(abc.ABC):
   episode_info: ClassVar[tuple[str, ...]] = ()
   # Attributes that manage terms, named as their part of the config: numbers there are settings of the programs.
   managers: ClassVar[tuple[str, ...]] = ()
-  # Whether `redraw` draws anything at the start of an episode that an auto-reset would not.
+  # Whether `redraw(info, key)` draws entries of `info` for an episode that an auto-reset starts from a stored state.
   redraws: bool = False
 
   def __init__(self, config: Any, mj_model: mujoco.MjModel):
@@ -110,10 +110,6 @@ class Env(abc.ABC):
   def model_of(self, info: Mapping[str, Any], model: mjx.Model | None) -> mjx.Model:
     """Returns the model that a step simulates: `model` if given (a randomised one), else the task's own."""
     return self.mjx_model if model is None else model
-
-  def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
-    """Returns `info` with what a new episode draws, for an auto-reset, which starts it from a stored state."""
-    return info
 
   @classmethod
   def settings_of(cls, config: Any) -> dict[str, np.ndarray]:

@@ -59,7 +59,7 @@ class CPhysics(Physics):
     with self._lock:
       for i in np.ndindex(batch):
         for name, value in state.items():
-          self._write(name, value[i])
+          setattr(self._c_data, name, value[i].reshape(np.shape(getattr(self._c_data, name))))
         if num_substeps:
           mujoco.mj_step(self._c_model, self._c_data, num_substeps)
         else:
@@ -67,13 +67,6 @@ class CPhysics(Physics):
         for name, values in out.items():
           values[i] = np.reshape(getattr(self._c_data, name), self._shapes[name].shape)
     return out
-
-  def _write(self, name: str, value: np.ndarray) -> None:
-    if name == "time":
-      self._c_data.time = float(value)
-    else:
-      field = getattr(self._c_data, name)
-      field[...] = value.reshape(field.shape)
 
 
 def on_c_physics(env: Env) -> Env:

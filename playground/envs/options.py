@@ -78,7 +78,7 @@ class TaskKeys:
 
 # Limits of the numbers of tasks' own keys, by name: the first that matches.
 NUMBERS = {
-  "links": count(1, 1000),
+  "links": count(3, 1000),
   "success_steps": count(0),
   "gripper_delay": count(0, 1000),
   "action_delay observation_delay": Limit(0, 1000, whole=True, form="list", length=2, rising=True),

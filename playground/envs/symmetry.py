@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import mujoco
 import numpy as np
+from scipy.linalg import block_diag
 
 from playground.envs.base import Env
 from playground.envs.task import Task
@@ -58,16 +59,20 @@ def mirror_of(env: Env) -> Mirror:
   task: Any = env.unwrapped
   if not isinstance(task, Task) or not isinstance(task.robot, LeggedRobot):
     raise ConfigError("only tasks of robots on legs have a left-right mirror, and this task has no such robot.")
-  joints, feet = joint_reflection(task.robot), _feet_reflection(task.robot)
-  groups: dict[str, Reflection] = {}
+  robot, joints = task.robot, joint_reflection(task.robot)
+  of_joints = np.eye(len(joints.sign))[joints.source] * joints.sign[:, None]
+  of_feet = np.eye(len(robot.foot_names))[partners(robot, robot.foot_names)]
+  groups: dict[str, np.ndarray] = {}
   for group, sizes in task.observation_parts.items():
     parts = []
     for term in task.observations.groups[group]:
       inherits = group != ACTOR and term.name == ACTOR
-      parts.append(groups[ACTOR] if inherits else _of_term(term, sizes[term.name], joints, feet))
-    whole = _concatenated(parts)
-    groups[group] = _repeated(whole, sum(sizes.values()))  # the group `state` may hold several steps
-  return Mirror(groups, joints)
+      parts.append(groups[ACTOR] if inherits else _of_term(term, sizes[term.name], of_joints, of_feet))
+    groups[group] = _repeated(
+      np.asarray(block_diag(*parts)), sum(sizes.values())
+    )  # the group `state` may hold several steps
+  obs = {group: Reflection(np.abs(m).argmax(axis=1), m.sum(axis=1, dtype=np.float32)) for group, m in groups.items()}
+  return Mirror(obs, joints)
 
 
 def joint_reflection(robot: LeggedRobot) -> Reflection:
@@ -100,10 +105,6 @@ def joint_reflection(robot: LeggedRobot) -> Reflection:
   return Reflection(source, sign.astype(np.float32))
 
 
-def _feet_reflection(robot: LeggedRobot) -> Reflection:
-  return Reflection(partners(robot, robot.foot_names), np.ones(len(robot.foot_names), np.float32))
-
-
 def partners(robot: LeggedRobot, names: tuple[str, ...]) -> np.ndarray:
   """Returns the index of the part on the other side, for each of `names`; a part on neither side is its own.
 
@@ -132,41 +133,30 @@ def _other_side(name: str, pairs: Mapping[str, str]) -> str:
   return name
 
 
-def _of_term(term: Term, size: int, joints: Reflection, feet: Reflection) -> Reflection:
+def _of_term(term: Term, size: int, joints: np.ndarray, feet: np.ndarray) -> np.ndarray:
+  """The matrix that turns a term's vector of `size` into its mirror image, shape [size, size]."""
   kind: MirrorKind | None = getattr(term.func, "mirror", None)
   if kind is None:
     raise ConfigError(
       f"{term.key} does not say how it mirrors: write @mirrors_as(...) (playground.mdp.options) above its function, "
       f"{term.func.__module__}:{term.func.__name__}."
     )
-  if kind in _SIGNS:
-    sign = np.array(_SIGNS[kind], np.float32)
-    whole = Reflection(np.arange(len(sign)), sign)
-  elif kind == "feet_polar":
-    source = (3 * feet.source[:, None] + np.arange(3)).ravel()
-    whole = Reflection(source, np.tile(np.array(_SIGNS["polar"], np.float32), len(feet.source)))
-  else:
-    whole = joints if kind == "joints" else feet
-  whole = _repeated(whole, size)
+  matrices = {name: np.diag(signs) for name, signs in _SIGNS.items()} | {"joints": joints, "feet": feet}
+  matrices["feet_polar"] = np.kron(feet, matrices["polar"])
+  whole = _repeated(matrices[kind], size)
   _check_options(term, whole)
   return whole
 
 
-def _check_options(term: Term, whole: Reflection) -> None:
+def _check_options(term: Term, whole: np.ndarray) -> None:
   """Raises ConfigError where a term's scale or clip treats left and right differently."""
   scale, clip = term.options.scale, term.options.clip
-  factors = np.resize(np.atleast_1d(1.0 if scale is None else scale), len(whole.sign))
-  uneven = clip is not None and clip[0] != -clip[1] and (whole.sign < 0).any()
-  if uneven or not np.array_equal(np.abs(factors), np.abs(factors[whole.source])):
+  factors = np.abs(np.resize(np.atleast_1d(1.0 if scale is None else scale), len(whole)))
+  uneven = clip is not None and clip[0] != -clip[1] and (whole < 0).any()
+  if uneven or not np.array_equal(factors, np.abs(whole) @ factors):
     raise ConfigError(f"{term.key}: its scale or clip is not the same on the left and on the right.")
 
 
-def _concatenated(parts: list[Reflection]) -> Reflection:
-  starts = np.cumsum([0, *(len(part.sign) for part in parts[:-1])])
-  source = np.concatenate([start + part.source for start, part in zip(starts, parts, strict=True)])
-  return Reflection(source, np.concatenate([part.sign for part in parts]))
-
-
-def _repeated(part: Reflection, size: int) -> Reflection:
-  """A vector of `size` that holds a vector several times, one after the other."""
-  return part if len(part.sign) == size else _concatenated([part] * (size // len(part.sign)))
+def _repeated(matrix: np.ndarray, size: int) -> np.ndarray:
+  """The matrix for a vector of `size` that holds a vector several times, one after the other."""
+  return np.kron(np.eye(size // len(matrix)), matrix)

@@ -128,6 +128,7 @@ class Task(Env):
     return model.tree_replace(info[_MODEL_FIELDS]) if self.redraws else model  # pyright: ignore[reportReturnType]
 
   def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
+    """Returns `info` with what a new episode draws."""
     return info | {_MODEL_FIELDS: self._episode_models.sample(key)} if self.redraws else info
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:

@@ -1,6 +1,7 @@
 """How large Warp's buffers must be for a task: the most that a policy makes it need."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import jax
@@ -36,9 +37,9 @@ class BufferSizes:
 
   def advised(self) -> dict[str, int]:
     """`njmax`, `naconmax_per_env` and `naccdmax_per_env`, with some room."""
-    pairs = _round_up(self.contacts * ROOM, 1)
-    convex = min(_round_up(self.convex * ROOM, 1), pairs)  # Warp takes no more of them
-    return {"njmax": _round_up(self.constraints * ROOM, 4), "naconmax_per_env": pairs, "naccdmax_per_env": convex}
+    pairs = math.ceil(self.contacts * ROOM)
+    convex = min(math.ceil(self.convex * ROOM), pairs)  # Warp takes no more of them
+    return {"njmax": _rows(self.constraints), "naconmax_per_env": pairs, "naccdmax_per_env": convex}
 
 
 def measure_buffers(
@@ -74,14 +75,10 @@ def measure_buffers(
     use = _roll(env, act, num_envs, num_steps, seed, on_steps)
     if not use.overflow:
       return BufferSizes(int(use.constraints), int(use.contacts) / num_envs, convex)
-    grew = False
-    if use.constraints > rows:
-      rows, grew = _round_up(int(use.constraints) * ROOM, 4), True
-    if use.contacts > pairs * num_envs:
-      pairs, grew = 2 * pairs, True
-    if use.overflow & _CCD and convex < pairs:
-      convex, grew = 2 * convex, True
-    if not grew:
+    rows = _rows(int(use.constraints)) if use.constraints > rows else rows
+    pairs *= 2 if use.contacts > pairs * num_envs else 1
+    convex *= 2 if use.overflow & _CCD and convex < pairs else 1
+    if sizes == sizes | {"njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": convex}:
       break
   bits = _overflow_names(int(use.overflow))  # pyright: ignore[reportPossiblyUnboundVariable]
   raise ConfigError(
@@ -96,7 +93,6 @@ def _roll(
   wrapped = wrap_for_training(env)
   reset_key, act_key = jax.random.split(jax.random.PRNGKey(seed))
   uniform = lambda obs, key: jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
-
   keys = jax.random.split(act_key, num_steps)
 
   @jax.jit
@@ -130,5 +126,6 @@ def _overflow_names(bits: int) -> str:
   return ", ".join(flag.name or str(flag.value) for flag in OverflowType if flag & bits and flag != OverflowType.ALL)
 
 
-def _round_up(value: float, multiple: int) -> int:
-  return -(-int(-(-value // 1)) // multiple) * multiple
+def _rows(constraints: int) -> int:
+  """That many constraint rows with some room, a multiple of 4."""
+  return 4 * math.ceil(constraints * ROOM / 4)

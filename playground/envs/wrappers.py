@@ -37,12 +37,6 @@ class Wrapper:
   def __init__(self, env: Any):
     self.env = env
 
-  def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
-    return self.env.reset(rng, model)
-
-  def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    return self.env.step(state, action, model)
-
   def with_settings(self, values: Mapping[str, jax.Array]) -> Self:
     """Returns the same with other values of the task's settings."""
     other = copy.copy(self)
@@ -249,12 +243,11 @@ class AutoReset(Wrapper):
       first = own[PREFIX + "first_info"]
       info = after.info | where_done(after.done, first, {name: after.info[name] for name in first})
       if self.env.unwrapped.redraws:
-        info = jax.lax.cond(after.done.any(), self._redraw, lambda _, info, __: info, after.done, info, new_keys())
+        keys = new_keys()
+        redraw = lambda info: where_done(after.done, jax.vmap(self.env.unwrapped.redraw)(info, keys), info)
+        info = jax.lax.cond(after.done.any(), redraw, lambda info: info, info)
       after = after.replace(data=data, obs=where_done(after.done, own[PREFIX + "first_obs"], after.obs), info=info)
     return after.replace(info=after.info | own)
-
-  def _redraw(self, done: jax.Array, info: dict[str, Any], keys: jax.Array) -> dict[str, Any]:
-    return where_done(done, jax.vmap(self.env.unwrapped.redraw)(info, keys), info)
 
   def _restart(self, after: State, keys: jax.Array, model: ModelFields | None) -> State:
     fresh = self.env.reset(keys, model)

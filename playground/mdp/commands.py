@@ -5,7 +5,6 @@ entries of `info` that an episode starts with, `step(c, key)` those for the next
 episode that ends starts the time of its command over, but keeps the command.
 """
 
-import abc
 import dataclasses
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -23,7 +22,7 @@ _AT_REST = np.pi  # the phase of a foot that stays on the floor
 
 
 @dataclasses.dataclass
-class _VelocityCommand(abc.ABC):
+class _VelocityCommand:
   """Writes `command` [3] (forward m/s, left m/s, turn rad/s) and `command_steps_left`.
 
   Attributes:
@@ -62,17 +61,15 @@ class _VelocityCommand(abc.ABC):
     seconds = self.resample_s * (jax.random.exponential(key) if self.exponential else jnp.ones(()))
     return jnp.round(seconds / self._dt).astype(jnp.int32)
 
-  def _uniform(self, key: jax.Array) -> jax.Array:
+  def _first(self, key: jax.Array) -> jax.Array:
+    """Draws the command that an episode starts with."""
     high = jnp.array(self.max, jnp.float32)
     low = -high if self.min is None else jnp.array(self.min, jnp.float32)
     return jax.random.uniform(key, (3,), minval=low, maxval=high)
 
-  def _first(self, key: jax.Array) -> jax.Array:
-    return self._uniform(key)
-
-  @abc.abstractmethod
   def _next(self, key: jax.Array, command: jax.Array) -> jax.Array:
     """Draws the command that follows another one."""
+    return self._first(key)
 
 
 @dataclasses.dataclass
@@ -89,11 +86,8 @@ class UniformVelocity(_VelocityCommand):
 
   def _first(self, key: jax.Array) -> jax.Array:
     key, zero_key = jax.random.split(key)
-    command = jnp.where(jax.random.bernoulli(zero_key, self.zero_probability), 0.0, self._uniform(key))
+    command = jnp.where(jax.random.bernoulli(zero_key, self.zero_probability), 0.0, super()._first(key))
     return jnp.where(jnp.abs(command) < self.deadband, 0.0, command)
-
-  def _next(self, key: jax.Array, command: jax.Array) -> jax.Array:
-    return self._first(key)
 
 
 @dataclasses.dataclass
@@ -114,7 +108,7 @@ class VelocityWalk(_VelocityCommand):
     value_key, change_key, nonzero_key = jax.random.split(key, 3)
     nonzero = jax.random.bernoulli(nonzero_key, jnp.array(self.nonzero_probability), (3,))
     change = jax.random.bernoulli(change_key, self.change_probability, (3,))
-    return jnp.where(change, self._uniform(value_key) * nonzero, command)
+    return jnp.where(change, self._first(value_key) * nonzero, command)
 
 
 @dataclasses.dataclass
@@ -145,8 +139,7 @@ class Gait:
   def reset(self, key: jax.Array) -> Info:
     mode_key, frequency_key, height_key = jax.random.split(key, 3)
     mode = jax.random.randint(mode_key, (), 0, len(self.modes))
-    low, high = self.frequency
-    frequency = jax.random.uniform(frequency_key, minval=low, maxval=high)
+    frequency = jax.random.uniform(frequency_key, (), float, *self.frequency)
     info = {
       "phase": self._phases[mode],
       "phase_dt": 2 * jnp.pi * self._dt * frequency,
@@ -154,8 +147,7 @@ class Gait:
       "gait_freq": frequency,
     }
     if self.foot_height is not None:
-      low, high = self.foot_height
-      info["foot_height"] = jax.random.uniform(height_key, minval=low, maxval=high)
+      info["foot_height"] = jax.random.uniform(height_key, (), float, *self.foot_height)
     return info
 
   def step(self, c: StepContext, key: jax.Array) -> Info:

@@ -45,7 +45,7 @@ class Robot:
 
   def find(self, kind: str, name: str, key: str = "env.robot") -> int:
     """Returns the id of a `body`, `site`, `geom`, `sensor` or `key`; raises UnknownNameError."""
-    index = mujoco.mj_name2id(self.mj_model, _OBJECTS[kind], name)
+    index = mujoco.mj_name2id(self.mj_model, mujoco.mju_str2Type(kind), name)
     if index < 0:
       names = [getattr(self.mj_model, kind)(i).name for i in range(getattr(self.mj_model, f"n{kind}"))]
       raise UnknownNameError(f"{key} names the {kind} {name!r}, which the model does not have.{nearest(name, names)}")
@@ -89,14 +89,12 @@ class Robot:
         self.find(kind, params[kind], f"{key}.{kind}")
 
 
-_OBJECTS = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in ("body", "site", "geom", "sensor", "key")}
-
-
 class StepContext:
   """One environment after one control step, before the bookkeeping for the next. Arrays have no batch axis.
 
   Attributes:
-    env: the task: its model, control step `dt` and `robot`, whose facts do not change.
+    env: the task: its model and control step `dt`.
+    robot: the robot's constant facts.
     data: the physics after the step.
     info: what the task carries, as it stood during the step.
     action: the action just applied, shape [action_size].
@@ -106,16 +104,11 @@ class StepContext:
   def __init__(
     self, env: "Task", data: PhysicsData, info: Mapping[str, Any], action: jax.Array, dt: float | None = None
   ):
-    self.env = env
+    self.env, self.robot = env, env.robot
     self.data = data
     self.info = info
     self.action = action
     self.dt = env.dt if dt is None else dt
-
-  @property
-  def robot(self) -> Any:
-    """The robot's constant facts."""
-    return self.env.robot
 
   @functools.cached_property
   def terminated(self) -> jax.Array:

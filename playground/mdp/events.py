@@ -327,7 +327,7 @@ class PushObjectByWrench(PushByForceRegularly):
     return jnp.repeat(jnp.array([super().strength(key), turn]), 3)
 
   def mass(self, model: mjx.Model) -> jax.Array:
-    return self.env.robot.cube_mass(model)
+    return model.body_mass[self.body]
 
 
 @dataclasses.dataclass
@@ -365,11 +365,7 @@ class PushBySettingVelocity:
 
 
 def push_force(time: jax.Array, mass: jax.Array, velocity: jax.Array, duration: jax.Array) -> jax.Array:
-  """Returns a push's force at `time` s after it began, N: 0.5 * mass * velocity / duration * sin(pi * time / duration).
-
-  A half sine. Its area over `duration` is mass * velocity / pi: the body gains velocity / pi, not `velocity`.
-  (Playground 0.2.0; kept, since its range of velocities goes with it.)
-  """
+  """Returns a push's force at `time` s after it began, N: a half sine, see `PushByForce`."""
   return 0.5 * jnp.sin(jnp.pi * time / duration) * mass * velocity / duration
 
 

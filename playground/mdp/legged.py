@@ -143,10 +143,8 @@ def _check_lengths(config: Any) -> None:
   per_foot |= {key: config.get(key) or None for key in ("foot_pos", "foot_force")}  # some robots have none
   for what, names, lists in (("joint", config.joints, per_joint), ("foot", config.feet, per_foot)):
     for key, entries in lists.items():
-      if entries is not None and len(entries) != len(names):
-        raise ConfigError(
-          f"env.robot.{key} has {len(entries)} entries: it must have {len(names)}, one for each {what}."
-        )
+      if entries is not None and len(entries) != (needed := len(names)):
+        raise ConfigError(f"env.robot.{key} has {len(entries)} entries: it must have {needed}, one for each {what}.")
 
 
 class LeggedContext(StepContext):

@@ -13,7 +13,7 @@ from mujoco.mjx._src.math import quat_to_mat
 from playground.errors import lookup
 from playground.mdp.context import Robot, StepContext
 from playground.mdp.poses import Pose, angle_between
-from playground.physics.backend import PhysicsData, mjx
+from playground.physics.backend import PhysicsData
 
 if TYPE_CHECKING:
   from playground.envs.manipulation.arm import TabletopTask
@@ -96,10 +96,6 @@ class Hand(Manipulator):
     self.cube: int = mj_model.body("cube").id
     start = int(mj_model.joint("cube_freejoint").qposadr[0])
     self.cube_qpos = slice(start, start + 7)
-
-  def cube_mass(self, model: mjx.Model) -> jax.Array:
-    """Returns the mass of the cube, kg."""
-    return model.body_mass[self.cube]
 
 
 def _span(indices: np.ndarray) -> slice | np.ndarray:

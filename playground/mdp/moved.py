@@ -2,14 +2,14 @@
 
 from playground.errors import UnknownNameError
 
-_REWARDS: dict[str, str | tuple[str, ...]] = {  # several where it depends on the task
+_REWARDS = {  # several names where it depends on the task
   "tracking_lin_vel": "track_linear_velocity_exp",
   "tracking_ang_vel": "track_angular_velocity_exp",
   "lin_vel_z": "lin_vel_z_l2",
   "lin_vel": "lin_vel_xy_l2",
   "ang_vel": "ang_vel_l2",
   "ang_vel_xy": "ang_vel_xy_l2",
-  "orientation": ("flat_orientation_l2", "cube_orientation_linear"),
+  "orientation": "flat_orientation_l2 cube_orientation_linear",
   "base_height": "base_height_l2",
   "dof_pos_limits": "joint_pos_limits",
   "dof_acc": "joint_acc_l2",
@@ -17,9 +17,9 @@ _REWARDS: dict[str, str | tuple[str, ...]] = {  # several where it depends on th
   "hip_splay": "hip_deviation_l2",
   "joint_deviation_knee": "knee_deviation_l1",
   "joint_deviation_hip": "hip_deviation_l1",
-  "torques": ("joint_torques_norms", "joint_torques_l2"),
-  "energy": ("joint_power_l1", "joint_power_qfrc_l1"),
-  "action_rate": ("action_rate_l2", "action_smoothness_l2", "action_rate_norm"),
+  "torques": "joint_torques_norms joint_torques_l2",
+  "energy": "joint_power_l1 joint_power_qfrc_l1",
+  "action_rate": "action_rate_l2 action_smoothness_l2 action_rate_norm",
   "termination": "is_terminated",
   "alive": "is_alive",
   "collision": "self_contact",
@@ -31,15 +31,15 @@ _REWARDS: dict[str, str | tuple[str, ...]] = {  # several where it depends on th
   "angvel": "cube_ang_vel_z",
   "linvel": "cube_lin_vel_l1",
   "hand_pose": "joint_deviation_l2",
-  "gripper_box": ("object_gripper_distance_tanh", "gripper_behind_object_tolerance", "grippers_at_box_exp"),
-  "box_target": ("object_goal_distance_tanh", "object_goal_distance_xy_tolerance"),
+  "gripper_box": "object_gripper_distance_tanh gripper_behind_object_tolerance grippers_at_box_exp",
+  "box_target": "object_goal_distance_tanh object_goal_distance_xy_tolerance",
   "box_orientation": "object_goal_angle_tolerance",
   "box_handover": "box_at_meeting_exp",
   "handover_target": "box_at_goal_exp",
   "no_floor_collision": "no_contact",
   "no_barrier_collision": "no_contact",
   "no_table_collision": "no_contact",
-  "robot_target_qpos": ("joint_deviation_tanh", "joint_deviation_tolerance"),
+  "robot_target_qpos": "joint_deviation_tanh joint_deviation_tolerance",
   "no_solution": "no_ik_solution",
   "lifted": "object_lifted",
   "success": "object_at_goal",
@@ -107,7 +107,7 @@ def check_not_moved(key: str) -> None:
     return
   new, name = _PREFIXES[prefix], key[len(prefix) + 1 :]
   if prefix == "env.reward.scales" and name:
-    new = " or ".join(new.replace("<term>", term) for term in _names(_REWARDS.get(name, name)))
+    new = " or ".join(new.replace("<term>", term) for term in _REWARDS.get(name, name).split())
     new += f" (func: {_FUNCTIONS[name]})" if name in _FUNCTIONS else ""
   elif prefix in ("env.command", "env.gait", "env.pushes", "env.hand", "env.noise.pose") and name:
     new = f"{new}.{_PARAMS.get(key, name)}"
@@ -117,8 +117,4 @@ def check_not_moved(key: str) -> None:
 def renamed_function(kind: str, name: str) -> str | None:
   """Returns the function that a term of an earlier version's name computes, in most tasks; None if there was none."""
   found = _FUNCTIONS.get(name, _REWARDS.get(name)) if kind == "rewards" else None
-  return _names(found)[0] if found else None
-
-
-def _names(found: str | tuple[str, ...]) -> tuple[str, ...]:
-  return (found,) if isinstance(found, str) else found
+  return found.split()[0] if found else None

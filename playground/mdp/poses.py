@@ -1,6 +1,5 @@
 """Orientations as unit quaternions (w, x, y, z), and the noise on the pose of an object that a camera tracks."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -38,13 +37,7 @@ def two_rows(quat: jax.Array) -> jax.Array:
   return quat_to_mat(quat).ravel()[3:]
 
 
-def sensed_pose(
-  key: jax.Array,
-  pose: Pose,
-  config: Any,
-  level: float,
-  turn: Callable[[jax.Array, jax.Array, float], jax.Array] = turn_at_random,
-) -> Pose:
+def sensed_pose(key: jax.Array, pose: Pose, config: Any, level: float) -> Pose:
   """Returns a tracker's reading of a pose (paper, Appendix C.4); `level` is a factor on all noise.
 
   `config` has `pos` (m, uniform in +- on each axis), `angle` (rad, largest turn, about a random axis) and `injection`:
@@ -52,8 +45,7 @@ def sensed_pose(
   """
   pos_key, quat_key, wrong_key, wrong_pos_key, wrong_quat_key = jax.random.split(key, 5)
   offset = jax.random.uniform(pos_key, (3,), minval=-1.0, maxval=1.0)
-  pos, quat = pose[0] + level * config.pos * offset, turn(quat_key, pose[1], level * config.angle)
+  pos, quat = pose[0] + level * config.pos * offset, turn_at_random(quat_key, pose[1], level * config.angle)
   wrong = level * jax.random.bernoulli(wrong_key, config.injection)
-  reach = _INJECTED_REACH
-  wrong_pos = jax.random.uniform(wrong_pos_key, (3,), minval=-reach, maxval=reach)
+  wrong_pos = jax.random.uniform(wrong_pos_key, (3,), minval=-_INJECTED_REACH, maxval=_INJECTED_REACH)
   return pos * (1 - wrong) + wrong_pos * wrong, quat * (1 - wrong) + uniform_quat(wrong_quat_key) * wrong

@@ -63,12 +63,6 @@ class Term(NamedTuple):
   params: dict[str, Any]
   options: Any
 
-  @property
-  def source(self) -> str:
-    """File and line of the function."""
-    target = inspect.unwrap(self.func)
-    return f"{inspect.getsourcefile(target)}:{inspect.getsourcelines(target)[1]}"
-
   def __call__(self, *args: Any) -> Any:
     return self.func(*args, **self.params)
 
@@ -87,7 +81,8 @@ def registered(kind: str) -> dict[str, Callable[..., Any]]:
   module = importlib.import_module(MODULES[kind])
   for key, value in vars(module).items():
     if not key.startswith("_") and callable(value) and getattr(value, "__module__", None) == module.__name__:
-      found[_snake_case(key) if isinstance(value, type) else key] = value
+      name = re.sub(r"(?<!^)(?=[A-Z])", "_", key).lower() if isinstance(value, type) else key  # in snake_case
+      found[name] = value
   return _of_contexts() | found if kind == "observations" else found
 
 
@@ -240,7 +235,3 @@ def _problem(value: Any, hint: Any) -> Any:
   if entries == (str,):
     return None if isinstance(value, tuple) and all(isinstance(v, str) for v in value) else "a list of texts"
   return None
-
-
-def _snake_case(name: str) -> str:
-  return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()

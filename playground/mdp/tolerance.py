@@ -12,24 +12,9 @@ from playground.errors import lookup
 Sigmoid = Callable[[jax.Array, float], jax.Array]
 
 
-def _cut(distance: jax.Array, falling: jax.Array) -> jax.Array:
-  """0 from a scaled distance of 1 on."""
-  return jnp.where(jnp.abs(distance) < 1, falling, 0.0)
-
-
-def _cosine(d: jax.Array, v: float) -> jax.Array:
-  d = d * math.acos(2 * v - 1) / math.pi
-  return _cut(d, (1 + jnp.cos(math.pi * d)) / 2)
-
-
-def _linear(d: jax.Array, v: float) -> jax.Array:
-  d = d * (1 - v)
-  return _cut(d, 1 - d)
-
-
-def _quadratic(d: jax.Array, v: float) -> jax.Array:
-  d = d * math.sqrt(1 - v)
-  return _cut(d, 1 - jnp.square(d))
+def _cut(distance: jax.Array, fall: Callable[[jax.Array], jax.Array]) -> jax.Array:
+  """`fall` of a scaled distance, 0 from a scaled distance of 1 on."""
+  return jnp.where(jnp.abs(distance) < 1, fall(distance), 0.0)
 
 
 SIGMOIDS: dict[str, Sigmoid] = {
@@ -37,9 +22,9 @@ SIGMOIDS: dict[str, Sigmoid] = {
   "hyperbolic": lambda d, v: 1 / jnp.cosh(d * math.acosh(1 / v)),
   "long_tail": lambda d, v: 1 / (jnp.square(d * math.sqrt(1 / v - 1)) + 1),
   "reciprocal": lambda d, v: 1 / (jnp.abs(d) * (1 / v - 1) + 1),
-  "cosine": _cosine,
-  "linear": _linear,
-  "quadratic": _quadratic,
+  "cosine": lambda d, v: _cut(d * math.acos(2 * v - 1) / math.pi, lambda s: (1 + jnp.cos(math.pi * s)) / 2),
+  "linear": lambda d, v: _cut(d * (1 - v), lambda s: 1 - s),
+  "quadratic": lambda d, v: _cut(d * math.sqrt(1 - v), lambda s: 1 - jnp.square(s)),
   "tanh_squared": lambda d, v: 1 - jnp.square(jnp.tanh(d * math.atanh(math.sqrt(1 - v)))),
 }
 _MAY_REACH_ZERO = ("cosine", "linear", "quadratic")

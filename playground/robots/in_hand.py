@@ -38,19 +38,14 @@ def build_in_hand_scene(robot: Any) -> mujoco.MjSpec:
   scale, collides.mass = robot.cube.half_size / collides.size[0], robot.cube.mass
   for geom in spec.body("cube").geoms:
     geom.size, geom.pos = scale * geom.size, scale * geom.pos
-  _add_position_sensors(spec)
-  attach(spec, "props/hand_goal")
-  home = spec.key("home")
-  home.qpos = [*home.qpos, *robot.cube.start, *_CUBE_ORIENTATION]
-  home.mpos, home.mquat = _GOAL_IN_KEYFRAME, (1, 0, 0, 0)
-  return spec.copy()  # a copy does not repeat, when compiled, the warning that `attach` silences
-
-
-def _add_position_sensors(spec: mujoco.MjSpec) -> None:
-  """Where palm and fingertips are, the sites `grasp_site` and `<finger>_tip`."""
   site, kind = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtSensor.mjSENS_FRAMEPOS
   spec.add_sensor(name="palm_position", type=kind, objtype=site, objname="grasp_site")
   tips = [each.name for each in spec.sites if each.name.endswith("_tip")]
   for tip in sorted(tips, key=lambda name: name != "th_tip"):
     palm = {"reftype": site, "refname": "grasp_site"}
     spec.add_sensor(name=f"{tip}_position", type=kind, objtype=site, objname=tip, **palm)
+  attach(spec, "props/hand_goal")
+  home = spec.key("home")
+  home.qpos = [*home.qpos, *robot.cube.start, *_CUBE_ORIENTATION]
+  home.mpos, home.mquat = _GOAL_IN_KEYFRAME, (1, 0, 0, 0)
+  return spec.copy()  # a copy does not repeat, when compiled, the warning that `attach` silences

@@ -33,13 +33,6 @@ _SELF_COLLISION_LIMITS = {"max_contact_points": 30, "max_geom_pairs": 12}
 _ROUGH = 0.05
 
 
-def configured_scene(config: Any) -> mujoco.MjSpec:
-  """Returns the scene that a task's config describes under `robot` and `scene`."""
-  scene, robot = config.scene, config.robot
-  ground = {"terrain": scene.terrain, "parameters": dict(scene.terrain_params or {})}
-  return build_scene(robot.mjcf, **ground, collision=scene.collision, floor_contacts=tuple(robot.floor_contacts))
-
-
 def find_mjcf(mjcf: str) -> Path:
   """Returns the path of a robot's MJCF; raises UnknownNameError if there is no such file.
 
@@ -101,7 +94,9 @@ def build_scene(
   _set_keyframes(spec, add_terrain(spec, terrain, parameters or {}))
   spec.geom("floor").material = GROUND
   if terrain != "flat":
-    _round_cylinders(spec)
+    for geom in spec.geoms:  # MJX on JAX knows no contact of a cylinder with a height field: rounds off its ends
+      if geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER and (geom.contype or geom.conaffinity):
+        geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
   geoms = {geom.name: geom for geom in spec.geoms if geom.name}
   for name in floor_contacts:
     lookup(geoms, name, "env.robot.floor_contacts")
@@ -115,14 +110,9 @@ def _feet(spec: mujoco.MjSpec) -> None:
     spec.delete(geom)
 
 
-def _full_floor(spec: mujoco.MjSpec) -> None:
-  """The whole robot against the floor."""
-  _activate(spec, contype=0)
-
-
 def _full_self(spec: mujoco.MjSpec) -> None:
   """The whole robot against the floor and itself (neighbouring links excepted, as MuJoCo always does)."""
-  _activate(spec, contype=1)
+  _full_floor(spec, contype=1)
   for name, value in _SELF_COLLISION_LIMITS.items():
     spec.add_numeric(name=name, size=1, data=[value])
 
@@ -131,7 +121,8 @@ def _full_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
   return [geom for geom in spec.geoms if geom.classname.name == "full"]
 
 
-def _activate(spec: mujoco.MjSpec, contype: int) -> None:
+def _full_floor(spec: mujoco.MjSpec, contype: int = 0) -> None:
+  """The whole robot against the floor; with contype 1 against itself, too."""
   for geom in spec.geoms:
     if geom.contype or geom.conaffinity:  # a foot: slides with friction wherever it touches, not on the floor alone
       geom.condim = 3
@@ -152,13 +143,6 @@ def _set_keyframes(spec: mujoco.MjSpec, peak: float) -> None:
     spec.delete(key)
   for key in spec.keys:
     key.qpos[2] += lift[key.name]
-
-
-def _round_cylinders(spec: mujoco.MjSpec) -> None:
-  """Rounds off the ends of cylinders that collide: MJX on JAX knows no contact of a cylinder with a height field."""
-  for geom in spec.geoms:
-    if geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER and (geom.contype or geom.conaffinity):
-      geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
 
 
 def load(part: str) -> mujoco.MjSpec:

@@ -34,19 +34,15 @@ def _panda() -> mujoco.MjSpec:
   return spec
 
 
-def _add_floor(spec: mujoco.MjSpec, height: float = 0.0) -> None:
-  """A studio and its floor, `height` m above the arm's base."""
-  add_studio_floor(spec, height)
-  spec.delete(spec.light("studio/spotlight"))  # scenes here have lights of their own
-
-
-def _add_top_light(spec: mujoco.MjSpec) -> None:
-  kind, mode = mujoco.mjtLightType.mjLIGHT_SPOT, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
-  spec.worldbody.add_light(name="top", type=kind, mode=mode, pos=[0, 0, 2])
-
-
-def _add_sun(spec: mujoco.MjSpec, height: float) -> None:
-  spec.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, height], diffuse=[0.3] * 3)
+def _add_studio(spec: mujoco.MjSpec, floor: float = 0.0, *, top: bool = True, sun: float | None = 1.5) -> None:
+  """A studio with its floor `floor` m above the arm's base, a light that follows the arm and a sun `sun` m up."""
+  add_studio_floor(spec, floor)
+  spec.delete(spec.light("studio/spotlight"))
+  if top:
+    kind, mode = mujoco.mjtLightType.mjLIGHT_SPOT, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+    spec.worldbody.add_light(name="top", type=kind, mode=mode, pos=[0, 0, 2])
+  if sun:
+    spec.worldbody.add_light(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, sun], diffuse=[0.3] * 3)
 
 
 def _add_camera(spec: mujoco.MjSpec) -> None:
@@ -65,9 +61,7 @@ def _add_cube(spec: mujoco.MjSpec) -> None:
 def _panda_single_cube() -> mujoco.MjSpec:
   """A cube to pick up."""
   spec = _panda()
-  _add_floor(spec)
-  _add_top_light(spec)
-  _add_sun(spec, 1.5)
+  _add_studio(spec)
   _add_camera(spec)
   _add_cube(spec)
   cube = (0.7, 0, 0.03, 1, 0, 0, 0)
@@ -81,9 +75,8 @@ def _panda_single_cube_camera() -> mujoco.MjSpec:
   for i in range(10):
     white, blue, alpha = 1 - 0.1 * i / 9, 1 - 0.08 * i / 9, 1 - 0.05 * i
     spec.add_material(name=f"off_white{i}", rgba=[white, white, blue, alpha], shininess=0.25)
-  _add_floor(spec)
+  _add_studio(spec, sun=None)
   spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.3] * 3, [0.6] * 3
-  _add_top_light(spec)
   strip = {"size": [0.02, 1, 0.01], "pos": [0.631, 0, 0.001], "rgba": [1, 1, 1, 1], "contype": 0, "conaffinity": 0}
   spec.worldbody.add_geom(name="init_space", type=mujoco.mjtGeom.mjGEOM_PLANE, **strip)
   quat = [0.657706645, 0.265371277, 0.263783826, 0.653772244]
@@ -120,9 +113,7 @@ def _panda_cabinet() -> mujoco.MjSpec:
   """A drawer to open, from an arm stretched upwards."""
   spec = _panda()
   spec.geom("hand_capsule").conaffinity = 3  # meets the cabinet, too
-  _add_floor(spec)
-  _add_top_light(spec)
-  _add_sun(spec, 1.5)
+  _add_studio(spec)
   quat = [0.0492779628, 0.0492779628, 0.705387611, 0.705387611]
   spec.worldbody.add_camera(name="side", pos=[0.5, 1.381, 0.476], quat=quat)
   attach(spec, "props/cabinet")
@@ -139,8 +130,7 @@ def _panda_robotiq_cube() -> mujoco.MjSpec:
   _drive_by_torque(spec)
   spec.option.iterations = spec.option.ls_iterations = spec.option.ccd_iterations = 10
   spec.visual.global_.azimuth, spec.visual.global_.elevation = -40, -30
-  _add_floor(spec, -0.02297)
-  _add_sun(spec, 3)
+  _add_studio(spec, -0.02297, top=False, sun=3)
   _add_camera(spec)
   wall = {"size": [0.48, 0.75, 0.05], "pos": [0.946, 0, 0.5], "quat": [1, 0, -1, 0]}
   spec.worldbody.add_geom(name="wall", type=mujoco.mjtGeom.mjGEOM_PLANE, **wall)

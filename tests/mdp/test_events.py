@@ -15,6 +15,7 @@ from playground.mdp.events import PushByForce, PushByForceRegularly, PushBySetti
 
 KEYS = jax.random.split(jax.random.PRNGKey(0), 2000)
 MASS = 12.0
+MODEL: Any = SimpleNamespace(body_mass=jnp.array([0.0, 0.1]))
 LOWER, UPPER = np.array([-0.1, -1.0]), np.array([0.4, 1.0])
 KEYFRAME = jnp.array([9.0, 9.0, 0.2, 0.0, 1.0, 0.0, 0.0, 0.3, -0.3])
 
@@ -24,7 +25,6 @@ def env(dt: float = 0.02) -> Any:
   robot = SimpleNamespace(
     qpos=slice(7, None), joint_range=jnp.array([LOWER, UPPER]), root=1, mass=lambda model: jnp.array(MASS),
     keyframe=lambda name: {"crouch": KEYFRAME}[name], cube=1, cube_qpos=slice(0, 7),
-    cube_mass=lambda model: jnp.array(0.1),
   )  # fmt: skip
   return SimpleNamespace(dt=dt, robot=robot)
 
@@ -122,7 +122,7 @@ class Body(struct.PyTreeNode):
 def roll(push: Any, steps: int, dt: float = 0.02) -> tuple[dict[str, Any], Body, Any]:
   """The first `info`, and forces, gains of velocity and `info` of all steps."""
   push.bind(env(dt))
-  info = {"rng": jax.random.PRNGKey(1), **push.reset(jax.random.PRNGKey(0), None)}
+  info = {"rng": jax.random.PRNGKey(1), **push.reset(jax.random.PRNGKey(0), MODEL)}
 
   def step(info: dict[str, Any], _: None) -> tuple[dict[str, Any], Any]:
     still: Any = Body(jnp.zeros(6), jnp.zeros((2, 6)))

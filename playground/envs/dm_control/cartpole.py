@@ -41,24 +41,17 @@ class Cartpole(SuiteTask):
     return {"cart_position": data.qpos[_SLIDER], "pole_cos": axis[2], "pole_sin": axis[0], "velocity": data.qvel}
 
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
-    terms = (_sparse if self.config.sparse else _dense)(data, action, data.xmat[self.body["pole_1"], 2, 2])
+    cart, cosine = data.qpos[_SLIDER], data.xmat[self.body["pole_1"], 2, 2]
+    if self.config.sparse:
+      terms = {"cart_in_bounds": tolerance(cart, (-0.25, 0.25)), "angle_in_bounds": tolerance(cosine, (0.995, 1.0))}
+    else:
+      terms = {
+        "upright": (cosine + 1) / 2,
+        "centered": (1 + tolerance(cart, margin=2)) / 2,
+        "small_control": (4 + tolerance(action[0], margin=1, sigmoid="quadratic", value_at_margin=0)) / 5,
+        "small_velocity": (1 + tolerance(data.qvel[_HINGE], margin=5)) / 2,
+      }
     return math.prod(terms.values(), start=jnp.ones(())), terms
-
-
-def _dense(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> Terms:
-  return {
-    "upright": (cosine + 1) / 2,
-    "centered": (1 + tolerance(data.qpos[_SLIDER], margin=2)) / 2,
-    "small_control": (4 + tolerance(action[0], margin=1, sigmoid="quadratic", value_at_margin=0)) / 5,
-    "small_velocity": (1 + tolerance(data.qvel[_HINGE], margin=5)) / 2,
-  }
-
-
-def _sparse(data: PhysicsData, action: jax.Array, cosine: jax.Array) -> Terms:
-  return {
-    "cart_in_bounds": tolerance(data.qpos[_SLIDER], (-0.25, 0.25)),
-    "angle_in_bounds": tolerance(cosine, (0.995, 1.0)),
-  }
 
 
 class CartpoleVision(Cartpole):

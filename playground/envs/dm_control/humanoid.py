@@ -29,9 +29,6 @@ class Humanoid(SuiteTask):
   domain = "humanoid"
   derived = ("sensordata", "xpos", "xmat")
 
-  def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    return {}
-
   def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
     torso, extremities = self.body["torso"], jnp.array([self.body[name] for name in _EXTREMITIES])
     return {
@@ -47,18 +44,11 @@ class Humanoid(SuiteTask):
     head, uprightness = data.xpos[self.body["head"], 2], data.xmat[self.body["torso"], 2, 2]
     standing = tolerance(head, (_HEAD_HEIGHT, math.inf), margin=_HEAD_HEIGHT / 4)
     upright = tolerance(uprightness, (0.9, math.inf), margin=1.9, sigmoid="linear", value_at_margin=0)
-    terms = {
-      "standing": standing,
-      "upright": upright,
-      "stand": standing * upright,
-      "small_control": small_control(action),
-      "move": self._move(self.sensor(data, "torso_subtreelinvel")[:2]),
-    }
-    return terms["stand"] * terms["small_control"] * terms["move"], terms
-
-  def _move(self, velocity: jax.Array) -> jax.Array:
-    """How well the centre of mass keeps still, or reaches the speed; `velocity` is horizontal, m/s."""
-    goal = self.config.move_speed
+    goal, velocity = self.config.move_speed, self.sensor(data, "torso_subtreelinvel")[:2]
     if goal == 0:
-      return tolerance(velocity, margin=2).mean()
-    return (5 * reach_speed(jnp.linalg.norm(velocity), goal, margin=goal, value_at_margin=0) + 1) / 6
+      move = tolerance(velocity, margin=2).mean()
+    else:
+      move = (5 * reach_speed(jnp.linalg.norm(velocity), goal, margin=goal, value_at_margin=0) + 1) / 6
+    stand, control = standing * upright, small_control(action)
+    terms = {"standing": standing, "upright": upright, "stand": stand, "small_control": control, "move": move}
+    return stand * control * move, terms

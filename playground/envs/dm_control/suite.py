@@ -56,9 +56,9 @@ class SuiteTask(Env):
     del config
     return mujoco.MjSpec.from_file(str(Path(__file__).with_name(f"{self.domain}.xml")))
 
-  @abc.abstractmethod
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
-    """State fields at the start of an episode, by name ("qpos", "qvel", "mocap_pos"), from one random key."""
+    """State fields at the start of an episode that are not the model's, by name ("qpos", ...), from one random key."""
+    return {}
 
   @abc.abstractmethod
   def parts(self, data: PhysicsData) -> dict[str, jax.Array]:

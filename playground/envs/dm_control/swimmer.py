@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import mujoco
 
 from playground.envs.dm_control.suite import SuiteTask, Terms
-from playground.errors import ConfigError
 from playground.mdp.tolerance import tolerance
 from playground.physics.backend import PhysicsData
 
@@ -28,8 +27,6 @@ class Swimmer(SuiteTask):
   def scene(self, config: Any) -> mujoco.MjSpec:
     """The head with a chain of `links - 1` segments behind it, which together can just close to a circle."""
     links = config.links
-    if links < 3:
-      raise ConfigError(f"env.links={links} must be at least 3.")
     spec = super().scene(config)
     visual, inertial, link = (spec.find_default(name) for name in ("visual", "inertial", "link"))
     body = spec.body("head")

@@ -21,19 +21,13 @@ class Joystick(LeggedTask):
   episode_info = (*LeggedTask.episode_info, "feet_air_time", "swing_peak", "last_contact")
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
-    feet = len(self.robot.feet)
-    return {
-      "feet_air_time": jnp.zeros(feet),
-      "swing_peak": jnp.zeros(feet),
-      "last_contact": jnp.zeros(feet, bool),
-    }
+    none = jnp.zeros(len(self.robot.feet))
+    return {"feet_air_time": none, "swing_peak": none, "last_contact": none.astype(bool)}
 
   def next_info(self, c: LeggedContext, key: jax.Array) -> dict[str, Any]:
-    return {
-      "feet_air_time": jnp.where(c.contact, 0.0, c.feet_air_time),
-      "swing_peak": jnp.where(c.contact, 0.0, c.swing_peak),
-      "last_contact": c.contact,
-    }
+    since_contact = lambda value: jnp.where(c.contact, 0.0, value)
+    air_time, peak = since_contact(c.feet_air_time), since_contact(c.swing_peak)
+    return {"feet_air_time": air_time, "swing_peak": peak, "last_contact": c.contact}
 
   def measure(self, c: LeggedContext) -> dict[str, jax.Array]:
     return super().measure(c) | {"swing_peak": jnp.where(c.contact, 0.0, c.swing_peak).mean()}

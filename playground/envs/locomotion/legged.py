@@ -12,7 +12,7 @@ from playground.errors import ConfigError, lookup
 from playground.mdp.context import StepContext
 from playground.mdp.legged import LeggedContext, LeggedRobot
 from playground.physics.backend import PhysicsData, mjx
-from playground.robots.scene import configured_scene, set_gains
+from playground.robots.scene import build_scene, set_gains
 
 # What an action is added to: the joints' default pose, their position, or their target in the step before.
 _ACTION_BASES: dict[str, Callable[[LeggedRobot, PhysicsData], jax.Array]] = {
@@ -47,7 +47,9 @@ class LeggedTask(Task):
 
   def scene(self, config: Any) -> mujoco.MjSpec:
     """Returns the scene to compile; called first of all."""
-    spec = configured_scene(config)
+    scene, robot = config.scene, config.robot
+    ground = {"terrain": scene.terrain, "parameters": dict(scene.terrain_params or {})}
+    spec = build_scene(robot.mjcf, **ground, collision=scene.collision, floor_contacts=tuple(robot.floor_contacts))
     if config.restricted_joint_range:
       if "restricted_range" not in config.robot:
         raise ConfigError(f"env.restricted_joint_range: robot={config.robot.name} has no restricted_range.")

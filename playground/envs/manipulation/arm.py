@@ -35,12 +35,7 @@ class TabletopTask(Task):
   robot: ArmRobot
 
   def __init__(self, config: Any):
-    """Builds the scene and binds the terms.
-
-    Args:
-      config: that of `Task`, `scene` (`playground.robots.tabletop`), `action_scale`, `keyframe`, `success_distance`
-        and, where terms read them, `success_angle`, `object` and `gripper`.
-    """
+    """Builds the scene and binds the terms; `config` is that of `configs/env/_panda.yaml` or `_aloha.yaml`."""
     self.object, self.gripper = config.get("object"), config.get("gripper")
     super().__init__(config, build_tabletop(config.scene))
     self._action_scale: float = config.action_scale

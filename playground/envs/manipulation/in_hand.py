@@ -40,9 +40,7 @@ class HandTask(Task):
     super().__init__(config, self.scene(config))
     self._action_base = lookup(_ACTION_BASES, config.action_base, "env.action_base")
     self._action_scale = np.asarray(config.action_scale)
-    self._smoothing: float = config.ema_alpha
-    self._noise_level: float = config.noise_level
-    self.pose_noise = config.pose_noise if self._noise_level else None
+    self.pose_noise = config.pose_noise if config.noise_level else None
 
   def scene(self, config: Any) -> mujoco.MjSpec:
     """Returns the scene to compile; called first of all."""
@@ -50,13 +48,9 @@ class HandTask(Task):
     if not config.torque_limits:
       for joint in spec.joints:
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    self.prepare_goal(spec.body("goal"))
-    return spec
-
-  def prepare_goal(self, goal: mujoco.MjsBody) -> None:
-    """Makes the goal a marker that nothing touches."""
-    for geom in goal.geoms:
+    for geom in spec.body("goal").geoms:  # a marker that nothing touches
       geom.contype = geom.conaffinity = 0
+    return spec
 
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> Hand:
     return Hand(mj_model, config.robot)
@@ -80,8 +74,9 @@ class HandTask(Task):
   def action_to_ctrl(self, state: State, action: jax.Array) -> jax.Array:
     target = self._action_base(self.robot, state.data) + self._action_scale * action
     target = jnp.clip(target, *self.robot.ctrl_range)
-    return self._smoothing * target + (1 - self._smoothing) * state.data.ctrl
+    return self.config.ema_alpha * target + (1 - self.config.ema_alpha) * state.data.ctrl
 
   def sense_cube(self, info: Mapping[str, Any], pose: Pose) -> Pose:
     """Returns the cube's pose as it is tracked in this step."""
-    return sensed_pose(info["pose_key"], pose, self.pose_noise, self._noise_level) if self.pose_noise else pose
+    level = self.config.noise_level
+    return sensed_pose(info["pose_key"], pose, self.pose_noise, level) if self.pose_noise else pose

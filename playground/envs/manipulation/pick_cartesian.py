@@ -14,7 +14,7 @@ from playground.mdp.manipulators import ArmContext
 from playground.physics.backend import PhysicsData, mjx
 from playground.robots.panda.kinematics import forward_kinematics, inverse_kinematics, within_limits
 
-_WORKSPACE = jnp.array([[0.25, -0.32, 0.02], [0.77, 0.32, 0.5]])  # m, where the tip may be sent
+WORKSPACE = jnp.array([[0.25, -0.32, 0.02], [0.77, 0.32, 0.5]])  # m, where the tip may be sent
 _BEHIND = 0.03  # m, by which cube and goal are nearer to the base than the tip at the start
 _GOAL_HEIGHT = 0.2  # m
 _GRIP_STEP = 0.02  # m: two steps close the open fingers
@@ -34,7 +34,7 @@ class PickCubeCartesian(ProgressTask, ArmTask):
   def __init__(self, config: Any):
     """Builds the scene. `config`: see `configs/env/PandaPickCubeCartesian.yaml`."""
     super().__init__(config)
-    self._tip, self._attitude = forward_kinematics(self.robot.init_ctrl[:7])
+    self._tip, self.attitude = forward_kinematics(self.robot.init_ctrl[:7])
     guide = self.mj_model.key("picked")
     self._guide_qpos, self._guide_ctrl = jnp.array(guide.qpos), jnp.array(guide.ctrl)
     self._guide_tip, _ = forward_kinematics(self._guide_ctrl[:7])
@@ -46,13 +46,10 @@ class PickCubeCartesian(ProgressTask, ArmTask):
   def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
     initial = super().initial_state(key, model)
     x = self._tip[0] - _BEHIND
-    qpos = initial.qpos.at[self.robot.free_joint("box")].set(jnp.stack([x, jnp.zeros(()), self.box_height]))
-    return initial.replace(qpos=qpos, mocap_pos=jnp.stack([x, jnp.zeros(()), jnp.array(_GOAL_HEIGHT)])[None])
-
-  @property
-  def box_height(self) -> jax.Array:
-    """Height of the cube's centre at the start, m."""
-    return self.robot.init_qpos[self.robot.free_joint("box")][2]
+    box = self.robot.free_joint("box")
+    place = jnp.stack([x, jnp.zeros(()), self.robot.init_qpos[box][2]])
+    goal = place.at[2].set(_GOAL_HEIGHT)
+    return initial.replace(qpos=initial.qpos.at[box].set(place), mocap_pos=goal[None])
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     return super().first_info(data, key, model) | {
@@ -88,17 +85,10 @@ class PickCubeCartesian(ProgressTask, ArmTask):
     # From the servos' new targets this is the plan that they came from: joint 7 is the same, and so is the branch.
     tip, _, solved = self._plan(data.ctrl, info, action)
     state = super().post_step(data, {**info, "no_solution": 1 - solved.astype(jnp.float32)}, action)
-    tip = self._tip_after(info["current_pos"], tip, solved)
     return state.replace(info=state.info | {"current_pos": tip, "action_history": history})
 
   def next_info(self, c: ArmContext, key: jax.Array) -> dict[str, Any]:
     return super().next_info(c, key) | {"action_delay": delays.draw_delay(key, (0, self.config.gripper_delay))}
-
-  def _tip_after(self, before: jax.Array, planned: jax.Array, solved: jax.Array) -> jax.Array:
-    return jnp.where(solved, planned, before)
-
-  def _is_solved(self, joints: jax.Array) -> jax.Array:
-    return within_limits(joints)
 
   def _delayed(self, info: Mapping[str, Any], action: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The action with the gripper's part of some steps ago, and the history of that part."""
@@ -108,11 +98,12 @@ class PickCubeCartesian(ProgressTask, ArmTask):
   def _plan(
     self, ctrl: jax.Array, info: Mapping[str, Any], action: jax.Array
   ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Where the tip is to go, the joint angles for it, and whether the arm can do that."""
+    """Where the tip goes, the joint angles for it, and whether the arm can do that: else the tip stays."""
     step = self._action_scale * jnp.array([0.0, action[0], action[1]])
-    tip = jnp.clip(info["current_pos"] + step, *_WORKSPACE)
-    joints = inverse_kinematics(tip, self._attitude, ctrl[6], near=ctrl[:7])
-    return tip, joints, self._is_solved(joints)
+    tip = jnp.clip(info["current_pos"] + step, *WORKSPACE)
+    joints = inverse_kinematics(tip, self.attitude, ctrl[6], near=ctrl[:7])
+    solved = within_limits(joints)
+    return jnp.where(solved, tip, info["current_pos"]), joints, solved
 
 
 class PickCubeCartesianVision(PickCubeCartesian):

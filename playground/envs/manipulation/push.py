@@ -22,7 +22,7 @@ _ARM, _BOX = slice(0, 7), slice(13, 16)  # joints, and the block's position, in 
 _PLACES = jnp.array([[0.4, -0.2, -0.005], [0.65, 0.2, 0.04]])
 _SPREAD = jnp.array([0.4, 1.0, 0.0]), jnp.array([0.0, 0.0, 0.005])  # of places: in parts of a distance, and m
 _BOX_SPREAD = 0.15  # m
-_ARM_SPREAD = 0.3 * jnp.array([0.2, 0.2, 0.2, 0.2, 0.3, 0.3, 0.3])  # of the joints' ranges
+ARM_SPREAD = 0.3 * jnp.array([0.2, 0.2, 0.2, 0.2, 0.3, 0.3, 0.3])  # of the joints' ranges
 _BONUSES = ("is_terminated", "object_at_goal", "goal_reached")  # terms that are paid beside the mean of the others
 
 
@@ -60,9 +60,9 @@ class PushCube(ArmTask):
     self._action_delay = tuple(config.action_delay)
     self.observations = _DelayedObservations(config, tuple(config.observation_delay))
     self._max_ctrl = jnp.array(config.max_torque / self.mj_model.actuator_gear[_ARM, 0])
-    self._distances, self._angles = jnp.array(config.curriculum.distance), jnp.array(config.curriculum.angle)
+    self._distances, self.angles = jnp.array(config.curriculum.distance), jnp.array(config.curriculum.angle)
     half = (self.robot.joint_range[1] - self.robot.joint_range[0]) / 2
-    self.arm_spread = _ARM_SPREAD * jnp.stack([-half, half])
+    self.arm_spread = ARM_SPREAD * jnp.stack([-half, half])
 
   @property
   def action_size(self) -> int:
@@ -72,9 +72,9 @@ class PushCube(ArmTask):
     box_key, yaw_key, goal_key, arm_key, turn_key = jax.random.split(key, 5)
     home = self.robot.init_qpos
     box = self._draw_place(box_key, jnp.array(_BOX_SPREAD)).at[2].set(home[_BOX][2])
-    box_quat = _draw_yaw(yaw_key, 2 * jnp.pi)
+    box_quat = draw_yaw(yaw_key, 2 * jnp.pi)
     goal = self._draw_place(goal_key, self._distances[0])
-    goal_quat = quat_mul(box_quat, _draw_yaw(turn_key, self._angles[0]))
+    goal_quat = quat_mul(box_quat, draw_yaw(turn_key, self.angles[0]))
     low, high = self.arm_spread
     arm = home[_ARM] + jax.random.uniform(arm_key, (7,), minval=low, maxval=high)
     qpos = home.at[_ARM].set(arm).at[_BOX].set(box).at[_BOX.stop :].set(box_quat)
@@ -92,13 +92,13 @@ class PushCube(ArmTask):
     }
 
   def pre_step(self, state: State) -> State:
-    """Shows the next goal after one was reached."""
+    """Shows the next goal after one was reached; beyond the last level goals are as that one's."""
     state = super().pre_step(state)
-    data, level = state.data, state.info[PRESERVE_INFO]["curriculum_id"]
-    rng, *keys = jax.random.split(state.info["rng"], 3)
-    pos, quat = self._next_goal(keys[0], keys[1], data, level)
-    reached = state.info["goal_reached"]
-    pos, quat = (jnp.where(reached, new, old[0]) for new, old in ((pos, data.mocap_pos), (quat, data.mocap_quat)))
+    data, level, reached = state.data, state.info[PRESERVE_INFO]["curriculum_id"], state.info["goal_reached"]
+    rng, place_key, turn_key = jax.random.split(state.info["rng"], 3)
+    pos = self._draw_place(place_key, self._distances[level])
+    quat = quat_mul(data.xquat[self.mj_model.body("box").id], draw_yaw(turn_key, self.angles[level]))
+    pos, quat = jnp.where(reached, pos, data.mocap_pos[0]), jnp.where(reached, quat, data.mocap_quat[0])
     data = data.replace(mocap_pos=pos[None], mocap_quat=quat[None])
     return state.replace(data=data, info=state.info | {"rng": rng})
 
@@ -144,13 +144,6 @@ class PushCube(ArmTask):
   def _next_level(self, c: ArmContext) -> jax.Array:
     return jnp.minimum(c.info[PRESERVE_INFO]["curriculum_id"] + self.goal_reached(c), len(self._distances) - 1)
 
-  def _next_goal(
-    self, place_key: jax.Array, turn_key: jax.Array, data: PhysicsData, level: jax.Array
-  ) -> tuple[jax.Array, jax.Array]:
-    """Draws place [3] and orientation [4] of a goal of a level; levels beyond the lists' ends are as their last."""
-    quat = quat_mul(data.xquat[self.mj_model.body("box").id], _draw_yaw(turn_key, self._angles[level]))
-    return self._draw_place(place_key, self._distances[level]), quat
-
   def _draw_place(self, key: jax.Array, distance: jax.Array) -> jax.Array:
     """A place for the block, m [3], up to `distance` from the keyframe's along y and 0.4 times that along x."""
     reach = _SPREAD[0] * distance + _SPREAD[1]
@@ -175,6 +168,6 @@ class _DelayedObservations(ObservationManager):
     return (obs | {ACTOR: late} if isinstance(obs, dict) else late), past
 
 
-def _draw_yaw(key: jax.Array, max_angle: jax.Array | float) -> jax.Array:
+def draw_yaw(key: jax.Array, max_angle: jax.Array | float) -> jax.Array:
   """A turn about the vertical, uniform in [0, `max_angle`) rad, as a quaternion [4]."""
   return axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), jax.random.uniform(key) * max_angle)

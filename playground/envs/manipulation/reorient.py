@@ -46,8 +46,6 @@ class Reorient(HandTask):
     """Builds the scene. `config`: see `configs/env/LeapCubeReorient.yaml`."""
     super().__init__(config)
     self._goal_pos = jnp.array(self.mj_model.key("home").mpos)
-    self._min_turn: float = config.goal.min_turn
-    self._threshold: float = config.success_threshold
     self._stuck_steps = round(config.stuck_after / self.dt)
 
   def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
@@ -64,10 +62,10 @@ class Reorient(HandTask):
 
   def reached(self, c: HandContext) -> jax.Array:
     """Returns whether the cube is at the goal, bool."""
-    return c.rotation_error < self._threshold
+    return c.rotation_error < self.config.success_threshold
 
   def next_info(self, c: HandContext, key: jax.Array) -> dict[str, Any]:
-    spin = jnp.where(self.reached(c), new_spin(key, self._min_turn, self.dt), _SLOWER * c.info["goal_spin"])
+    spin = jnp.where(self.reached(c), new_spin(key, self.config.goal.min_turn, self.dt), _SLOWER * c.info["goal_spin"])
     return self._counts(c) | {"goal_spin": spin}
 
   def _counts(self, c: HandContext) -> dict[str, jax.Array]:

@@ -46,7 +46,7 @@ def test_links(links: int) -> None:
 
 
 def test_too_few_links() -> None:
-  with pytest.raises(ConfigError, match=r"env.links=2 must be at least 3."):
+  with pytest.raises(ConfigError, match=r"env.links=2 must be a whole number from 3 to 1000"):
     load_task("SwimmerSwimmer6", {"links": 2})
 
 
