@@ -68,9 +68,8 @@ def mirror_of(env: Env) -> Mirror:
     for term in task.observations.groups[group]:
       inherits = group != ACTOR and term.name == ACTOR
       parts.append(groups[ACTOR] if inherits else _of_term(term, sizes[term.name], of_joints, of_feet))
-    groups[group] = _repeated(
-      np.asarray(block_diag(*parts)), sum(sizes.values())
-    )  # the group `state` may hold several steps
+    step = np.asarray(block_diag(*parts))
+    groups[group] = _repeated(step, sum(sizes.values()))  # the group `state` may hold several steps
   obs = {group: Reflection(np.abs(m).argmax(axis=1), m.sum(axis=1, dtype=np.float32)) for group, m in groups.items()}
   return Mirror(obs, joints)
 
