@@ -82,22 +82,20 @@ class _Draw(NamedTuple):
 
   def __call__(self, key: jax.Array) -> jax.Array:
     # One flat draw, a scalar if single: the order and shapes of Playground 0.2.0, so that the numbers are the same.
-    axes = None
-    if self.term.operation == "rotate":
-      key, axis_key = jax.random.split(key)
-      shape = (*(() if self.term.shared else self.shape), 3)
-      if self.term.axis is None:
-        axes = jax.random.normal(axis_key, shape)
-      else:
-        low, high = jnp.array(self.term.axis, jnp.float32).T
-        axes = jax.random.uniform(axis_key, shape, minval=low, maxval=high)
-    scalar = self.count == 1
+    rotates, scalar = self.term.operation == "rotate", self.count == 1
+    key, axis_key = jax.random.split(key) if rotates else (key, key)
     draw = _DISTRIBUTIONS[self.term.distribution](key, () if scalar else (self.count,), *self.term.parameters)
     draw = draw if scalar else draw.reshape(self.shape)
-    if axes is not None:
-      axes = axes / jnp.linalg.norm(axes, axis=-1, keepdims=True)
-      return jnp.broadcast_to(jnp.asarray(draw)[..., None] * axes, (*self.shape, 3))
-    return draw
+    if not rotates:
+      return draw
+    shape = (*(() if self.term.shared else self.shape), 3)
+    if self.term.axis is None:
+      axes = jax.random.normal(axis_key, shape)
+    else:
+      low, high = jnp.array(self.term.axis, jnp.float32).T
+      axes = jax.random.uniform(axis_key, shape, minval=low, maxval=high)
+    axes = axes / jnp.linalg.norm(axes, axis=-1, keepdims=True)
+    return jnp.broadcast_to(jnp.asarray(draw)[..., None] * axes, (*self.shape, 3))
 
 
 class Randomizer:

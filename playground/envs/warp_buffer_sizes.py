@@ -80,9 +80,11 @@ def measure_buffers(
     convex *= 2 if use.overflow & _CCD and convex < pairs else 1
     if sizes == sizes | {"njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": convex}:
       break
-  bits = _overflow_names(int(use.overflow))  # pyright: ignore[reportPossiblyUnboundVariable]
+  from mujoco.mjx.third_party.mujoco_warp import OverflowType
+
+  full = OverflowType(int(use.overflow)).name  # pyright: ignore[reportPossiblyUnboundVariable]
   raise ConfigError(
-    f"env.impl=warp: buffers ({bits}) still overflow with njmax={rows}, naconmax_per_env={pairs} and "
+    f"env.impl=warp: buffers ({full}) still overflow with njmax={rows}, naconmax_per_env={pairs} and "
     f"naccdmax_per_env={convex}."
   )
 
@@ -118,12 +120,6 @@ def _roll(
     on_steps(end)
   most = carry[1]
   return jax.device_get(BufferUse(most.constraints.max(), most.contacts.max(), jax.lax.reduce_or(most.overflow, (0,))))
-
-
-def _overflow_names(bits: int) -> str:
-  from mujoco.mjx.third_party.mujoco_warp import OverflowType
-
-  return ", ".join(flag.name or str(flag.value) for flag in OverflowType if flag & bits and flag != OverflowType.ALL)
 
 
 def _rows(constraints: int) -> int:

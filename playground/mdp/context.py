@@ -23,6 +23,10 @@ class Robot:
   Attributes:
     mj_model: the compiled scene.
     joint_names: of the joints that `c.joint_pos` holds, in its order.
+    qpos, qvel: where those joints are in `qpos` and `qvel`.
+    init_qpos: configuration of the keyframe, shape [nq].
+    default_pose: positions of those joints in `init_qpos`, rad, shape [joints].
+    joint_range: (lower, upper) limits of those joints, rad, shape [2, joints].
     joint_groups: regular expressions of joint names, by the name of a group.
   """
 

@@ -22,15 +22,12 @@ class LeggedRobot(Robot):
   The first joint is the free one of the base; actuators stand in the order of the other joints.
 
   Attributes:
-    init_qpos: configuration of the keyframe, shape [nq].
-    default_pose: its joint part, rad, shape [nu].
-    joint_range: (lower, upper) limits of the joints, or of the targets of joints that have none, rad, shape [2, nu].
+    joint_range: for joints that have no limits those of their targets, rad, shape [2, nu].
     target_range: (lower, upper) limits of the joints' targets: the robot's own, or those of the servos, rad, [2, nu].
     root: id of the body that is pushed.
     base_site: id of the site that carries the inertial sensors.
     feet: ids of the foot sites, shape [feet].
     foot_names: names of the foot sites.
-    qpos, qvel: where the joints are in `qpos` and `qvel`.
     pose_weights: how much each joint's distance from the default pose counts, shape [nu].
     contact_groups: addresses of contact sensors' readings, by the name of a group.
     left_to_right: beginnings or ends of names on the left and their counterparts on the right.

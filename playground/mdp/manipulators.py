@@ -27,10 +27,6 @@ class Manipulator(Robot):
 
   Attributes:
     joint_ids: of the arms' or the hand's joints, those of grippers' fingers excepted.
-    qpos, qvel: indices of those joints in `qpos` and `qvel`.
-    joint_range: (lower, upper) limits of those joints, rad, shape [2, joints].
-    init_qpos: configuration of the keyframe, shape [nq].
-    default_pose: positions of those joints in `init_qpos`, rad, shape [joints].
     ctrl_range: (lower, upper) limits of `ctrl`, shape [2, nu].
     init_ctrl: `ctrl` of the keyframe, shape [nu].
   """

@@ -23,6 +23,7 @@ from playground.robots.terrain import add_terrain
 from playground.text import first_line
 
 ROBOTS = Path(__file__).parent
+Gains = float | Sequence[float] | None  # of all servos, or of each
 _OF_KEYFRAMES = ("qpos", "qvel", "act", "ctrl", "mpos", "mquat")
 GROUND = "studio/groundplane"  # material of the floor
 
@@ -218,12 +219,7 @@ def add_studio_floor(spec: mujoco.MjSpec, height: float = 0.0, **properties: Any
   spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 0.05], pos=at, material=GROUND, **properties)
 
 
-def set_gains(
-  mj_model: mujoco.MjModel,
-  kp: float | Sequence[float] | None = None,
-  kv: float | Sequence[float] | None = None,
-  damping: float | Sequence[float] | None = None,
-) -> None:
+def set_gains(mj_model: mujoco.MjModel, kp: Gains = None, kv: Gains = None, damping: Gains = None) -> None:
   """Sets the gains of every position servo of a robot, in place; None leaves those of the MJCF.
 
   A servo's torque is kp * (ctrl - q) - kv * qd, clipped to its range; each hinge itself adds -damping * qd.

@@ -19,6 +19,7 @@ POINTS = 256  # a side: 0.078 m apart
 START = 1.0  # m: feet touch the ground first within this half-extent of the origin
 _BASE = 1.0  # m of solid ground below the lowest point
 Seed = Annotated[int, SEED]
+Octaves = Annotated[int, count(1, 16)]
 
 
 def flat(spec: mujoco.MjSpec) -> float:
@@ -28,12 +29,7 @@ def flat(spec: mujoco.MjSpec) -> float:
 
 
 def rough(
-  spec: mujoco.MjSpec,
-  *,
-  seed: Seed = 0,
-  elevation: Positive = 0.05,
-  wavelength: Positive = 0.5,
-  octaves: Annotated[int, count(1, 16)] = 3,
+  spec: mujoco.MjSpec, *, seed: Seed = 0, elevation: Positive = 0.05, wavelength: Positive = 0.5, octaves: Octaves = 3
 ) -> float:
   """Perlin noise (paper: appendix "Locomotion", rough terrain).
 

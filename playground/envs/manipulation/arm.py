@@ -117,7 +117,6 @@ class ProgressTask(TabletopTask):
 
   def bonus(self, c: ArmContext, potential: jax.Array) -> jax.Array:
     """Returns what is paid besides the gain, from the terms' total."""
-    del c, potential
     return jnp.zeros(())
 
   def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
