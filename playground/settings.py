@@ -24,6 +24,7 @@ from playground.limits import Limit
 T = TypeVar("T")
 Plain = Any  # mappings, lists and scalars inside each other, as YAML has them; they are checked where they are read
 Section = Mapping[str, Plain]  # of a configuration
+TEXTS = ("text", "a list of texts", "a list of lists of texts")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,13 +128,46 @@ def plain(value: Plain, finite: bool = False) -> Plain:
   return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
+def members(hint: Any) -> tuple[Any, ...]:
+  """Returns the types of a union, or the one type that an annotation names."""
+  return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+
+
+def problem(value: object, hint: Any) -> str:
+  """Returns what a value must be that an annotation (of a parameter) does not allow, to follow 'must be'; else ""."""
+  problems = [_problem(value, kind) for kind in members(hint) if kind is not type(None)]
+  return " or ".join(dict.fromkeys(problems)) if all(problems) else ""
+
+
+def _problem(value: object, hint: Any) -> str:
+  limit = next((entry for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, Limit)), None)
+  kind = get_args(hint)[0] if limit else hint
+  if limit is None and kind in (int, float):
+    limit = Limit(whole=kind is int)
+  if limit is None and get_args(kind) == (float,):
+    limit = Limit(form="list")
+  if limit is not None:
+    return "" if limit.allows(value) else str(limit)
+  if kind is bool:
+    return "" if isinstance(value, bool) else "true or false"
+  depth = _text_depth(kind)
+  return "" if depth is None or is_text(value, depth) else TEXTS[depth]
+
+
+def is_text(value: object, depth: int) -> bool:
+  """Whether a value is text, or with `depth` 1 a list of texts, with 2 a list of such lists (`TEXTS`)."""
+  if depth == 0:
+    return isinstance(value, str)
+  return isinstance(value, list | tuple) and all(is_text(entry, depth - 1) for entry in value)
+
+
 def _settings(cls: type, prefix: str = "") -> Iterator[Setting]:
   hints = _hints(cls)
   for field in dataclasses.fields(cls):
     hint, name = hints[field.name], f"{prefix}{field.name}"
     metadata = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
     kind = get_args(hint)[0] if metadata else hint
-    options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    options = members(kind)
     depths = [_text_depth(option) for option in options]
     yield Setting(
       name=name,
@@ -164,7 +198,7 @@ def _text_depth(kind: object) -> int | None:
   """How deep texts are nested in lists; None if the type holds none."""
   if kind is str:
     return 0
-  if get_origin(kind) is Sequence:
+  if get_origin(kind) in (Sequence, list):
     inner = _text_depth(get_args(kind)[0])
     return None if inner is None else inner + 1
   return None

@@ -10,12 +10,11 @@ from playground.config.schema import is_of_terms, wrong_type
 from playground.envs.options import NUMBERS, sees
 from playground.errors import ConfigError, nearest
 from playground.limits import Limit
-from playground.settings import Plain, Section
+from playground.settings import TEXTS, Plain, Section, is_text
 from playground.text import format_value, join
 
 _XLA_SWITCH = re.compile(r"--xla_\w+(=(true|false|-?\d+(\.\d+)?))?")
 _XLA_PLACES = ("dir", "path", "file", "dump", "load", "cache", "option", "override", "_to", "_from")  # in flags' names
-_NESTED = ("text (put quotes around a number)", "a list of texts", "a list of lists of texts")
 
 
 def check_limits(resolved: Section) -> None:
@@ -50,8 +49,8 @@ def _check(key: str, value: object, names: Mapping[str, object]) -> None:
   if setting and setting.choices and value not in setting.choices:
     near = nearest(str(value), setting.choices)
     raise ConfigError(f"{shown} is unknown: choose from {', '.join(setting.choices)}.{near}")
-  if setting and setting.text_depth is not None and not _is_text(value, setting.text_depth):
-    raise wrong_type(key, value, _NESTED[setting.text_depth])
+  if setting and (depth := setting.text_depth) is not None and not is_text(value, depth):
+    raise wrong_type(key, value, TEXTS[depth] + " (put quotes around a number)" * (depth == 0))
   limit = limit_of(key, names) or (Limit().each if _numbers(value) else None)
   if limit is not None and not limit.allows(value):
     raise ConfigError(f"{shown} must be {limit}.")
@@ -81,12 +80,6 @@ def _check_xla_flags(flags: object) -> None:
     if not _XLA_SWITCH.fullmatch(flag) or any(word in flag for word in _XLA_PLACES):
       what = "must be switches and numbers, such as --xla_gpu_deterministic_ops=true"
       raise ConfigError(f"hardware.xla_flags={flag} is refused: they {what}; export others in XLA_FLAGS.")
-
-
-def _is_text(value: object, depth: int) -> bool:
-  if depth == 0:
-    return isinstance(value, str)
-  return isinstance(value, list) and all(_is_text(entry, depth - 1) for entry in value)
 
 
 def _numbers(value: object) -> list[float]:

@@ -70,11 +70,8 @@ def joint_pos_limits(c: StepContext, soft_limit_factor: Annotated[float, positiv
   """Sum over joints of how far q lies outside the soft limits: the range shrunk about its centre by the factor."""
   lower, upper = c.robot.joint_range
   centre, reach = (lower + upper) / 2, (upper - lower) / 2 * soft_limit_factor
-  return _outside(c.joint_pos, centre - reach, centre + reach)
-
-
-def _outside(x: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
-  return (jnp.maximum(lower - x, 0) + jnp.maximum(x - upper, 0)).sum()
+  below, above = centre - reach - c.joint_pos, c.joint_pos - (centre + reach)
+  return (jnp.maximum(below, 0) + jnp.maximum(above, 0)).sum()
 
 
 def joint_deviation_l1(c: StepContext, joints: str | Sequence[str] = ".*") -> jax.Array:

@@ -19,7 +19,6 @@ import functools
 import importlib
 import inspect
 import re
-import types
 import typing
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -27,10 +26,9 @@ from typing import Any, NamedTuple
 import jax
 
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.limits import Limit
 from playground.mdp.moved import renamed_function
 from playground.mdp.options import OPTIONS, keys
-from playground.settings import below
+from playground.settings import below, members, problem
 from playground.text import format_value
 from playground.trust import trusted_object
 
@@ -198,40 +196,14 @@ def annotation(func: Callable[..., Any], argument: inspect.Parameter) -> Any:
 
 def _checked(key: str, value: Any, hint: Any) -> Any:
   """Returns a value, whole numbers as floats where the annotation says float; raises ConfigError if it must not be."""
-  kinds = [kind for kind in alternatives(hint) if kind is not type(None)]
   if typing.get_origin(hint) is typing.Literal and value not in (known := typing.get_args(hint)):
     raise UnknownNameError(f"{key}={value!r} is unknown: choose from {', '.join(known)}.{nearest(str(value), known)}")
-  problems = [_problem(value, kind) for kind in kinds]
-  if problems and all(problems):
-    raise ConfigError(f"{key}={format_value(value)} must be {' or '.join(dict.fromkeys(map(str, problems)))}.")
-  return _as_float(value) if any("float" in str(kind) for kind in kinds) else value
-
-
-def alternatives(hint: Any) -> tuple[Any, ...]:
-  """The types that a value of an annotation may have."""
-  is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
-  return typing.get_args(hint) if is_union else (hint,)
+  if wanted := problem(value, hint):
+    raise ConfigError(f"{key}={format_value(value)} must be {wanted}.")
+  return _as_float(value) if any("float" in str(kind) for kind in members(hint)) else value
 
 
 def _as_float(value: Any) -> Any:
   if isinstance(value, tuple):
     return tuple(map(_as_float, value))
   return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
-def _problem(value: Any, hint: Any) -> Any:
-  """What a value must be that is not of this type, None if it is."""
-  limit = next((entry for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, Limit)), None)
-  kind = typing.get_args(hint)[0] if limit else hint
-  entries = typing.get_args(kind)
-  if limit is None and kind in (int, float):
-    limit = Limit(whole=kind is int)
-  if limit is None and entries == (float,):
-    limit = Limit(form="list")
-  if limit is not None:
-    return None if limit.allows(value) else limit
-  if kind in (str, bool):
-    return None if isinstance(value, kind) else {str: "text", bool: "true or false"}[kind]
-  if entries == (str,):
-    return None if isinstance(value, tuple) and all(isinstance(v, str) for v in value) else "a list of texts"
-  return None

@@ -13,7 +13,7 @@ import numpy as np
 
 from playground.limits import Limit
 from playground.mdp.options import is_model_field
-from playground.mdp.terms import MODULES, Term, alternatives, annotation, bind_one
+from playground.mdp.terms import MODULES, Term, annotation, bind_one
 
 
 def traced_settings(config: Mapping[str, Any], kinds: Sequence[str]) -> dict[str, np.ndarray]:
@@ -63,7 +63,7 @@ def _parameters(kind: str, term: Term) -> Iterator[tuple[str, Any]]:
 
 
 def _is_traced(kind: str, func: Callable[..., Any], argument: inspect.Parameter) -> bool:
-  options = alternatives(annotation(func, argument))
+  options = members(annotation(func, argument))
   if kind == "commands":
     return any("float" in str(option) for option in options)
   limits = [entry for o in options for entry in getattr(o, "__metadata__", ()) if isinstance(entry, Limit)]

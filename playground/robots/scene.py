@@ -233,8 +233,4 @@ def set_gains(mj_model: mujoco.MjModel, kp: Gains = None, kv: Gains = None, damp
     mj_model.dof_damping[6:] = damping
 
 
-COLLISIONS: dict[str, Callable[[mujoco.MjSpec], None]] = {
-  "feet": _feet,
-  "full_floor": _full_floor,
-  "full_self": _full_self,
-}
+COLLISIONS: dict[str, Callable[..., None]] = {"feet": _feet, "full_floor": _full_floor, "full_self": _full_self}

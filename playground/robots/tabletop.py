@@ -127,7 +127,14 @@ def _panda_robotiq_cube() -> mujoco.MjSpec:
   """A foam block to push over a table, with torques, before a wall; gravity does not pull the robot."""
   spec = load("panda/arm")
   attach(spec, "panda/robotiq_2f85", frame="flange")
-  _drive_by_torque(spec)
+  for body in spec.bodies[1:]:
+    body.gravcomp = 1
+  for i in range(1, 8):  # servos become motors: a control of 1 is 150 Nm (the first four) or 20 Nm, in light joints
+    spec.joint(f"joint{i}").damping[0] = 1
+    motor = spec.actuator(f"actuator{i}")
+    motor.set_to_motor()
+    motor.gear[0] = 150 if i <= 4 else 20
+    motor.inheritrange, motor.ctrlrange = 0, [-1, 1]
   spec.option.iterations = spec.option.ls_iterations = spec.option.ccd_iterations = 10
   spec.visual.global_.azimuth, spec.visual.global_.elevation = -40, -30
   _add_studio(spec, -0.02297, top=False, sun=3)
@@ -147,18 +154,6 @@ def _panda_robotiq_cube() -> mujoco.MjSpec:
   block = (0.56784, -0.0253974, 0.0306525, 0, 0, 0, 1)
   spec.add_key(name="home", qpos=[*arm, *[0.8] * 6, *block], ctrl=[*[0] * 7, 0.82])
   return spec
-
-
-def _drive_by_torque(spec: mujoco.MjSpec) -> None:
-  """Makes the Panda's servos motors, with a control of 1 for 150 Nm (the first four) or 20 Nm, in light joints."""
-  for body in spec.bodies[1:]:
-    body.gravcomp = 1
-  for i in range(1, 8):
-    spec.joint(f"joint{i}").damping[0] = 1
-    motor = spec.actuator(f"actuator{i}")
-    motor.set_to_motor()
-    motor.gear[0] = 150 if i <= 4 else 20
-    motor.inheritrange, motor.ctrlrange = 0, [-1, 1]
 
 
 def _aloha(task: str, closed: float) -> mujoco.MjSpec:

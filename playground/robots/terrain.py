@@ -61,9 +61,7 @@ def slope(spec: mujoco.MjSpec, *, gradient: float = 0.2, platform: Positive = 2.
   return _add_height_field(spec, gradient * np.maximum(_distance() - platform / 2, 0))
 
 
-TERRAINS: dict[str, Callable[..., float]] = {
-  terrain.__name__: terrain for terrain in (flat, rough, white_noise, stairs, slope)
-}
+TERRAINS: dict[str, Callable[..., float]] = {f.__name__: f for f in (flat, rough, white_noise, stairs, slope)}
 
 
 def add_terrain(spec: mujoco.MjSpec, name: str, parameters: Mapping[str, Any]) -> float:

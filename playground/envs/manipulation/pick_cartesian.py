@@ -65,13 +65,11 @@ class PickCubeCartesian(ProgressTask, ArmTask):
     rng, key = jax.random.split(state.info["rng"])
     guided = state.info["first_step"] & jax.random.bernoulli(key, self.config.guide_probability)
     choose = lambda guide, own: jnp.where(guided, guide, own)
-    data = state.data.replace(
-      qpos=choose(self._guide_qpos, state.data.qpos), ctrl=choose(self._guide_ctrl, state.data.ctrl)
-    )
+    qpos, ctrl = choose(self._guide_qpos, state.data.qpos), choose(self._guide_ctrl, state.data.ctrl)
     info = {"rng": rng, "current_pos": choose(self._guide_tip, state.info["current_pos"])}
     # The fingers hold the cube because they were told to close: a late command must not let it fall.
     info["action_history"] = choose(-1.0, state.info["action_history"])
-    return state.replace(data=data, info=state.info | info)
+    return state.replace(data=state.data.replace(qpos=qpos, ctrl=ctrl), info=state.info | info)
 
   def action_to_ctrl(self, state: State, action: jax.Array) -> jax.Array:
     action, _ = self._delayed(state.info, action)

@@ -49,8 +49,8 @@ class Reorient(HandTask):
     self._stuck_steps = round(config.stuck_after / self.dt)
 
   def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
-    goal = {"mocap_pos": self._goal_pos[None], "mocap_quat": uniform_quat(key)[None]}
-    return super().initial_state(key, model).replace(**goal)
+    initial = super().initial_state(key, model)
+    return initial.replace(mocap_pos=self._goal_pos[None], mocap_quat=uniform_quat(key)[None])
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     return super().first_info(data, key, model) | {
