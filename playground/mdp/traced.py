@@ -14,6 +14,7 @@ import numpy as np
 from playground.limits import Limit
 from playground.mdp.options import is_model_field
 from playground.mdp.terms import MODULES, Term, annotation, bind_one
+from playground.settings import members
 
 
 def traced_settings(config: Mapping[str, Any], kinds: Sequence[str]) -> dict[str, np.ndarray]:
