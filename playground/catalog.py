@@ -4,12 +4,13 @@
 reference runs in results/reference/. A task of another package is not in it.
 """
 
-import csv
 import dataclasses
 import json
 from functools import cache
 from pathlib import Path
 from typing import Literal, get_args
+
+from playground.files import read_csv
 
 Status = Literal["solved", "learning", "open", "not measured"]
 STATUSES = get_args(Status)
@@ -112,8 +113,8 @@ def _reference(task: str) -> dict[str, str] | None:
   """The best of our runs of a task; where there are only chains, the last stage."""
   rows: list[dict[str, str]] = []
   for name in _TABLES:
-    with (_REFERENCE / f"{name}.csv").open(encoding="utf-8", newline="") as file:
-      rows += [row for row in csv.DictReader(file) if row["task"] == task and row["who"] == "ours"]
+    found = read_csv(_REFERENCE / f"{name}.csv")
+    rows += [row for row in found if row["task"] == task and row["who"] == "ours"]
   single = [row for row in rows if "chain" not in row.get("experiment", "")]
   return max(single, key=lambda row: float(row["final_return"])) if single else rows[-1] if rows else None
 

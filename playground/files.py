@@ -3,6 +3,7 @@
 And locks: files that say which process is at work on a run, a job or a sweep.
 """
 
+import csv
 import errno
 import fcntl
 import json
@@ -120,6 +121,12 @@ def _try_lock(handle: int, kind: int) -> bool:
   except OSError as error:
     return error.errno in _NO_LOCKS
   return True
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+  """Returns the rows of a CSV by column."""
+  with path.open(encoding="utf-8", newline="") as file:
+    return list(csv.DictReader(file))
 
 
 def numbered(path: Path) -> Path:

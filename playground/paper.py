@@ -1,10 +1,10 @@
 """The paper's tables (`benchmarks/paper/`) and the suites of tasks in them."""
 
-import csv
 from functools import cache
 
 from playground.config.files import shipped
 from playground.errors import UnknownNameError, nearest
+from playground.files import read_csv
 
 SUITES = ("dm_control", "locomotion", "manipulation")
 
@@ -12,8 +12,7 @@ SUITES = ("dm_control", "locomotion", "manipulation")
 @cache
 def paper_table(name: str) -> list[dict[str, str]]:
   """Rows of one of the paper's tables."""
-  with (shipped("benchmarks") / "paper" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
-    return list(csv.DictReader(file))
+  return read_csv(shipped("benchmarks") / "paper" / f"{name}.csv")
 
 
 def tasks_of(suite: str) -> list[str]:

@@ -29,6 +29,11 @@ def first_line(error: Exception) -> str:
   return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
+def first_docstring_line(thing: object) -> str:
+  """The first line of a function's or class's docstring; "" if it has none."""
+  return next(iter((thing.__doc__ or "").strip().splitlines()), "")
+
+
 def join(parent: str, name: object) -> str:
   """The dotted key of something in `parent`, which is '' at the top."""
   return f"{parent}.{name}" if parent else str(name)

@@ -14,6 +14,7 @@ from playground.config import RunConfig, compose, format_value
 from playground.errors import ConfigError
 from playground.mdp.options import is_model_field
 from playground.settings import Plain, Section
+from playground.text import first_docstring_line
 
 if TYPE_CHECKING:
   from playground.envs.base import Env
@@ -110,7 +111,7 @@ def _row(term: "Term") -> dict[str, Plain]:
     "name": term.name,
     "function": function_and_source(term.func, term.name),
     "params": _params(term.params),
-    "what": _first_line(term.func),
+    "what": first_docstring_line(term.func),
   }
 
 
@@ -176,10 +177,6 @@ def function_and_source(func: Callable[..., object], known: str = "") -> str:
   depth = target.__module__.count(".") + (2 if path.stem == "__init__" else 1)
   place = f"{'/'.join(path.parts[-depth:])}:{inspect.getsourcelines(target)[1]}"
   return place if target.__name__ == known else f"{target.__qualname__} {place}"
-
-
-def _first_line(thing: object) -> str:
-  return next(iter((thing.__doc__ or "").strip().splitlines()), "")
 
 
 def _params(params: Section) -> str:

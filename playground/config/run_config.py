@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_type_hints
 
 from ml_collections import ConfigDict
 from omegaconf import OmegaConf
@@ -27,22 +27,6 @@ from playground.text import first_line, format_value
 
 if TYPE_CHECKING:
   from rich.tree import Tree
-
-SECTIONS = (
-  *("env", "agent", "curriculum", "hardware", "tracking"),
-  *("video", "checkpoint", "on_nonfinite", "profile"),
-)
-TYPED: dict[str, type] = {
-  "curriculum": CurriculumConfig,
-  "hardware": HardwareConfig,
-  "tracking": TrackingConfig,
-  "video": VideoConfig,
-  "checkpoint": CheckpointConfig,
-  "on_nonfinite": NonfiniteConfig,
-  "profile": ProfileConfig,
-}
-SCALARS = ("seed", "run_dir", "resume", "init_from")
-
 
 if TYPE_CHECKING:
 
@@ -95,6 +79,13 @@ class RunConfig:
     return self.resolved["agent"]["name"]
 
 
+_FIELDS = [field.name for field in dataclasses.fields(RunConfig)]
+SECTIONS = tuple(_FIELDS[_FIELDS.index("env") : _FIELDS.index("seed")])
+SCALARS = tuple(_FIELDS[_FIELDS.index("seed") : _FIELDS.index("choices")])
+_UNTYPED = ("env", "agent")  # whose keys, or class, the configuration itself chooses
+_CLASSES = {name: cls for name, cls in get_type_hints(RunConfig).items() if name in SECTIONS and name not in _UNTYPED}
+
+
 def config_dict(values: Section | ConfigDict) -> TaskConfig:
   """Returns a ConfigDict whose keys keep their order, in which terms apply; ConfigDict itself sorts them."""
   config: Plain = ConfigDict(sort_keys=False)
@@ -135,7 +126,7 @@ def from_dict(resolved: Section, overrides: Sequence[str] = ()) -> RunConfig:
     name=resolved["name"],
     env=config_dict(resolved["env"]),
     agent=read_config(resolved["agent"]),
-    **{key: build(cls, resolved[key]) for key, cls in TYPED.items()},  # pyright: ignore[reportArgumentType]
+    **{key: build(cls, resolved[key]) for key, cls in _CLASSES.items()},  # pyright: ignore[reportArgumentType]
     **{key: resolved[key] for key in SCALARS},
     choices=dict(resolved["choices"]),
     overrides=tuple(overrides),

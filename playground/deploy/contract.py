@@ -14,6 +14,7 @@ from playground.envs.base import PIXELS, Env, State
 from playground.errors import CheckpointError
 from playground.mdp.options import OPTIONS, ObservationOptions
 from playground.settings import plain
+from playground.text import first_docstring_line
 
 FORMAT = "playground-policy/3"
 Contract = dict[str, Any]  # what YAML has of it, and of the `env` section in it
@@ -175,11 +176,6 @@ def _options(options: ObservationOptions, noise_level: float) -> dict[str, objec
     "delay": options.delay,
     "history": options.history if options.history > 1 else None,
   }
-
-
-def first_docstring_line(func: Callable[..., object]) -> str:
-  """The first line of a function's docstring; "" if it has none."""
-  return next(iter((func.__doc__ or "").strip().splitlines()), "")
 
 
 def _commands(config: Contract) -> Contract:

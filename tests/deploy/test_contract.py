@@ -8,10 +8,11 @@ import pytest
 import yaml
 
 from playground import registry
-from playground.deploy.contract import check_contract, describe_policy, first_docstring_line
+from playground.deploy.contract import check_contract, describe_policy
 from playground.envs.base import State
 from playground.files import plain
 from playground.mdp.terms import registered
+from playground.text import first_docstring_line
 
 
 def contract(

@@ -5,9 +5,10 @@ from contextlib import nullcontext
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from playground.benchmark.measures.machine import used_memory
-from playground.benchmark.measures.subject import Subject, alone, emit_peak, num_updates, rate, told
+from playground.benchmark.measures.subject import Subject, alone, emit_peak, rate, told
 from playground.benchmark.worker import Facts
 from playground.envs.base import PIXELS
 from playground.envs.wrappers import ModelFields, Vectorize, Wrapper, wrap_for_training
@@ -97,7 +98,7 @@ def _train(subject: Subject, state: TrainState) -> Callable[[int], PyTree]:
 
   def call(count: int) -> PyTree:
     nonlocal state
-    state, metrics = trainer.train(state, subject.model, num_updates(count))
+    state, metrics = trainer.train(state, subject.model, np.int32(count))
     return metrics
 
   call(1 + trainer.config.prefill_updates)

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
-import numpy as np
 from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -128,8 +127,3 @@ def emit_peak(facts: Facts, **columns: object) -> None:
   peak = peak_memory_gib()
   if peak is not None:
     facts.emit("peak_memory_gib", peak, "GiB", **columns)
-
-
-def num_updates(count: int) -> np.int32:
-  """The argument of `Trainer.train`."""
-  return np.int32(count)

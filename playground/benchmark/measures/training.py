@@ -4,9 +4,10 @@ from contextlib import nullcontext
 from functools import partial
 
 import jax
+import numpy as np
 
 from playground.benchmark.measures.machine import used_memory
-from playground.benchmark.measures.subject import Subject, alone, emit_peak, num_updates, rate
+from playground.benchmark.measures.subject import Subject, alone, emit_peak, rate
 from playground.benchmark.worker import Facts
 from playground.learning.loop import compile_program
 from playground.runs.provenance import process_age_s
@@ -51,7 +52,7 @@ def measure(
 
         def train(count: int) -> jax.Array:
           nonlocal state
-          state, metrics = program.train(state, model, num_updates(count))  # noqa: B023  # called within this turn
+          state, metrics = program.train(state, model, np.int32(count))  # noqa: B023  # called within this turn
           return metrics["nonfinite"]
 
         jax.block_until_ready(train(warm_up))

@@ -1,6 +1,5 @@
 """Our learning curves over those of public repositories (`benchmarks/public/`), tasks where we are below first."""
 
-import csv
 import dataclasses
 import math
 import re
@@ -11,6 +10,7 @@ from itertools import groupby, pairwise
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.sections import Notes, runs_by_step
 from playground.config.files import shipped, task_names
+from playground.files import read_csv
 from playground.paper import tasks_of
 from playground.reporting import figures
 from playground.reporting.page import Block, Heading, Picture, Table, Text
@@ -173,5 +173,4 @@ def _panel(ours: Sequence[Curve], theirs: Sequence[Curve]) -> dict[str, figures.
 
 @cache
 def _read(name: str) -> Sequence[Mapping[str, str]]:
-  with (shipped("benchmarks") / "public" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
-    return list(csv.DictReader(file))
+  return read_csv(shipped("benchmarks") / "public" / f"{name}.csv")

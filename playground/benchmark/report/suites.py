@@ -4,14 +4,13 @@ A page is written by hand but for what stands between two comments, which `playg
 In a table of runs, tasks that are not learnt come first.
 """
 
-import csv
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from playground.catalog import entries
 from playground.errors import ConfigError
-from playground.files import write_text
+from playground.files import read_csv, write_text
 from playground.reporting.page import Block, Heading, Table, to_markdown
 
 PAGES = {  # page -> the tables that it shows
@@ -50,7 +49,7 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
     path = pages / name
     try:
       text = path.read_text(encoding="utf-8")
-      rows = [row for table in tables for row in _read(reference / f"{table}.csv")]
+      rows = [row for table in tables for row in read_csv(reference / f"{table}.csv")]
     except FileNotFoundError as error:
       raise ConfigError(f"pages={pages}: {error.filename} does not exist.") from None
     write_text(path, _replaced(path, text, BEGIN, END, to_markdown(list(_blocks(rows)), "")))
@@ -82,11 +81,6 @@ def _grid(suite: str) -> str:
   rows = [cells[i : i + _GRID_WIDTH] for i in range(0, len(cells), _GRID_WIDTH)]
   full = [[*row, *[""] * (_GRID_WIDTH - len(row))] for row in rows]
   return "\n".join(f"| {' | '.join(row)} |" for row in [[""] * _GRID_WIDTH, ["---"] * _GRID_WIDTH, *full]) + "\n"
-
-
-def _read(path: Path) -> list[Row]:
-  with path.open(encoding="utf-8", newline="") as file:
-    return list(csv.DictReader(file))
 
 
 def _blocks(rows: Sequence[Row]) -> Iterator[Block]:
