@@ -11,27 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playground.errors import CheckpointError, ConfigError
-from playground.pretrained import copy_policy
-from playground.runs.wandb_tracker import logged_in, reason
+from playground.runs.wandb_tracker import TYPE, logged_in, reason
 
 if TYPE_CHECKING:
   import wandb
 
 PREFIX = "wandb:"
-TYPE = "policy"
 _NAME = re.compile(r"[\w.-]+/[\w.-]+/[\w.-]+(:[\w.-]+)?")
 _DOWNLOADS = Path("results/wandb")
-
-
-def upload(run: "wandb.Run", folder: Path) -> None:
-  """Logs the newest policy of a run directory as an artifact of its W&B run."""
-  import wandb
-
-  artifact = wandb.Artifact(f"policy-{run.id}", type=TYPE)
-  with tempfile.TemporaryDirectory(prefix="playground-") as scratch:
-    copy_policy(folder, Path(scratch) / "run")
-    artifact.add_dir(str(Path(scratch) / "run"))  # copies the files
-  run.log_artifact(artifact)
 
 
 def local_path(name: str) -> str:

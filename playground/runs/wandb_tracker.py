@@ -4,17 +4,20 @@ import contextlib
 import netrc
 import os
 import secrets
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from playground.files import write_text
+from playground.pretrained import copy_policy
 from playground.settings import Section
 
 if TYPE_CHECKING:
   import wandb
 
+TYPE = "policy"  # of artifacts
 # wandb 0.31 renamed its public server, and still takes a netrc entry under the old name.
 _PUBLIC_HOSTS = {"api.wandb.ai", "api.forge.coreweave.com"}
 
@@ -104,13 +107,11 @@ class WandbTracker:
   def _log_files(self, run: "wandb.Run") -> None:
     import wandb
 
-    from playground.runs.wandb_artifacts import upload
-
     for video in sorted(self._folder.glob("videos/*.mp4"))[-1:]:
       run.log({"video": wandb.Video(str(video), format="mp4")})
     for plot in sorted(self._folder.glob("plots/*.png")):
       run.log({f"plots/{plot.stem}": wandb.Image(str(plot))})
-    upload(run, self._folder)
+    _upload(run, self._folder)
 
   def _guard(self, call: Callable[[], object]) -> None:
     try:
@@ -123,3 +124,14 @@ class WandbTracker:
 def reason(error: Exception) -> str:
   """The first line of an error's message."""
   return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")
+
+
+def _upload(run: "wandb.Run", folder: Path) -> None:
+  """Logs the newest policy of a run directory as an artifact of its W&B run."""
+  import wandb
+
+  artifact = wandb.Artifact(f"policy-{run.id}", type=TYPE)
+  with tempfile.TemporaryDirectory(prefix="playground-") as scratch:
+    copy_policy(folder, Path(scratch) / "run")
+    artifact.add_dir(str(Path(scratch) / "run"))  # copies the files
+  run.log_artifact(artifact)
