@@ -45,14 +45,14 @@ def is_main() -> bool:
   return jax.process_index() == 0
 
 
-def several() -> bool:
+def is_multiprocess() -> bool:
   """Whether a training spans more than one process."""
   return jax.process_count() > 1
 
 
-def agree(flag: bool) -> bool:
-  """Whether any process says so. All of them must ask, in the same order."""
-  if not several():
+def any_process(flag: bool) -> bool:
+  """Returns whether the flag is true in any process; all processes call it, in the same order."""
+  if not is_multiprocess():
     return flag
   from jax.experimental import multihost_utils
 
@@ -78,7 +78,7 @@ def share(text: str = "") -> str:
   return _within(lambda: client.blocking_key_value_get(key, _WEEK_MS), None, "process 0 did not answer")
 
 
-def join(config: HardwareConfig) -> None:
+def init_distributed(config: HardwareConfig) -> None:
   """Joins the training's other processes, if `hardware.distributed` says that there are any.
 
   They come from Slurm (or whatever else JAX knows), or from the keys coordinator, num_processes and process_id. Call it
@@ -146,7 +146,7 @@ def preflight(config: HardwareConfig, fingerprint: object, what: str = "configur
     HardwareError: it takes longer than `hardware.distributed.timeout`.
     ConfigError: they differ.
   """
-  if not several():
+  if not is_multiprocess():
     return
   from jax.experimental import multihost_utils
 

@@ -39,8 +39,8 @@ def gather_on_mesh(function: Callable[..., PyTree], mesh: Mesh, spec: PyTree) ->
   return jax.jit(function, in_shardings=(_shardings(mesh, spec),), out_shardings=NamedSharding(mesh, P()))
 
 
-def divide(tree: PyTree, mesh: Mesh) -> PyTree:
-  """Arrays that every process has, divided over the devices by their leading axis."""
+def shard(tree: PyTree, mesh: Mesh) -> PyTree:
+  """Divides arrays that every process has over the devices, by their leading axis."""
   if jax.process_count() == 1:  # what is jitted over the mesh takes them as they are
     return tree
   return put(tree, mesh, P(AXIS))
@@ -59,12 +59,12 @@ def put(tree: PyTree, mesh: Mesh, spec: PyTree) -> PyTree:
   return jax.tree.map(place, shardings, tree)
 
 
-def own_share(array: jax.Array | np.ndarray, axis: int) -> np.ndarray:
-  """What this process has of an array that is divided by `axis`, on the host: all of it if there is one process."""
+def local_shard(array: jax.Array | np.ndarray, axis: int) -> np.ndarray:
+  """Returns this process's part of an array that is divided by `axis`, on the host."""
   if isinstance(array, np.ndarray) or array.is_fully_addressable or array.is_fully_replicated:
     return np.asarray(array)
-  shards = sorted(array.addressable_shards, key=lambda shard: shard.index[axis].start or 0)
-  return np.concatenate([np.asarray(shard.data) for shard in shards], axis)
+  parts = sorted(array.addressable_shards, key=lambda part: part.index[axis].start or 0)
+  return np.concatenate([np.asarray(part.data) for part in parts], axis)
 
 
 def _shardings(mesh: Mesh, specs: PyTree) -> PyTree:

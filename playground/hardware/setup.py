@@ -8,7 +8,7 @@ import jax
 from jax.sharding import Mesh
 
 from playground.errors import HardwareError
-from playground.hardware.distributed import join
+from playground.hardware.distributed import init_distributed
 from playground.hardware.mesh import make_mesh
 from playground.hardware.options import HardwareConfig, Platform
 
@@ -35,7 +35,7 @@ def setup(config: HardwareConfig) -> Hardware:
   _environment(config)
   if config.platform == "cpu":
     jax.config.update("jax_platforms", "cpu")
-  join(config)
+  init_distributed(config)
   jax.config.update("jax_default_matmul_precision", config.matmul_precision)
   cache = _caches(config)
   devices = jax.local_devices()

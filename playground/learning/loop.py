@@ -20,8 +20,8 @@ from jax.stages import Compiled, Traced, Wrapped
 
 from playground.envs.wrappers import ModelFields
 from playground.gc_pause import gc_paused
-from playground.hardware.distributed import agree, several
-from playground.hardware.mesh import divide, put
+from playground.hardware.distributed import any_process, is_multiprocess
+from playground.hardware.mesh import put, shard
 from playground.learning.algorithm import Policy
 from playground.learning.evaluation import Evaluate, Recording
 from playground.learning.rollout import Step
@@ -150,7 +150,7 @@ def compile_program(
     with gc_paused():  # tracing makes millions of objects
       futures = _trace(trainer, evaluate, draw, policy, stored, pool)
       trace_s = time.perf_counter() - start
-      model, eval_model = divide(draw(), trainer.mesh)  # takes seconds, which XLA needs anyway
+      model, eval_model = shard(draw(), trainer.mesh)  # takes seconds, which XLA needs anyway
       results = {name: future.result() for name, future in futures.items()}
     if kernels is not None:
       notices.append(kernels.wait())
@@ -181,7 +181,7 @@ def _compile_stored(
   if functions is None:
     return None
   futures = {name: pool.submit(function.compile, trainer.mesh) for name, function in functions.items()}
-  model, eval_model = divide(draw(), trainer.mesh)
+  model, eval_model = shard(draw(), trainer.mesh)
   try:
     compiled = {name: future.result() for name, future in futures.items()}
   except Exception as error:  # of any kind: JAX and XLA read a file
@@ -291,9 +291,9 @@ class Loop:
         at = event.update
         if reported:
           reported.result()  # one row is in flight; what went wrong with it stops the run here
-        stop = agree(all(each.should_stop() for each in self.callbacks)) and event is not events[-1]
+        stop = any_process(all(each.should_stop() for each in self.callbacks)) and event is not events[-1]
         if stop:
-          done.snapshot = self.functions.copy(state) if several() else state
+          done.snapshot = self.functions.copy(state) if is_multiprocess() else state
         reported = reports.submit(self._report, done)
         if stop:
           break
@@ -312,7 +312,7 @@ class Loop:
       self.train_s += done.train_s
       self.first_update_s = self.first_update_s or done.train_s / num_updates
       if np.any(done.trained["nonfinite"] > 0):
-        capture = jax.device_get(self.functions.copy(state).capture if several() else state.capture)
+        capture = jax.device_get(self.functions.copy(state).capture if is_multiprocess() else state.capture)
         shapes = self.trainer.shapes((state.env_state, self.functions.model))
         action_size = self.trainer.env.action_size
         first = lambda i: self.trainer.agent(capture, i).first(shapes[0], action_size, shapes[1])
@@ -325,7 +325,7 @@ class Loop:
       done.eval_s = time.perf_counter() - start
     if event.reset:
       state = self.functions.reset(state, self._key(self._reset_key, event), self.functions.model)
-    late = agree(time.perf_counter() - self._last_save > SAVE_EVERY_S)
+    late = any_process(time.perf_counter() - self._last_save > SAVE_EVERY_S)
     due = late or event.evaluate or event is self.events[-1]
     if due and event.update:
       # A copy, because the next training call takes the state's buffers over while this one is written to disk.

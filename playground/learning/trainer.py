@@ -13,7 +13,7 @@ from jax.sharding import PartitionSpec as P
 from playground.envs.base import Env, State
 from playground.envs.wrappers import PRESERVE_INFO, ModelFields, wrap_for_training
 from playground.errors import ConfigError
-from playground.hardware.distributed import several
+from playground.hardware.distributed import is_multiprocess
 from playground.hardware.mesh import AXIS, device_memory, for_agents, gather_on_mesh, jit_on_mesh, put
 from playground.learning.algorithm import AlgorithmState, Metrics, Policy, build_algorithm
 from playground.learning.checkpoints import Checkpoint
@@ -111,7 +111,7 @@ class Trainer:
     self.act, self.networks = self.algorithm.act, self.algorithm.networks
     self.steps_per_update = config.steps_per_update * env.action_repeat
     self._buffer = self.algorithm.replay
-    if several() and self._buffer and self._buffer.saved:
+    if is_multiprocess() and self._buffer and self._buffer.saved:
       raise ConfigError("agent.checkpoint_replay=true needs one process for all devices: set it to false.")
     specs: dict[str, PyTree] = {"algorithm": P(), "key": P(), "env_state": P(AXIS), "capture": P(AXIS), "settings": P()}
     spec = self._spec = TrainState(**specs, replay=REPLAY_SPEC if self._buffer else None)
@@ -120,7 +120,9 @@ class Trainer:
     self.train = jit_on_mesh(self._train, mesh, (spec, P(AXIS), None), (spec, P()), donate_argnums=0)
     copy = lambda state: jax.tree.map(jnp.copy, self._saved(state))
     # Whole on every device where no process sees all of them.
-    self.copy = gather_on_mesh(copy, mesh, spec) if several() else jit_on_mesh(copy, mesh, (spec,), self._saved(spec))
+    self.copy = (
+      gather_on_mesh(copy, mesh, spec) if is_multiprocess() else jit_on_mesh(copy, mesh, (spec,), self._saved(spec))
+    )
 
   def join(self, parts: Sequence[PyTree]) -> PyTree:
     """Puts the trees of all agents, a tree each, into one; that of a single agent stays as it is."""

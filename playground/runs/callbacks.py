@@ -12,7 +12,7 @@ import numpy as np
 
 from playground.envs.base import Env
 from playground.errors import PlaygroundError
-from playground.hardware.mesh import own_share
+from playground.hardware.mesh import local_shard
 from playground.learning.checkpoints import CheckpointStore, checksum
 from playground.learning.evaluation import Recording
 from playground.learning.loop import Loop, Metrics
@@ -298,7 +298,7 @@ def check_updates(metrics: Metrics, allowed: float, step: int) -> int:
 
 def episodes_of(recording: Recording, count: int) -> dict[str, PyTree]:
   """The first `count` episodes of an evaluation's recording, one after the other: `qpos` [T, nq] and mocap poses."""
-  tape = {name: own_share(value, axis=1) for name, value in recording.items()}
-  active = tape.pop("active")[:, :count] > 0
+  arrays = {name: local_shard(value, axis=1) for name, value in recording.items()}
+  active = arrays.pop("active")[:, :count] > 0
   columns, rows = np.nonzero(active.T)
-  return {name: value[rows, columns] for name, value in tape.items() if value.size}
+  return {name: value[rows, columns] for name, value in arrays.items() if value.size}

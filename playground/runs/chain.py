@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from playground import registry
 from playground.config import in_stage, stage_folders
 from playground.errors import ConfigError
-from playground.hardware.distributed import agree, is_main, noting_loss, share
+from playground.hardware.distributed import any_process, is_main, noting_loss, share
 from playground.hardware.setup import setup
 from playground.learning.checkpoints import describe
 from playground.learning.trainer import Trainer
@@ -75,7 +75,7 @@ def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun
           interrupts.stop_saving()
           began_s = process_age_s()
           gc.collect()  # what the stage held on the device goes now, not when Python comes round to it
-        if agree(interrupts.signum is not None):
+        if any_process(interrupts.signum is not None):
           break
         before = str(run_dir.path)
     finally:

@@ -130,7 +130,7 @@ def test_too_little_is_said_of_the_others(
   for name in [name for name in os.environ if name.startswith(("SLURM", "OMPI"))]:
     monkeypatch.delenv(name)
   with pytest.raises(ConfigError) as caught:
-    distributed.join(hardware(*overrides))
+    distributed.init_distributed(hardware(*overrides))
   assert all(word in str(caught.value) for word in words)
 
 
@@ -140,7 +140,9 @@ def test_a_coordinator_that_is_not_there() -> None:
     address = f"localhost:{taken.getsockname()[1]}"
     keys = {"coordinator": address, "num_processes": 2, "process_id": 1, "timeout": 0.3}
     with pytest.raises(HardwareError) as caught:
-      distributed.join(hardware("hardware=multi_node", *(f"hardware.distributed.{k}={v}" for k, v in keys.items())))
+      distributed.init_distributed(
+        hardware("hardware=multi_node", *(f"hardware.distributed.{k}={v}" for k, v in keys.items()))
+      )
   assert f"coordinator={address} could not be reached" in str(caught.value)
   assert "Connection refused" in str(caught.value)
 
@@ -167,7 +169,7 @@ def test_others_that_do_not_come(tmp_path: Path) -> None:
 def test_an_exchange_that_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
   from jax.experimental import multihost_utils
 
-  monkeypatch.setattr(distributed, "several", lambda: True)
+  monkeypatch.setattr(distributed, "is_multiprocess", lambda: True)
   monkeypatch.setattr(multihost_utils, "process_allgather", lambda x: time.sleep(1))
   config = hardware("hardware.distributed.timeout=0.2")
   with pytest.raises(HardwareError, match=r"a first exchange between their devices did not end within .*=0\.2 s"):
