@@ -9,7 +9,7 @@ import numpy as np
 
 from playground import fingerprint
 from playground.errors import ConfigError
-from playground.hardware.distributed import several
+from playground.hardware.distributed import is_multiprocess
 from playground.hardware.setup import Hardware
 from playground.learning.stored_program import StoredProgram
 from playground.learning.trainer import Trainer
@@ -57,7 +57,7 @@ def stored_program(
     addresses of this process), and for a task from a notebook.
   """
   env, cache = trainer.env.unwrapped, hardware.facts["compilation_cache"]
-  if not cache or "://" in str(cache) or several() or env.impl == "warp":
+  if not cache or "://" in str(cache) or is_multiprocess() or env.impl == "warp":
     return None
   placeholders = {name: np.ones_like(value) for name, value in trainer.settings.items()}
   task = env.with_settings(below("env", placeholders))
