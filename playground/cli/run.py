@@ -106,8 +106,13 @@ def _main(argv: Sequence[str]) -> int:
 def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
   """Trains runs in one program (`playground.runs.together`), their overrides with `--` between them.
 
+  `--exploit-every` and `--explore` before those of the first make them a population.
   What holds for the whole command (`trust`, `hardware.cache_dir`) stands in the first.
   """
+  parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+  parser.add_argument("--exploit-every", type=int, default=0)
+  parser.add_argument("--explore", action="append", default=[])
+  population, overrides = parser.parse_known_args(overrides)
   overrides, trusted = _trusted(overrides)
   trust(*trusted)
   common = command_lines(overrides)
@@ -120,7 +125,7 @@ def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
   with gc_paused(stays=True):
     from playground.runs.together import train_together
 
-  return train_together(configs)
+  return train_together(configs, population.exploit_every, population.explore)
 
 
 def _downloaded(override: str) -> str:

@@ -35,6 +35,12 @@ class TogetherConfig(LocalConfig):
   """One process for jobs that differ only in seeds, initial weights and numbers, else as `local` (docs/sweeps.md)."""
 
   max_agents: Annotated[int, count(1), "most jobs in one process, which share its compiled program and memory"] = 16
+  exploit_every: Annotated[
+    int, count(0), "evaluations after which the worst quarter of the jobs copies the best; 0: each trains on its own"
+  ] = 0
+  explore: Annotated[
+    Sequence[str], "numbers of the agent that a job copies too, then multiplies by 0.8 or 1.25, within their limits"
+  ] = ("agent.learning_rate",)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

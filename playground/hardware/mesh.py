@@ -73,6 +73,15 @@ def _shardings(mesh: Mesh, specs: PyTree) -> PyTree:
   return jax.tree.map(lambda spec: NamedSharding(mesh, P(*agents, *spec)), specs)
 
 
+def take_agents(tree: PyTree, indices: np.ndarray, mesh: Mesh, spec: PyTree) -> PyTree:
+  """Returns the parts of these agents of a tree, divided as `spec` says of one agent's, in their order."""
+  return jax.jit(_take, out_shardings=_shardings(mesh, spec))(tree, indices)
+
+
+def _take(tree: PyTree, indices: jax.Array) -> PyTree:
+  return jax.tree.map(lambda x: x[indices], tree)
+
+
 def device_memory(mesh: Mesh) -> int | None:
   """Bytes that a program may use on the smallest device, of a CPU its share of the host's; None if nobody says."""
   if mesh.devices.flat[0].platform == "cpu":

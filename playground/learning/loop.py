@@ -24,6 +24,7 @@ from playground.hardware.distributed import any_process, is_multiprocess
 from playground.hardware.mesh import put, shard
 from playground.learning.algorithm import Policy
 from playground.learning.evaluation import Evaluate, Recording
+from playground.learning.population import PARENT, Population
 from playground.learning.rollout import Step
 from playground.learning.stored_program import LoweredFunction, StoredProgram, UnusableProgramError
 from playground.learning.trainer import Trainer, TrainState
@@ -234,6 +235,7 @@ class SegmentResult:
   trained: dict[str, jax.Array] | None = None
   train_s: float = 0.0
   evaluated: tuple[dict[str, jax.Array], Recording] | None = None
+  lineage: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # see `Population.exchange`
   eval_s: float = 0.0
   captured: Sequence[Step | None] | None = None
   snapshot: TrainState | None = None
@@ -250,6 +252,7 @@ class Loop:
     seeds: of each agent; evaluations and resets draw from it and the event they belong to, so they do not depend on
       where the run was interrupted.
     callbacks: of each agent, called with rows, states to keep and for whether to stop, which it does if all say so.
+    population: lets agents learn from each other; None does not.
     train_s: device time of training alone.
     first_update_s: that of one training step, by the first row.
   """
@@ -259,6 +262,7 @@ class Loop:
   events: list[ScheduleEvent]
   seeds: Sequence[int]
   callbacks: Sequence[Callbacks]
+  population: Population | None = None
   train_s: float = 0.0
   first_update_s: float | None = None
 
@@ -323,6 +327,8 @@ class Loop:
       done.evaluated = self.functions.evaluate(policy, key, self.functions.eval_model, state.settings)
       jax.block_until_ready(done.evaluated)
       done.eval_s = time.perf_counter() - start
+      if self.population:
+        state, done.lineage = self._exchange(state, event, done.evaluated[0]["episode_reward"], self.population)
     if event.reset:
       state = self.functions.reset(state, self._key(self._reset_key, event), self.functions.model)
     late = any_process(time.perf_counter() - self._last_save > SAVE_EVERY_S)
@@ -332,6 +338,17 @@ class Loop:
       done.snapshot = self.functions.copy(state)
       self._last_save = time.perf_counter()
     return state, done
+
+  def _exchange(
+    self, state: TrainState, event: ScheduleEvent, returns: jax.Array, population: Population
+  ) -> tuple[TrainState, tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Lets agents learn from each other, where it is time for that; the end of the run is not."""
+    settings = jax.device_get(state.settings)
+    count = sum(each.evaluate and 0 < each.update <= event.update for each in self.events)
+    if not event.update or event is self.events[-1] or count % population.exploit_every:
+      return state, (np.arange(len(self.callbacks)), settings)
+    lineage = population.exchange(np.asarray(returns), settings, event.update)
+    return self.trainer.inherit(state, *lineage), lineage
 
   def _report(self, done: SegmentResult) -> None:
     """Hands finished work to the callbacks, to each its agent's part."""
@@ -349,6 +366,10 @@ class Loop:
       if scores is not None:
         row |= {f"eval/{k}": float(v) for k, v in self.trainer.agent(scores, i).items()}
         row["time/eval_s"] = done.eval_s
+      if done.lineage is not None and self.population is not None:
+        parents, settings = done.lineage
+        row |= {PARENT: float(parents[i])} if parents[i] != i else {}
+        row |= {f"population/{key}": float(settings[key][i]) for key in self.population.explore}
       captured = None if done.captured is None else done.captured[i]
       callbacks.on_metrics(step, row, captured, self.trainer.agent(recording, i))
       if snapshot is not None:

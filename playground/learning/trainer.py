@@ -14,7 +14,7 @@ from playground.envs.base import Env, State
 from playground.envs.wrappers import PRESERVE_INFO, ModelFields, wrap_for_training
 from playground.errors import ConfigError
 from playground.hardware.distributed import is_multiprocess
-from playground.hardware.mesh import AXIS, device_memory, for_agents, gather_on_mesh, jit_on_mesh, put
+from playground.hardware.mesh import AXIS, device_memory, for_agents, gather_on_mesh, jit_on_mesh, put, take_agents
 from playground.learning.algorithm import AlgorithmState, Metrics, Policy, build_algorithm
 from playground.learning.checkpoints import Checkpoint
 from playground.learning.hyperparameters import AgentConfig
@@ -35,7 +35,7 @@ class TrainState(struct.PyTreeNode):
     key: of the next training step.
     env_state: a batch.
     capture: the first step with a number that is not finite.
-    settings: of `trainer_settings`; no checkpoint has them.
+    settings: of `trainer_settings`; a checkpoint notes them as plain numbers.
   """
 
   algorithm: AlgorithmState
@@ -222,6 +222,18 @@ class Trainer:
   def place(self, state: TrainState) -> TrainState:
     """Puts a state's host arrays on the devices, each its share, with the trainer's settings."""
     return put(state.replace(settings=self.settings), self.mesh, self._spec)
+
+  def inherit(self, state: TrainState, parents: np.ndarray, settings: Settings) -> TrainState:
+    """Returns a state of several agents in which each has what another one has learned.
+
+    Args:
+      state: of all agents.
+      parents: whose parameters, statistics and optimiser each agent gets, [agents]. Its environments, random key and
+        experience stay its own.
+      settings: host arrays of all agents.
+    """
+    algorithm = take_agents(state.algorithm, parents, self.mesh, P())
+    return state.replace(algorithm=algorithm, settings=put(dict(settings), self.mesh, P()))
 
   def _restore_replay(
     self, checkpoint: Checkpoint, template: TrainState, replay: Replay | None

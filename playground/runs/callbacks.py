@@ -16,6 +16,7 @@ from playground.hardware.mesh import local_shard
 from playground.learning.checkpoints import CheckpointStore, checksum
 from playground.learning.evaluation import Recording
 from playground.learning.loop import Loop, Metrics
+from playground.learning.population import PARENT
 from playground.learning.rollout import Step
 from playground.learning.trainer import Trainer, TrainState
 from playground.pytree import PyTree
@@ -72,6 +73,7 @@ class RunCallbacks:
     self._evaluations = 0
     self._step = plan.step or 0
     self._return: float | None = None  # of the newest row
+    self._copied = False  # whether the policy since then is another agent's
     self._recording: Recording | None = None
     self._rates: list[float] = []  # steps per second, by row
     self._start_to_first_update_s: float | None = None
@@ -94,6 +96,7 @@ class RunCallbacks:
     taken = step - self._step
     self._time(taken, metrics)
     self._step, self._return, self._recording = step, score, recording
+    self._copied = PARENT in metrics
     if score is not None:
       self._evaluations += 1
       every = self._config.video.every_evals
@@ -112,9 +115,10 @@ class RunCallbacks:
       "wall_clock_s": self.wall_clock_s,
       "config": self._config.resolved,
       "columns": self._trackers.columns,
+      "settings": {key: np.asarray(value).tolist() for key, value in state.settings.items()},
     }
     experience = None if final else partial(self._trainer.experience, state)
-    self._store.save(step, policy, rest, meta, experience, self._return)
+    self._store.save(step, policy, rest, meta, experience, None if self._copied else self._return)
 
   def should_stop(self) -> bool:
     return self._interrupts.signum is not None
@@ -173,8 +177,9 @@ class RunCallbacks:
     steps, returns, rate = (column(name) for name in ("step", RETURN, "time/steps_per_second"))
     last = lambda name: next((value for value in column(name)[::-1].tolist() if np.isfinite(value)), None)
     chosen = "mode" if self._trainer.config.deterministic_eval else "sampled"
-    scores = [(value, int(step)) for value, step in zip(returns.tolist(), steps, strict=True) if np.isfinite(value)]
-    # As `checkpoints/best` has it: of several the last, and never the untrained policy, which is not saved.
+    own = np.isfinite(returns) & ~np.isfinite(column(PARENT))
+    scores = [(float(value), int(step)) for value, step in zip(returns[own], steps[own], strict=True)]
+    # As `checkpoints/best` has it: of several the last, and never a policy that is not saved, as the untrained one.
     best_return, best_step = max((score for score in scores if score[1] > 0), default=(None, None))
     trained = np.isfinite(rate)
     taken = np.diff(steps, prepend=0)[trained]

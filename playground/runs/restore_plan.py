@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import jax
+import numpy as np
 
 from playground import registry
 from playground.errors import CheckpointError
@@ -14,8 +15,9 @@ from playground.hardware.distributed import is_main
 from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import Checkpoint, DamagedCheckpointError, NoCheckpointError, find_checkpoints
 from playground.learning.loop import Draw
-from playground.learning.trainer import Trainer, TrainState
+from playground.learning.trainer import Settings, Trainer, TrainState
 from playground.pretrained import check_task, is_pretrained, locate
+from playground.pytree import PyTree
 from playground.runs.run_dir import RunDirectory
 
 if TYPE_CHECKING:
@@ -49,6 +51,7 @@ class RestorePlan:
     wall_clock_s: time the run had taken by then.
     policy: restored weights (host arrays) for a new run.
     columns: of metrics.csv at the restored checkpoint.
+    settings: those of the agent at the restored checkpoint, which population-based training may have changed.
     began_s: age of the process when the run's turn came.
   """
 
@@ -62,6 +65,7 @@ class RestorePlan:
   wall_clock_s: float = 0.0
   policy: Policy | None = None
   columns: list[str] = dataclasses.field(default_factory=list)
+  settings: dict[str, float | list[float]] = dataclasses.field(default_factory=dict)
   began_s: float = 0.0
 
   @classmethod
@@ -108,6 +112,11 @@ class RestorePlan:
     """Whether the resumed run has nothing left to do."""
     return self.run_dir is not None and self.run_dir.status.get("status") == "finished"
 
+  def settings_over(self, own: Settings) -> dict[str, PyTree]:
+    """Returns a run's settings: those at the restored checkpoint where it notes any, else the config's."""
+    noted = {key: np.asarray(value, np.float32) for key, value in self.settings.items() if key in own}
+    return {**own, **noted}
+
   def restore(self, trainer: Trainer, name: str, draw: Draw) -> None:
     """Reads what there is to restore, checked against the algorithm and its shapes, before anything is compiled.
 
@@ -140,5 +149,6 @@ class RestorePlan:
       self.update, self.step = checkpoint.meta["update"], checkpoint.step
       self.wall_clock_s = checkpoint.meta["wall_clock_s"]
       self.columns = checkpoint.meta.get("columns", [])  # earlier versions did not note them
+      self.settings = checkpoint.meta.get("settings", {})
       self.notices.append(notice)
       return

@@ -14,10 +14,12 @@ from playground.hardware.mesh import device_memory
 from playground.hardware.setup import Hardware, setup
 from playground.learning.evaluation import Recording
 from playground.learning.loop import CompiledFunctions, Loop
+from playground.learning.population import Population
 from playground.learning.rollout import Step
 from playground.learning.trainer import TrainState
 from playground.runs.callbacks import RunCallbacks
 from playground.runs.interrupts import Interrupted, Interrupts, exit_code
+from playground.runs.population import population_of
 from playground.runs.programs import program_of
 from playground.runs.progress import Progress
 from playground.runs.restore_plan import RestorePlan
@@ -28,11 +30,17 @@ if TYPE_CHECKING:
   from playground.config import RunConfig
 
 
-def train_together(configs: Sequence["RunConfig"]) -> int:
+def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explore: Sequence[str] = ()) -> int:
   """Trains runs that have the same program, new or to resume.
 
   A run that fails, be it for its numbers or its disk, ends alone. Runs that stand at different steps (an earlier start
-  was cut short between two of them) are trained in turn, those of the same step together.
+  was cut short between two of them) are trained in turn, those of the same step together; but a population goes on from
+  the newest step that all of them have.
+
+  Args:
+    configs: of the runs.
+    exploit_every: see `Population`; 0 is no population.
+    explore: keys of the settings that its agents copy and vary.
 
   Returns:
     The exit code: 0 when all are finished, 130 or 143 when interrupted (and saved), 2 where a run failed.
@@ -42,30 +50,38 @@ def train_together(configs: Sequence["RunConfig"]) -> int:
   """
   if len({program_of(config) for config in configs}) > 1 or program_of(configs[0]) is None:
     raise ConfigError("These runs cannot train together: they differ in more than seeds and numbers of agent and task.")
+  population = population_of(configs, exploit_every, explore)
   with Interrupts() as interrupts:
     try:
-      hardware, groups = setup(configs[0].hardware), _by_step(configs)
-      codes = [_train_group(group, interrupts, hardware) for group in groups if interrupts.signum is None]
+      hardware, groups = setup(configs[0].hardware), _groups(configs, population)
+      codes = [_train_group(group, interrupts, hardware, population) for group in groups if interrupts.signum is None]
     except Interrupted as interrupt:
       print(f"Interrupted by {interrupt}.")
       return exit_code(interrupt.signum)
   return exit_code(interrupts.signum) if interrupts.signum is not None and any(codes) else max(codes, default=0)
 
 
-def _by_step(configs: Sequence["RunConfig"]) -> "list[list[RunConfig]]":
-  """The runs that are not finished, those at the same step together."""
+def _groups(configs: Sequence["RunConfig"], population: Population | None) -> "list[list[RunConfig]]":
+  """The runs that are not finished; those of a population together, else those at the same step."""
   groups: dict[str, list[RunConfig]] = {}
   for config in configs:
     plan = RestorePlan.find(config)
     if not plan.finished:
-      groups.setdefault(plan.checkpoints[0].name if plan.checkpoints else "", []).append(config)
+      step = plan.checkpoints[0].name if plan.checkpoints and not population else ""
+      groups.setdefault(step, []).append(config)
   return list(groups.values())
 
 
-def _train_group(configs: Sequence["RunConfig"], interrupts: Interrupts, hardware: Hardware) -> int:
-  """Trains runs that stand at the same step."""
+def _train_group(
+  configs: Sequence["RunConfig"], interrupts: Interrupts, hardware: Hardware, population: Population | None
+) -> int:
+  """Trains runs that stand at the same step, or a population."""
   with contextlib.ExitStack() as runs:
     plans = [runs.enter_context(RestorePlan.find(config).locked(config)) for config in configs]
+    if population:
+      steps = set.intersection(*({path.name for path in plan.checkpoints} for plan in plans))
+      for plan in plans:
+        plan.checkpoints = [path for path in plan.checkpoints if path.name in steps]
     training = prepare(configs, plans, hardware, together=True)
     if len({plan.update for plan in plans}) > 1:
       raise CheckpointError("A checkpoint was damaged, and one run of the group is behind: start the sweep again.")
@@ -89,7 +105,7 @@ def _train_group(configs: Sequence["RunConfig"], interrupts: Interrupts, hardwar
       member.begin(
         RunCallbacks(config, member.run_dir, training.env, training.trainer, shown, interrupts, plan, training.drawn)
       )
-    loop = Loop(training.trainer, program, training.events, [config.seed for config in configs], members)
+    loop = Loop(training.trainer, program, training.events, [config.seed for config in configs], members, population)
     state, completed = training.run(loop, plans, interrupts)
     state = jax.device_get(state)
     for i, member in enumerate(members):

@@ -147,8 +147,8 @@ def prepare(
   env = registry.load(config.choices["env"], config=config.env)
   drawn = drawn_model(env, config.video.visuals)
   need_camera(drawn, config.video.camera, "video.camera")
-  agents = [trainer_settings(each.agent, env.settings_of(each.env)) for each in configs] if together else ()
-  trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision, agents)
+  settings = [trainer_settings(each.agent, env.settings_of(each.env)) for each in configs]
+  trainer = Trainer(env, agent, hardware.mesh, hardware.network_precision, settings if together else ())
   samplers = [model_sampler(env, each, agent.num_envs, agent.num_eval_envs) for each in configs]
 
   def draw() -> tuple[ModelFields, ModelFields]:
@@ -160,6 +160,7 @@ def prepare(
     plan.notices.append(describe_division(agent, trainer.num_devices))
   for each, theirs in zip(plans, configs, strict=True):
     each.restore(trainer, theirs.agent_name, draw)
+  trainer.settings = trainer.join([each.settings_over(own) for each, own in zip(plans, settings, strict=True)])
   preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # one may see it damaged
 
   num_updates = math.ceil(agent.num_timesteps / trainer.steps_per_update)

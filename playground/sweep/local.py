@@ -88,8 +88,11 @@ class LocalLauncher:
   def start(self, job: Job) -> bool:
     return self._start([job])
 
-  def _start(self, jobs: Sequence[Job]) -> bool:
-    """Starts jobs that need the same devices in one process, or returns False because there is no room for it now."""
+  def _start(self, jobs: Sequence[Job], options: Sequence[str] = ()) -> bool:
+    """Starts jobs that need the same devices in one process, or returns False because there is no room for it now.
+
+    `options` go to their command.
+    """
     job = jobs[0]
     for name in [name for name in self._taken if not self._at_work(name)]:
       del self._taken[name]
@@ -107,7 +110,7 @@ class LocalLauncher:
     for folder in folders:
       folder.write_waiting("submitted")
     numbers = [str(slot.number) for slot in slots]
-    args = [*limits, "--where", where, "--slots", *numbers, "--cores", *map(str, cores), "--", *self._command]
+    args = [*limits, "--where", where, "--slots", *numbers, "--cores", *map(str, cores), "--", *self._command, *options]
     with folders[0].log.open("ab") as log:
       worker = subprocess.Popen(
         [*PYTHON, "-m", "playground.sweep.worker", *(str(folder.path) for folder in folders), *args],

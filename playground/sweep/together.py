@@ -4,7 +4,9 @@ import math
 from collections.abc import Sequence
 
 from playground.config import compose
-from playground.config.sweep_options import TogetherConfig
+from playground.config.sweep_options import LocalConfig, TogetherConfig
+from playground.errors import ConfigError
+from playground.runs.population import population_of
 from playground.runs.programs import program_of
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import LocalLauncher, Slot
@@ -19,16 +21,27 @@ class TogetherLauncher(LocalLauncher):
     self, sweep: SweepDirectory, config: TogetherConfig, command: Sequence[str] = COMMAND, slots: Sequence[Slot] = ()
   ):
     super().__init__(sweep, config, command, slots)
+    explore = [f"--explore={key}" for key in config.explore]
+    self._population = [f"--exploit-every={config.exploit_every}", *explore] if config.exploit_every else []
     self._max_agents = config.max_agents
     self._groups: dict[str, list[Job]] = {}  # by the names of their jobs
     self._group(sweep.jobs)
+
+  @staticmethod
+  def check(config: LocalConfig, jobs: Sequence[Job]) -> None:
+    LocalLauncher.check(config, jobs)
+    if isinstance(config, TogetherConfig) and config.exploit_every:
+      population_of([compose(job.overrides) for job in jobs], config.exploit_every, config.explore)
+      if len(jobs) > config.max_agents:
+        raise ConfigError(f"launcher.max_agents={config.max_agents} is below the {len(jobs)} jobs of the population.")
 
   def start(self, job: Job) -> bool:
     if job.name in self._workers:  # with the first of its group
       return True
     if job.name not in self._groups:  # a search has added it
       self._group([job])
-    return self._start(self._groups[job.name])
+    group = self._groups[job.name]
+    return self._start(group, self._population if len(group) > 1 else ())
 
   def _group(self, jobs: Sequence[Job]) -> None:
     """Finds jobs that can share a program, among those that are not done."""
@@ -40,5 +53,6 @@ class TogetherLauncher(LocalLauncher):
         programs.setdefault(program_of(config) or job.name, []).append(job)
     for same in programs.values():
       size = min(self._max_agents, math.ceil(len(same) / len(self.slots)))  # no slot stays empty
+      size = len(same) if self._population else size
       groups = [same[i : i + size] for i in range(0, len(same), size)]
       self._groups |= {job.name: group for group in groups for job in group}

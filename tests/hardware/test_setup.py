@@ -69,6 +69,10 @@ for count, devices in ((2, 1), (3, 2)):  # one agent on each device; all of them
     ours, theirs = (jax.tree.leaves(jax.device_get(s.algorithm.params)) for s in (trainer.agent(state, i), expected))
     for a, b in zip(ours, theirs, strict=True):
       np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
+  state = trainer.inherit(state, np.zeros(count, int), trainer.settings)
+  for leaf in jax.tree.leaves(jax.device_get(state.algorithm)):
+    np.testing.assert_array_equal(leaf[-1], leaf[0])
+  trainer.train(state, {}, np.int32(1))
 """
 
 

@@ -97,6 +97,37 @@ def test_what_ends_one_lets_the_others_go_on(
   assert runs["b"].summary["steps"] == runs["a"].summary["steps"]
 
 
+@pytest.mark.slow
+def test_a_population_goes_on_from_the_step_that_all_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  rate = "agent.learning_rate"
+  explore = 1, [rate]
+  own = {"a": [f"{rate}=1e-3", "seed=1"], "b": [f"{rate}=3e-3", "seed=2"]}
+
+  def start(folder: str) -> list[RunConfig]:
+    of = lambda name: [*BUDGET, "agent.num_evals=4", *own[name], f"run_dir={tmp_path / folder / name}"]
+    return [compose(of(name)) for name in own]
+
+  assert train_together(start("whole"), *explore) == 0
+  whole = {name: RunDirectory(tmp_path / "whole" / name) for name in own}
+  tables = [pd.read_csv(run.metrics_csv) for run in whole.values()]
+  numbers = [table[f"population/{rate}"].dropna().tolist() for table in tables]
+  assert [len(column) for column in numbers] == [4, 4] and max(len(set(column)) for column in numbers) > 1
+  with monkeypatch.context() as patch:
+    asked = itertools.count()
+    patch.setattr(Member, "should_stop", lambda self: next(asked) > 14)
+    train_together(start("cut"), *explore)
+  cut = {name: RunDirectory(tmp_path / "cut" / name) for name in own}
+  assert [run.status["status"] for run in cut.values()] == ["preempted"] * 2
+  newest = sorted(path for path in cut["b"].checkpoints.glob("0*") if path.is_dir())[-1]
+  shutil.rmtree(newest)  # as a kill between two saves leaves it
+  assert train_together(resumed(tmp_path / "cut", *own), *explore) == 0
+  sums = [{name: run.summary["params_sha256"] for name, run in runs.items()} for runs in (whole, cut)]
+  assert sums[0] == sums[1], "bit for bit"
+  for run, table in zip(cut.values(), tables, strict=True):
+    theirs = pd.read_csv(run.metrics_csv).filter(regex="^(?!time/)")
+    pd.testing.assert_frame_equal(theirs, table.filter(regex="^(?!time/)"), check_like=True)
+
+
 @pytest.mark.parametrize(
   ("override", "same"),
   [

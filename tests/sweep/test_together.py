@@ -1,13 +1,16 @@
 """Which jobs of a sweep `launcher=together` gives one process, and such a sweep as users start it."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 
 from playground.cli.run import main
 from playground.config.sweep_options import TogetherConfig
+from playground.errors import ConfigError
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import LocalLauncher
 from playground.sweep.together import TogetherLauncher
@@ -24,9 +27,9 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
   """The names of the jobs of each process that is started."""
   found: list[list[str]] = []
 
-  def start(self: LocalLauncher, jobs: Sequence[Job]) -> bool:
-    found.append([job.name for job in jobs])
-    self._workers |= dict.fromkeys(found[-1])  # pyright: ignore
+  def start(self: LocalLauncher, jobs: Sequence[Job], options: Sequence[str]) -> bool:
+    found.append([*options, *(job.name for job in jobs)])
+    self._workers |= dict.fromkeys(job.name for job in jobs)  # pyright: ignore
     return True
 
   monkeypatch.setattr(LocalLauncher, "_start", start)
@@ -54,6 +57,33 @@ def test_finished_jobs_are_left_out_and_a_search_adds_jobs(tmp_path: Path, start
   sweep.add(new)
   assert launcher.start(sweep.jobs[1]) and launcher.start(sweep.jobs[2]) and launcher.start(new)
   assert started == [["001", "002"], ["new"]]
+
+
+def test_a_population_is_one_process(tmp_path: Path, started: list[list[str]]) -> None:
+  sweep = make(tmp_path, *(f"seed={i}" for i in range(4)))
+  explore = ["agent.learning_rate", "agent.entropy_cost"]
+  settings = TogetherConfig(exploit_every=2, explore=explore, cores_per_job=1)
+  launcher = TogetherLauncher(sweep, settings)
+  assert all(launcher.start(job) for job in sweep.jobs)
+  assert started == [["--exploit-every=2", *(f"--explore={key}" for key in explore), "000", "001", "002", "003"]]
+
+
+@pytest.mark.parametrize(
+  ("jobs", "settings", "message"),
+  [
+    (["seed=1"], {}, "needs two or more jobs"),
+    (["seed=1", "seed=2 agent.num_envs=64"], {}, "differ in more than seeds and numbers"),
+    (["seed=1", "seed=2 env.events.damping.params.range=[0.8,1.2]"], {}, "need the same env"),
+    (["seed=1", "seed=2"], {"explore": ["agent.num_envs"]}, "launcher.explore=agent.num_envs must be one of agent.l"),
+    (["seed=1", "seed=2", "seed=3"], {"max_agents": 2}, "launcher.max_agents=2 is below the 3 jobs"),
+  ],
+)
+def test_what_is_no_population(jobs: list[str], settings: dict[str, Any], message: str, tmp_path: Path) -> None:
+  damping = "env.events.damping={mode:startup,func:model_field}"
+  params = "env.events.damping.params={field:dof_damping,target:all,operation:scale,range:[0.9,1.1]}"
+  listed = [Job(text, ["tuned=null", damping, params, *text.split()], {}) for text in jobs]
+  with pytest.raises(ConfigError, match=re.escape(message)):
+    TogetherLauncher.check(TogetherConfig(exploit_every=2, **settings), listed)
 
 
 def test_a_sweep_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,41 @@
+"""Whether runs can be a population, whose agents learn from each other (`playground.learning.population`)."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.learning.population import Population
+from playground.limits import Limit
+from playground.runs.programs import program_of
+from playground.settings import settings
+
+if TYPE_CHECKING:
+  from playground.config import RunConfig
+
+
+def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: Sequence[str]) -> Population | None:
+  """Returns the population that runs are, None where `exploit_every` is 0.
+
+  Raises:
+    ConfigError: there is one run only, their programs differ, or their tasks do, so that returns do not compare.
+    UnknownNameError: `explore` names something else than a number of the agent that is an argument of the program.
+  """
+  if not exploit_every:
+    return None
+  if len(configs) < 2 or len({program_of(config) for config in configs}) > 1 or program_of(configs[0]) is None:
+    raise ConfigError(
+      f"launcher.exploit_every={exploit_every} needs two or more jobs that train in one program: these are "
+      f"{len(configs)} that differ in more than seeds and numbers (docs/sweeps.md)."
+      if len(configs) > 1
+      else f"launcher.exploit_every={exploit_every} needs two or more jobs, such as 'seed=range(8)'."
+    )
+  if any(config.resolved["env"] != configs[0].resolved["env"] for config in configs):
+    raise ConfigError(
+      f"launcher.exploit_every={exploit_every} compares returns, so all jobs need the same env: vary seed and agent."
+    )
+  agent, known = configs[0].agent, [f"agent.{name}" for name in configs[0].agent.traced]
+  for key in explore:
+    if key not in known:
+      raise UnknownNameError(f"launcher.explore={key} must be one of {', '.join(known)}.{nearest(key, known)}")
+  limits = {key: settings(type(agent))[key.removeprefix("agent.")].limit or Limit() for key in explore}
+  return Population(exploit_every, limits, configs[0].seed)
