@@ -126,6 +126,7 @@ def compile_program(
   draw: Draw,
   policy: Policy | None = None,
   stored: StoredProgram | None = None,
+  resets: bool = True,
 ) -> CompiledFunctions:
   """Compiles all functions side by side, Warp's kernels too, ahead of the first step.
 
@@ -137,6 +138,7 @@ def compile_program(
     draw: randomised model fields of the training and of the evaluation environments.
     policy: what a new run starts from, if it has any weights to start from.
     stored: where the lowered functions are kept, None where they are not.
+    resets: whether the schedule resets all environments; without, `reset` is compiled if it is called at all.
   """
   start, notices = time.perf_counter(), []
   kernels = trainer.env.unwrapped.physics.compile_ahead()
@@ -149,7 +151,7 @@ def compile_program(
       except UnusableProgramError as error:
         notices.append(str(error))
     with gc_paused():  # tracing makes millions of objects
-      futures = _trace(trainer, evaluate, draw, policy, stored, pool)
+      futures = _trace(trainer, evaluate, draw, policy, stored, resets, pool)
       trace_s = time.perf_counter() - start
       model, eval_model = shard(draw(), trainer.mesh)  # takes seconds, which XLA needs anyway
       results = {name: future.result() for name, future in futures.items()}
@@ -166,7 +168,7 @@ def compile_program(
       stored.save(lowered)
     except OSError as error:
       notices.append(f"The program was not stored, so the next start traces again: {first_line(error)}.")
-  compiled = {name: function for name, (function, _) in results.items()}
+  compiled = {"reset": trainer.reset} | {name: function for name, (function, _) in results.items()}
   notice = " ".join(filter(None, notices)) or None
   return CompiledFunctions(
     **compiled, model=model, eval_model=eval_model, trace_s=trace_s, compile_s=compile_s, notice=notice
@@ -184,7 +186,7 @@ def _compile_stored(
   futures = {name: pool.submit(function.compile, trainer.mesh) for name, function in functions.items()}
   model, eval_model = shard(draw(), trainer.mesh)
   try:
-    compiled = {name: future.result() for name, future in futures.items()}
+    compiled = {"reset": trainer.reset} | {name: future.result() for name, future in futures.items()}
   except Exception as error:  # of any kind: JAX and XLA read a file
     raise stored.discard(error) from error
   compile_s = time.perf_counter() - start
@@ -199,6 +201,7 @@ def _trace(
   draw: Draw,
   policy: Policy | None,
   stored: StoredProgram | None,
+  resets: bool,
   pool: ThreadPoolExecutor,
 ) -> dict[str, Future[tuple[Compiled, LoweredFunction | None]]]:
   """Traces all functions and has the pool compile them: name to the function and what can be stored of it."""
@@ -217,13 +220,13 @@ def _trace(
 
   model, eval_model = jax.eval_shape(draw)
   state = trainer.init.trace(key, model, policy, trainer.settings).out_info
-  return {
+  futures = {
     "train": submit(trainer.train, state, model, count),  # first, for it takes XLA longest
     "init": submit(trainer.init, key, model, policy, trainer.settings),
-    "reset": submit(trainer.reset, state, key, model),
     "evaluate": submit(evaluate, trainer.policy(state), key, eval_model, state.settings),
     "copy": submit(trainer.copy, state),
   }
+  return futures | {"reset": submit(trainer.reset, state, key, model)} if resets else futures
 
 
 @dataclasses.dataclass

@@ -111,7 +111,8 @@ class Training:
 
   def compile(self, plans: Sequence[RestorePlan]) -> CompiledFunctions:
     """Compiles what it needs; `plans` say what each agent starts from."""
-    return compile_program(self.trainer, self.evaluate, self.draw, self._policies(plans), self.stored)
+    resets = any(event.reset for event in self.events)
+    return compile_program(self.trainer, self.evaluate, self.draw, self._policies(plans), self.stored, resets)
 
   def run(self, loop: Loop, plans: Sequence[RestorePlan], interrupts: Interrupts) -> tuple[TrainState, bool]:
     """Trains from where the runs begin; returns the last state, and whether the schedule was completed."""
