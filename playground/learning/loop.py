@@ -258,6 +258,7 @@ class Loop:
     population: lets agents learn from each other; None does not.
     train_s: device time of training alone.
     first_update_s: that of one training step, by the first row.
+    first_update_at: when the first training step was done, on the clock of `time.perf_counter`.
   """
 
   trainer: Trainer
@@ -268,6 +269,7 @@ class Loop:
   population: Population | None = None
   train_s: float = 0.0
   first_update_s: float | None = None
+  first_update_at: float | None = None
 
   def __post_init__(self) -> None:
     keys = self.trainer.join([np.asarray(jax.random.split(jax.random.PRNGKey(seed), 3)) for seed in self.seeds])
@@ -317,7 +319,9 @@ class Loop:
       jax.block_until_ready(done.trained)
       done.train_s = time.perf_counter() - start
       self.train_s += done.train_s
-      self.first_update_s = self.first_update_s or done.train_s / num_updates
+      if self.first_update_s is None:
+        self.first_update_s = done.train_s / num_updates
+        self.first_update_at = start + self.first_update_s
       if np.any(done.trained["nonfinite"] > 0):
         capture = jax.device_get(self.functions.copy(state).capture if is_multiprocess() else state.capture)
         shapes = self.trainer.shapes((state.env_state, self.functions.model))

@@ -76,7 +76,6 @@ class RunCallbacks:
     self._copied = False  # whether the policy since then is another agent's
     self._recording: Recording | None = None
     self._rates: list[float] = []  # steps per second, by row
-    self._start_to_first_update_s: float | None = None
     self._rejected = 0  # gradient steps
     self._dumped = any(run_dir.nan_dump.glob("*.npz"))  # by an earlier start of this run
     self._warned_of_buffers = False
@@ -94,7 +93,8 @@ class RunCallbacks:
     self._trackers.log(step, metrics | {"time/wall_clock_s": self.wall_clock_s})
     self._progress.update(step, metrics.get("time/steps_per_second"), score)
     taken = step - self._step
-    self._time(taken, metrics)
+    if (rate := metrics.get("time/steps_per_second")) is not None:
+      self._rates.append(rate)
     self._step, self._return, self._recording = step, score, recording
     self._copied = PARENT in metrics
     if score is not None:
@@ -145,7 +145,7 @@ class RunCallbacks:
       for line in format_ops(write_top_ops(self._profile)):
         self._progress.print(line)
     timings = {
-      "start_to_first_update_s": self._start_to_first_update_s,
+      "start_to_first_update_s": self._from_start(loop.first_update_at),
       "first_update_s": loop.first_update_s,
       "train_s": loop.train_s,
       "steady_steps_per_second": float(np.median(self._rates)) if self._rates else None,
@@ -194,15 +194,9 @@ class RunCallbacks:
       "steps_per_second": float(taken.sum()) / seconds if seconds else None,
     }
 
-  def _time(self, taken: int, metrics: Metrics) -> None:
-    """Notes how fast a row was trained and, at the first, when the first training step was done."""
-    rate = metrics.get("time/steps_per_second")
-    if rate is None:
-      return
-    if not self._rates:
-      after_first = (taken - self._trainer.steps_per_update) / rate
-      self._start_to_first_update_s = process_age_s() - self._process_began_s - after_first
-    self._rates.append(rate)
+  def _from_start(self, at: float | None) -> float | None:
+    """Seconds from the start of the process, or of the chain's stage, to a time of `time.perf_counter`."""
+    return None if at is None else process_age_s() - self._process_began_s - (time.perf_counter() - at)
 
   def _start_video(self, step: int, recording: Recording) -> None:
     """Renders the first recorded episodes in a child process while training goes on."""
