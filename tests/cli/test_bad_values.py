@@ -54,7 +54,7 @@ def cases() -> list[tuple[str, ...]]:
 def built() -> Iterator[None]:
   """Stops each run where it would compile, with its task traced."""
 
-  def stop(trainer: Any, evaluate: Any, draw: Any, policy: Any) -> None:
+  def stop(trainer: Any, evaluate: Any, draw: Any, *_: Any) -> None:
     env = trainer.env.unwrapped
     jax.eval_shape(draw)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))

@@ -184,6 +184,7 @@ class Weighted(PointTask):
   """A point whose reward has a term with a weight."""
 
   managers = ("rewards",)
+  robot: Any = None
 
   def __init__(self, weight: float):
     super().__init__()
