@@ -149,7 +149,10 @@ class Env(abc.ABC):
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:
-    """What each observation entry is made of, in order: part name to length ("state" for a flat observation)."""
+    """What each observation entry is made of, in order: part name to length ("state" for a flat observation).
+
+    A part that has the name of another entry is that entry.
+    """
     return {}
 
   @functools.cached_property

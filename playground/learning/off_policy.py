@@ -5,6 +5,7 @@ from the buffer.
 """
 
 import abc
+from collections.abc import Mapping
 from typing import ClassVar, Generic, TypeVar
 
 import jax
@@ -73,7 +74,8 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
         "transitions are collected, so nothing would be learned."
       )
     shape = lambda *size: jax.ShapeDtypeStruct(size, jnp.float32)
-    obs = {key: shape(*size) for key, size in networks.obs_sizes.items()}
+    self._inside = groups_inside(env, networks.obs_sizes)
+    obs = {key: shape(*size) for key, size in networks.obs_sizes.items() if key not in self._inside}
     done = shape() if config.num_steps > 1 else None
     example = Transition(obs, obs, shape(env.action_size), shape(), shape(), shape(), done)  # pyright: ignore
     dtype = jnp.dtype(config.replay_dtype)
@@ -121,7 +123,9 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
     normalizer = state.normalizer
     if config.normalize_observations:
       normalizer = running_statistics.update(normalizer, transition.obs, pmap_axis_name=AXIS)
-    replay = self.buffer.insert(state.replay, transition)
+    stored = lambda obs: {key: x for key, x in obs.items() if key not in self._inside}
+    kept = transition.replace(obs=stored(transition.obs), next_obs=stored(transition.next_obs))
+    replay = self.buffer.insert(state.replay, kept)
 
     # Learn, once there is enough to learn from: what all gradient steps need is drawn and normalised in one go.
     def learn(start: Learned) -> tuple[Learned, jax.Array]:
@@ -132,7 +136,8 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
       else:
         batches = self.buffer.sample(replay, replay_key, shape)
       seen = normalizer if config.normalize_observations else None
-      batches = batches.replace(obs=normalize(batches.obs, seen), next_obs=normalize(batches.next_obs, seen))
+      read = lambda obs: normalize(obs | {key: obs[of][..., :n] for key, (of, n) in self._inside.items()}, seen)
+      batches = batches.replace(obs=read(batches.obs), next_obs=read(batches.next_obs))
       return self.learn(start, batches, learn_key, replay.inserted)
 
     ready = state.replay.inserted >= config.prefill_updates
@@ -167,6 +172,21 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
   def explore(self, state: OffPolicyState, obs: Observation, key: jax.Array) -> jax.Array:
     """Returns the actions to collect with, in [-1, 1], [N, action_size]: the policy's samples."""
     return self.act(self.policy(state), obs, key, deterministic=False)
+
+
+def groups_inside(env: Env, sizes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[str, int]]:
+  """Observation groups of these sizes that another one begins with, and which the buffer therefore leaves out.
+
+  Returns:
+    By group: the other, and how many of its numbers are the group.
+  """
+  found: dict[str, tuple[str, int]] = {}
+  parts = env.observation_parts if len(sizes) > 1 else {}
+  for group in sizes:
+    first, length = next(iter(parts.get(group, {}).items()), (group, 0))
+    if first != group and sizes.get(first) == (length,):
+      found[first] = group, length
+  return found
 
 
 def n_step(windows: Transition, discounting: float) -> Transition:

@@ -17,6 +17,7 @@ from playground.errors import CheckpointError, ConfigError
 from playground.hardware.mesh import jit_on_mesh, make_mesh
 from playground.learning import trainer as trainer_module
 from playground.learning.checkpoints import Checkpoint, CheckpointStore, find_checkpoints
+from playground.learning.off_policy import groups_inside
 from playground.learning.rollout import Environments
 from playground.learning.sac import SAC
 from playground.learning.trainer import Trainer
@@ -48,6 +49,30 @@ def trained(updates: int, trainer: Trainer | None = None) -> Any:
   trainer = trainer or built()
   state, _ = trainer.train(trainer.init(jax.random.PRNGKey(0), MODEL, None, trainer.settings), MODEL, np.int32(updates))
   return state
+
+
+class PointInParts(PointTask):
+  """The point, which says that `privileged_state` begins with `state`."""
+
+  @property
+  def observation_parts(self) -> dict[str, dict[str, int]]:
+    return {"state": {"place": 2}, "privileged_state": {"state": 2, "velocity": 2}}
+
+
+def test_groups_that_another_one_begins_with() -> None:
+  sizes = {"state": (2,), "privileged_state": (4,)}
+  assert groups_inside(PointInParts(), sizes) == {"state": ("privileged_state", 2)}
+  assert groups_inside(PointInParts(), {"state": (6,), "privileged_state": (4,)}) == {}, "frames: it is longer"
+  assert groups_inside(PointInParts(), {"privileged_state": (4,)}) == groups_inside(PointTask(), sizes) == {}
+
+
+@pytest.mark.slow
+def test_the_buffer_keeps_a_group_within_another_once() -> None:
+  parts = Trainer(PointInParts(), SMALL_SAC, make_mesh(1))
+  assert algorithm(parts).buffer.width == algorithm(built()).buffer.width - 2 * 2
+  ours, whole = (trained(PREFILL + 2, trainer).algorithm for trainer in (parts, built()))
+  for a, b in zip(numbers((ours.params, ours.target_q)), numbers((whole.params, whole.target_q)), strict=True):
+    np.testing.assert_array_equal(a, b)
 
 
 def test_nothing_is_learned_before_there_is_enough_to_learn_from() -> None:
