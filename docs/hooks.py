@@ -190,9 +190,10 @@ def _terms_page() -> str:
 
 def _experiments() -> str:
   """The experiments that have no file."""
-  rows = [f"| {_code(name)} | {_code(task)} |" for name, task in sorted(task_experiments([ROOT / "configs"]).items())]
-  head = "Every task has an experiment of its name, which chooses it with its tuned set. Those below have files.\n"
-  return "\n".join([head, "| experiment | task |", "|---|---|", *rows, ""])
+  tasks, known = task_experiments([ROOT / "configs"]), entries()
+  rows = [f"| {_code(name)} | {_code(task)} | {_code(known[task].agent)} |" for name, task in sorted(tasks.items())]
+  head = "Every task has an experiment of its name with its agent and tuned set. Those below have files.\n"
+  return "\n".join([head, "| experiment | task | agent |", "|---|---|---|", *rows, ""])
 
 
 def _class_section(name: str, cls: type) -> str:

@@ -30,6 +30,7 @@ class Entry:
     observation: size of each observation group, such as `state 48, privileged_state 123`.
     action: size of the action.
     backend: physics on an NVIDIA GPU, jax or warp.
+    agent: the algorithm that its experiment trains with.
     budget: environment steps of its tuned set.
     experiment: its experiment.
     status: solved, learning or open, as `status` says; "not measured" without a reference run.
@@ -44,6 +45,7 @@ class Entry:
   observation: str
   action: int
   backend: str
+  agent: str
   budget: int
   experiment: str
   status: Status
@@ -79,6 +81,7 @@ def measure(task: str) -> Entry:
     observation=shown,
     action=env.action_size,
     backend="warp" if config.env.vision.enable else str(config.env.cuda_impl),
+    agent=str(config.agent_name),
     budget=int(config.agent.num_timesteps),
     experiment=experiment_name(task),
     status=status(row) if row else "not measured",

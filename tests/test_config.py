@@ -68,6 +68,13 @@ def test_env_and_agent_alone_pick_the_tuned_set():
   assert compose(["env=CartpoleSwingup", "tuned=null"]).agent.discounting == 0.99
 
 
+@pytest.mark.parametrize("chosen", ["env=HumanoidWalk", "experiment=humanoid_run"])
+def test_a_task_chooses_the_agent_that_learns_it_best(chosen: str):
+  own, ppo = compose([chosen]), compose([chosen, "agent=ppo"])
+  assert (own.agent_name, own.choices["tuned"]) == ("reppo", None)
+  assert (ppo.agent_name, ppo.choices["tuned"]) == ("ppo", f"ppo/{ppo.choices['env']}")
+
+
 def test_a_task_without_a_tuned_set_has_the_agents_defaults(configs: Path):
   shutil.copy(configs / "env/CartpoleBalance.yaml", configs / "env/Untuned.yaml")
   run = compose(["env=Untuned"], configs)
@@ -107,7 +114,7 @@ def test_debug_fast_is_small_for_every_task(env: str):
   run = compose([*f"env={env}".split(), "debug=fast"])
   agent = run.agent
   assert run.env.episode_length == 20
-  assert agent.num_timesteps / (agent.batch_size * agent.num_minibatches * agent.unroll_length) == 4
+  assert agent.num_timesteps / agent.steps_per_update == 4
 
 
 @pytest.mark.parametrize("agent", config.options("agent"))

@@ -57,7 +57,7 @@ def _table(rows: Iterable[Section]) -> Table:
   table.add_column("task", style="cyan", no_wrap=True)
   for name in ("suite", "robot", "observation"):
     table.add_column(name, overflow="fold")
-  for name in ("action", "backend", "budget", "status", "return", "experiment"):
+  for name in ("action", "backend", "agent", "budget", "status", "return", "experiment"):
     table.add_column(name, overflow="fold", justify="right" if name in ("action", "budget", "return") else "left")
   for row in rows:
     score = row.get("reference_return")

@@ -36,8 +36,8 @@ def _stub(monkeypatch: pytest.MonkeyPatch, module: str, name: str, result: Any) 
 def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
   assert command("list") == 0
   lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-  assert lines[0] == "task suite robot observation action backend budget status return experiment"
-  start = "CartpoleBalance dm_control state 5 1 jax 60 M solved 999.3 cartpole_balance"
+  assert lines[0] == "task suite robot observation action backend agent budget status return experiment"
+  start = "CartpoleBalance dm_control state 5 1 jax ppo 60 M solved 999.3 cartpole_balance"
   assert start in lines and lines[-1].startswith(f"{len(lines) - 2} tasks.")
   assert command("list", "go1", "--suite", "locomotion", "--backend", "jax", "--json") == 0
   rows = json.loads(capsys.readouterr().out)
