@@ -1,11 +1,13 @@
 """Pages that `make docs` makes: the reference, from docstrings, settings classes and configs/, and the notebook's."""
 
 import dataclasses
+import functools
 import inspect
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import yaml
 from mkdocs.config.defaults import MkDocsConfig
@@ -13,13 +15,16 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from playground.catalog import entries
-from playground.config.comments import flow, keys_and_comments
+from playground.config.comments import flow, keys_and_comments, meaning
 from playground.config.definitions import RunSettings, defined, definition
-from playground.config.files import task_experiments
+from playground.config.files import lineage, task_experiments
 from playground.config.sweep_options import SweepConfig
-from playground.envs.options import TermsConfig
-from playground.mdp.terms import MODULES, registered
-from playground.settings import Setting, settings
+from playground.envs.options import RobotKeys, TaskKeys, TermsConfig
+from playground.limits import Limit
+from playground.mdp.options import is_model_field
+from playground.mdp.terms import MODULES, annotation, bind_one, find, registered
+from playground.settings import Setting, members, settings
+from playground.text import join
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = "results/reference"
@@ -48,18 +53,15 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
   """Puts the generated pages into the navigation."""
   assert config.nav is not None, "mkdocs.yml has one"
   api = [{title: _uri("api", title)} for title in API]
-  groups = [{"config.yaml" if title == "config" else title: _uri("configs", title)} for title in _groups()]
-  terms = {"Terms of a task": _uri("configs", "terms")}
-  config.nav.append({"Reference": [{"Python": api}, {"Configuration": [*groups, terms]}]})
+  terms = {"terms": [{kind: _uri("configs", f"terms {kind}")} for kind in MODULES]}
+  config.nav.append({"Reference": [{"Python": api}, {"Configuration": [*_navigation(), terms]}]})
   return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
   """Adds the generated pages."""
   pages = {_uri("api", title): _api_page(title, modules) for title, modules in API.items()}
-  pages |= {_uri("configs", title): _group_page(title, group, paths) for title, (group, paths) in _groups().items()}
-  pages[_uri("configs", "terms")] = _terms_page()
-  pages["first_policy.md"] = _notebook_page()
+  pages |= reference_pages() | {"first_policy.md": _notebook_page()}
   for uri, content in pages.items():
     files.append(File.generated(config, uri, content=content))
   for curve in sorted((ROOT / REFERENCE).glob("*.png")):
@@ -90,102 +92,181 @@ def _api_page(title: str, modules: list[str]) -> str:
   return f"# {title}\n\n" + "\n\n".join(f"::: {name}" for name in names) + "\n"
 
 
-def _groups() -> dict[str, tuple[str, list[Path]]]:
-  """The group and the files that each page shows, by title: config.yaml, then a page for each group and tuned set.
+def reference_pages() -> dict[str, str]:
+  """Returns the pages of the configuration, by where they lie."""
+  pages = {_uri("configs", title): _group_page(title, page) for title, page in _pages().items()}
+  return pages | {_uri("configs", f"terms {kind}"): _terms_page(kind) for kind in MODULES}
 
-  Tasks have a page for each suite, and the files that they build on another.
-  """
+
+def _navigation() -> list[dict[str, object]]:
+  """The pages of the groups; those of a group that has several are under its name."""
+  found: dict[str, list[dict[str, str]]] = {}
+  for title, page in _pages().items():
+    found.setdefault(page.group or "config.yaml", []).append({title: _uri("configs", title)})
+  return [{name: pages if len(pages) > 1 else next(iter(pages[0].values()))} for name, pages in found.items()]
+
+
+class _Page(NamedTuple):
+  """The settings classes, by heading, and the files of a group that one page shows."""
+
+  group: str
+  classes: dict[str, type]
+  files: list[Path]
+
+
+@functools.cache
+def _pages() -> dict[str, _Page]:
+  """Returns the pages by title: config.yaml, then each group, with a page for each part of a long one."""
   configs = ROOT / "configs"
   of_files = {path.parent.relative_to(configs).as_posix() for path in configs.glob("*/**/*.yaml")}
-  pages = {"config": ("", sorted(configs.glob("*.yaml")))}
+  pages = {"config": _Page("", {"A run": RunSettings, "A sweep": SweepConfig}, sorted(configs.glob("*.yaml")))}
+  classes = {"env": {"Tasks that are made of terms": TermsConfig, "Keys of some tasks": TaskKeys}}
+  classes |= {"robot": {"A robot": RobotKeys}}
   for group in sorted(of_files | set(defined())):
+    of_group = {} if group == "agent" else defined().get(group, {})
+    pages[group] = _Page(group, {**of_group, **classes.get(group, {})}, [])
+    if group == "agent":
+      pages |= {f"agent {name}": _Page(group, {name: cls}, []) for name, cls in defined()[group].items()}
     for path in sorted((configs / group).glob("*.yaml")):
-      known = entries().get(path.stem) if group == "env" else None
-      pages.setdefault(f"{group} {known.suite}" if known else group, (group, []))[1].append(path)
-    pages.setdefault(group, (group, []))
+      pages.setdefault(_title(group, path), _Page(group, {}, [])).files.append(path)
   return pages
 
 
-def _group_page(title: str, group: str, paths: list[Path]) -> str:
-  """Every option of a page, those of classes first: its keys, their values and their meaning."""
-  parts = [f"# {f'configs/{title}' if group else 'config.yaml'}\n"]
-  classes = (
-    (defined().get(group, {}) if title == group else {})
-    if group
-    else {"A run": RunSettings, "env of a task made of terms": TermsConfig, "A sweep": SweepConfig}
-  )
-  parts += [_class_section(name, cls) for name, cls in classes.items()]
-  parts += [_experiments()] if group == "experiment" else []
+def _title(group: str, path: Path) -> str:
+  """The page that shows a file: its group's, or that of its task family, robot or agent where the group's is long."""
+  suite = entries()[path.stem].suite if path.stem in entries() else ""
+  if group == "env":
+    families = [base for base in lineage(group, path.stem, [ROOT / "configs"]) if not base[0].isupper()]
+    if suite == "dm_control" or path.stem in ("_cartpole", "_finger"):
+      return f"env dm_control {'A to F' if path.stem.lstrip('_').upper() < 'G' else 'H to Z'}"
+    return f"env {families[-1].lstrip('_') if families else suite}" + (" tasks" if suite == "locomotion" else "")
+  if group == "tuned/ppo":
+    return f"{group} {suite or ('shared' if path.stem[0] == '_' else 'options')}"
+  return f"agent {_agent(group, path)}" if group == "agent" else f"robot {path.stem}" if group == "robot" else group
+
+
+def _group_page(title: str, page: _Page) -> str:
+  """Every key of a page, those of classes first: value or default, what is allowed, meaning."""
+  parts = [f"# {f'configs/{title}' if page.group else 'config.yaml'}\n"]
+  parts += [_class_section(name, cls) for name, cls in page.classes.items()]
+  parts += [_experiments()] if page.group == "experiment" else []
   shared_first = lambda path: (path.stem[0].isupper(), path.stem)
-  for path in sorted(paths, key=shared_first):
-    text = path.read_text(encoding="utf-8")
-    head = list(itertools.takewhile(lambda line: line.startswith("#"), text.splitlines()))
-    said = " ".join(line[1:].strip() for line in head if not line.startswith("# @package"))
-    package = next((line.split()[-1] for line in head if line.startswith("# @package")), group)
-    parts.append(f"## {path.stem}\n\n{_text(said)}\n")
-    keys = list(keys_and_comments(text))
-    bases = [base for key, value, _ in keys if key == "defaults" for base in yaml.safe_load(value) if base != "_self_"]
-    if bases:
-      parts.append("On top of " + ", ".join(_code(flow(base)) for base in bases) + ".\n")
-    prefix, names = "" if package == "_global_" else f"{package}.", {"agent": _agent(group, path)}
-    rows = [
-      f"| {_code(term)} | {_code(entry)} | {_text(said or _help(prefix + term, entry, names))} |"
-      for key, value, said in keys
-      if key != "defaults"
-      for term, entry in _terms(prefix, key, value)
-    ]
-    if rows:
-      parts.append("\n".join(["| key | value | meaning |", "|---|---|---|", *rows]) + "\n")
+  parts += [_file_section(page.group, path) for path in sorted(page.files, key=shared_first)]
+  others = [name for name, other in _pages().items() if other.group == page.group and name != title]
+  if others and title == page.group:
+    parts.append("".join(f"- [{name}]({_uri('', name).rpartition('/')[2]})\n" for name in others))
   return "\n".join(parts)
+
+
+def _file_section(group: str, path: Path) -> str:
+  """The keys that a file sets."""
+  text = path.read_text(encoding="utf-8")
+  head = list(itertools.takewhile(lambda line: line.startswith("#"), text.splitlines()))
+  about = " ".join(line[1:].strip() for line in head if not line.startswith("# @package"))
+  package = next((line.split()[-1] for line in head if line.startswith("# @package")), group)
+  parts = [f"## {path.stem}\n\n{_text(about)}\n"]
+  content = _content(path)
+  bases = [base for base in content.get("defaults", []) if base != "_self_"]
+  if bases:
+    parts.append("On top of " + ", ".join(_code(flow(base)) for base in bases) + ".\n")
+  comments = {key: comment for key, _, comment in keys_and_comments(text)}
+  file = _File(group, path, "" if package == "_global_" else f"{package}.", comments)
+  rows = [
+    f"| {_code(key)} | {_code(value)} | {allowed} | {_text(said)} |"
+    for key, value, allowed, said in file.rows({key: value for key, value in content.items() if key != "defaults"})
+  ]
+  if rows:
+    parts.append("\n".join(["| key | value | allowed | meaning |", "|---|---|---|---|", *rows]) + "\n")
+  return "\n".join(parts)
+
+
+@functools.cache
+def _content(path: Path) -> dict[str, Any]:
+  return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+
+
+class _File(NamedTuple):
+  """A file of configs/; `prefix` is where its keys are in a configuration, `comments` are by its own keys."""
+
+  group: str
+  path: Path
+  prefix: str
+  comments: Mapping[str, str]
+
+  def rows(self, value: object, key: str = "") -> Iterator[tuple[str, str, str, str]]:
+    """Yields key, value, allowed values and meaning of each term and of each other key."""
+    comment = self.comments.get(key, "")
+    kind, *inside = (self.prefix + key).removeprefix("env.").split(".")
+    if key and kind in MODULES and len(inside) == (2 if kind == "observations" else 1):
+      yield key, flow(value), "", self._meaning_of_term(kind, key, value)
+    elif isinstance(value, dict) and value:
+      if comment:
+        yield key, "", "", comment
+      for name, inner in value.items():
+        yield from self.rows(inner, join(key, str(name)))
+    elif kind in MODULES and value is None:
+      yield key, "null", "", "removes the group"
+    elif key:
+      setting = definition(self.prefix + key, {"agent": _agent(self.group, self.path)})
+      yield key, flow(value), _allowed(setting) if setting else "", meaning(setting, comment)
+
+  def _meaning_of_term(self, kind: str, key: str, entry: object) -> str:
+    name = key.rpartition(".")[2]
+    if entry is None:
+      return "removes the term"
+    if kind == "observations" and name == "state":
+      return "all terms of the group state"
+    comment = " ".join(text for at, text in self.comments.items() if at == key or at.startswith(f"{key}."))
+    entry = {"func": self._func(key) or name, **(entry if isinstance(entry, dict) else {})}
+    if is_model_field(name, entry):
+      field = bind_one(kind, key, name, entry)().describe()
+      said = f"{field['operation']} {field['field']} of {field['target']}: {field['draw']}"
+    else:
+      said = _summary(find(kind, entry["func"], key))
+    return " ".join(filter(None, [said, comment and f"({comment})"]))
+
+  def _func(self, key: str) -> str | None:
+    """The function that the file, or the nearest one that it is built on, gives a term."""
+    for base in lineage(self.group, self.path.stem, [ROOT / "configs"]):
+      node: object = _content(self.path.with_stem(base))
+      for part in key.split("."):
+        node = node.get(part) if isinstance(node, dict) else None
+      if isinstance(node, dict) and "func" in node:
+        return node["func"]
+    return None
 
 
 def _agent(group: str, path: Path) -> str:
-  """The agent whose keys a file of `agent` or `tuned/<agent>` sets; PPO, whose keys experiments set, for others."""
-  name = path.stem if group == "agent" else group.removeprefix("tuned/")
+  """The agent whose keys a file sets: PPO, unless the file or its group is named after another."""
+  name = group.removeprefix("tuned/") if group.startswith("tuned/") else path.stem.lstrip("_")
   return next((agent for agent in defined()["agent"] if name.startswith(agent)), "ppo")
 
 
-def _terms(prefix: str, key: str, value: str) -> Iterator[tuple[str, str]]:
-  """Yields each term of a section that a file writes on one line, other keys as they are."""
-  entry = yaml.safe_load(value) if value else None
-  kind, *inside = (prefix + key).removeprefix("env.").split(".")
-  if isinstance(entry, dict) and kind in MODULES and len(inside) < (2 if kind == "observations" else 1):
-    for name, term in entry.items():
-      yield from _terms(prefix, f"{key}.{name}", flow(term))
-  else:
-    yield key, value
+def _summary(function: Callable[..., object]) -> str:
+  """The first line of a docstring."""
+  return (inspect.getdoc(function) or "").partition("\n")[0]
 
 
-def _help(key: str, value: str, names: Mapping[str, object]) -> str:
-  """The help of a setting, or the first line of the docstring of the function that a term names; else empty."""
-  kind, *inside = key.removeprefix("env.").split(".")
-  if kind in MODULES and len(inside) == (2 if kind == "observations" else 1):
-    entry = yaml.safe_load(value) if value else None
-    name = entry.get("func", inside[-1]) if isinstance(entry, dict) else inside[-1]
-    return "removes the term" if value == "null" else _summary(registered(kind).get(name))
-  setting = definition(key, names)
-  return setting.help if setting else ""
+def _terms_page(kind: str) -> str:
+  """The registered functions of a kind, with their parameters."""
+  rows = []
+  for name, func in sorted(registered(kind).items()):
+    first = 3 if kind == "events" and not inspect.isclass(func) else 0 if inspect.isclass(func) else 1
+    params = [
+      _code(str(param.replace(annotation=param.empty))) + _limit(annotation(func, param))
+      for param in list(inspect.signature(func).parameters.values())[first:]
+      if not param.name.startswith("_")
+    ]
+    rows.append(f"| {_code(name)} | {', '.join(params)} | {_text(_summary(func))} |")
+  head = "The registered functions. [Add a reward](../../add-a-reward.md) shows how to use them.\n"
+  return "\n".join([f"# {kind}\n", head, "| function | parameters | meaning |", "|---|---|---|", *rows, ""])
 
 
-def _summary(function: Callable[..., object] | None) -> str:
-  """The first line of a docstring; empty for a function of another package."""
-  return (inspect.getdoc(function) or "").partition("\n")[0] if function else ""
-
-
-def _terms_page() -> str:
-  """The registered functions of each kind, with their parameters."""
-  parts = [
-    "# Terms of a task\n",
-    "The registered functions. [Add a reward](../../add-a-reward.md) shows how to use them.\n",
-  ]
-  for kind in MODULES:
-    rows = []
-    for name, func in sorted(registered(kind).items()):
-      first = 3 if kind == "events" and not inspect.isclass(func) else 0 if inspect.isclass(func) else 1
-      params = ", ".join(list(inspect.signature(func).parameters)[first:])
-      rows.append(f"| {_code(name)} | {_code(params)} | {_text(_summary(func))} |")
-    parts.append("\n".join([f"## {kind}\n", "| function | parameters | meaning |", "|---|---|---|", *rows, ""]))
-  return "\n".join(parts)
+def _limit(hint: object) -> str:
+  """What an annotation allows, to follow the name of a parameter."""
+  metadata = itertools.chain(*(getattr(kind, "__metadata__", ()) for kind in members(hint)))
+  limit = next((entry for entry in metadata if isinstance(entry, Limit)), None)
+  return f" ({limit})" if limit else ""
 
 
 def _experiments() -> str:
@@ -198,17 +279,27 @@ def _experiments() -> str:
 
 def _class_section(name: str, cls: type) -> str:
   """The settings that a class defines."""
-  head = [f"## {name}\n", f"{_text(inspect.getdoc(cls) or '')}\n"]
-  rows = [_setting_row(setting) for setting in settings(cls).values() if setting.default is not dataclasses.MISSING]
-  return "\n".join([*head, "| key | default | allowed | meaning |", "|---|---|---|---|", *filter(None, rows), ""])
+  parts = [f"## {name}\n\n{_text(inspect.getdoc(cls) or '')}\n"]
+  rows = [_setting_row(setting) for setting in settings(cls).values() if _has_row(setting)]
+  if rows:
+    parts.append("\n".join(["| key | default | allowed | meaning |", "|---|---|---|---|", *rows]) + "\n")
+  return "\n".join(parts)
+
+
+def _has_row(setting: Setting) -> bool:
+  """Whether a setting is one to set: the fields of a nested class and the keys of a mapping have rows of their own."""
+  is_section = isinstance(setting.default, dict) and bool(setting.default)
+  return bool(setting.help) and not is_section and not setting.name.endswith(".*")
 
 
 def _setting_row(setting: Setting) -> str:
-  if isinstance(setting.default, dict) and setting.default:  # a nested class: its fields have rows of their own
-    return ""
+  default = "" if setting.default is dataclasses.MISSING else flow(setting.default)
+  return f"| {_code(setting.name)} | {_code(default)} | {_allowed(setting)} | {_text(setting.help)} |"
+
+
+def _allowed(setting: Setting) -> str:
   allowed = ", ".join(map(_code, setting.choices)) if setting.choices else str(setting.limit or "")
-  allowed += " or null" if setting.nullable and allowed else ""
-  return f"| {_code(setting.name)} | {_code(flow(setting.default))} | {allowed} | {_text(setting.help)} |"
+  return allowed + (" or null" if setting.nullable and allowed else "")
 
 
 def _code(text: str) -> str:

@@ -16,7 +16,7 @@ import functools
 import math
 import types
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from playground.errors import UnknownNameError, nearest
 from playground.limits import Limit
@@ -32,7 +32,7 @@ class Setting:
   """One field of a settings class.
 
   Attributes:
-    name: the field, dotted for a field of a nested class.
+    name: the field, dotted for a field of a nested class; `*` stands for any key of a mapping.
     default: as YAML has it; `dataclasses.MISSING` if the field has none.
     limit: of the numbers, None if there is none.
     choices: the allowed texts, None if any is allowed.
@@ -162,28 +162,40 @@ def is_text(value: object, depth: int) -> bool:
 
 
 def _settings(cls: type, prefix: str = "") -> Iterator[Setting]:
+  """Yields the fields of a dataclass or a TypedDict, those of nested classes and values of mappings (`*`) included."""
+  if not dataclasses.is_dataclass(cls):
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+      yield from _setting(f"{prefix}{name}", hint, dataclasses.MISSING)
+    return
   hints = _hints(cls)
   for field in dataclasses.fields(cls):
-    hint, name = hints[field.name], f"{prefix}{field.name}"
-    metadata = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-    kind = get_args(hint)[0] if metadata else hint
-    options = members(kind)
-    depths = [_text_depth(option) for option in options]
-    yield Setting(
-      name=name,
-      default=_default(field, hint),
-      limit=next((entry for entry in metadata if isinstance(entry, Limit)), None),
-      choices=next((get_args(option) for option in options if get_origin(option) is Literal), None),
-      text_depth=next((depth for depth in depths if depth is not None), None),
-      nullable=type(None) in options,
-      help=next((entry for entry in metadata if isinstance(entry, str)), ""),
-    )
-    inner = nested(hint)
-    if inner is not None:
-      yield from _settings(inner, f"{name}.")
-    for option in options:
-      if get_origin(option) is Mapping and (depth := _text_depth(get_args(option)[1])) is not None:
-        yield Setting(f"{name}.*", dataclasses.MISSING, None, None, depth, False, "")
+    yield from _setting(f"{prefix}{field.name}", hints[field.name], _default(field, hints[field.name]))
+
+
+def _setting(name: str, hint: Any, default: object) -> Iterator[Setting]:
+  metadata = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+  options = members(get_args(hint)[0] if metadata else hint)
+  depths = [_text_depth(option) for option in options]
+  mappings = [option for option in options if get_origin(option) is Mapping]
+  limit = next((entry for entry in metadata if isinstance(entry, Limit)), None)
+  said = next((entry for entry in metadata if isinstance(entry, str)), "")
+  yield Setting(
+    name=name,
+    default=default,
+    limit=None if mappings else limit,
+    choices=next((get_args(option) for option in options if get_origin(option) is Literal), None),
+    text_depth=next((depth for depth in depths if depth is not None), None),
+    nullable=type(None) in options,
+    help=said,
+  )
+  for option in options:
+    if dataclasses.is_dataclass(option) and isinstance(option, type):
+      yield from _settings(option, f"{name}.")
+  for _, value in map(get_args, mappings):
+    if is_typeddict(value):
+      yield from _settings(value, f"{name}.*.")
+    else:
+      yield Setting(f"{name}.*", dataclasses.MISSING, limit, None, _text_depth(value), False, said)
 
 
 def _default(field: "dataclasses.Field[object]", hint: object) -> object:

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import importlib.util
 import inspect
 import itertools
 import json
@@ -290,6 +291,20 @@ def test_the_notebook_runs(tmp_path: Path):
   assert shown if find_gl() else "No video" in said
 
 
+def test_every_key_of_the_reference_has_a_meaning_on_a_short_page():
+  """A page of 120 rows has about 5,000 pixels."""
+  spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
+  assert spec is not None and spec.loader is not None
+  hooks = importlib.util.module_from_spec(spec)
+  spec.loader.exec_module(hooks)
+  pages = {
+    uri: [line for line in text.splitlines() if line.startswith("| ")] for uri, text in hooks.reference_pages().items()
+  }
+  assert len(pages) > 40 and sum(map(len, pages.values())) > 1500
+  assert [row for rows in pages.values() for row in rows if row.endswith("|  |")] == []
+  assert {uri: len(rows) for uri, rows in pages.items() if len(rows) > 120} == {}
+
+
 @pytest.mark.slow
 def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(tmp_path / "site")]
@@ -300,10 +315,10 @@ def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   assert (
     'src="../../iframe-worker.js"' in page and "unpkg" not in page and (tmp_path / "site/iframe-worker.js").is_file()
   )
-  page = (tmp_path / "site/reference/configs/env-locomotion.html").read_text(encoding="utf-8")
+  page = (tmp_path / "site/reference/configs/env-joystick.html").read_text(encoding="utf-8")
   assert "Warp: constraint rows of one environment" in page  # beside a field of EnvConfig
-  page = (tmp_path / "site/reference/configs/terms.html").read_text(encoding="utf-8")
-  assert all(f'id="{kind}"' in page for kind in terms.MODULES) and "feet_air_time" in page
+  pages = {kind: tmp_path / f"site/reference/configs/terms-{kind}.html" for kind in terms.MODULES}
+  assert "feet_air_time" in pages["rewards"].read_text(encoding="utf-8") and all(map(Path.is_file, pages.values()))
   page = (tmp_path / "site/reference/api/parts-of-tasks.html").read_text(encoding="utf-8")
   assert 'id="playground.mdp.tolerance.tolerance"' in page
 

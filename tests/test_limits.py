@@ -11,7 +11,6 @@ import yaml
 
 from playground.config import compose, compose_settings, config_roots, override_section
 from playground.config.definitions import RunSettings, defined, definition
-from playground.config.limits import limit_of
 from playground.config.schema import is_of_terms
 from playground.config.sweep_options import SweepConfig
 from playground.envs.options import VisionConfig
@@ -45,8 +44,8 @@ def test_every_number_of_a_file_has_limits() -> None:
   for path, section in ((path, section) for folder, section in SECTIONS.items() for path in (root / folder).glob("*")):
     for key, value in leaves(yaml.safe_load(path.read_text()) or {}, section) if path.suffix == ".yaml" else ():
       setting = definition(key, {})
-      text = setting is not None and setting.text_depth is not None
-      if takes_a_number(value) and not is_of_terms(key) and not text and not limit_of(key, {}):
+      known = setting is not None and (setting.limit or setting.text_depth is not None)
+      if takes_a_number(value) and not is_of_terms(key) and not known:
         missing.append(f"{path.name}: {key}={value}")
   assert not missing, "give these a limit in playground/envs/options.py, or say text there"
 

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from playground.config import RunConfig, compose, compose_settings, config_roots, format_value, is_of_sweep
-from playground.config.comments import keys_and_comments
+from playground.config.comments import keys_and_comments, meaning
 from playground.config.definitions import chosen_names, definition
 from playground.config.files import find_file, groups, lineage, listed_options
 from playground.config.schema import check_key
@@ -72,7 +72,7 @@ def _rows(prefix: str, node: Plain, config: RunConfig, names: Section) -> Iterat
 
   def walk(key: str, value: Plain) -> Iterator[tuple[str, str, str, str]]:
     setting = definition(key, names)
-    said = (setting and setting.help) or comments.get(key, "")
+    said = meaning(setting, comments.get(key, ""))
     if _is_term(key, value):
       what, said = _term(key, value)
       yield key, what, "", said

@@ -1,9 +1,11 @@
-"""Comments of YAML files: the help of keys that no settings class defines."""
+"""Comments of YAML files: what they add to the help of keys, which settings classes define."""
 
 import itertools
 from collections.abc import Iterator
 
 import yaml
+
+from playground.settings import Setting
 
 
 def keys_and_comments(text: str) -> Iterator[tuple[str, str, str]]:
@@ -14,6 +16,14 @@ def keys_and_comments(text: str) -> Iterator[tuple[str, str, str]]:
   lines = text.splitlines()
   head = len(list(itertools.takewhile(lambda line: line.startswith("#"), lines)))
   return _keys(yaml.compose(text), [""] * head + lines[head:])
+
+
+def meaning(setting: Setting | None, comment: str) -> str:
+  """Returns the help of a key and what the comment of a file adds to it."""
+  said = setting.help if setting else ""
+  if said in comment or comment in said:
+    return max(said, comment, key=len)
+  return f"{said} ({comment})"
 
 
 def flow(value: object) -> str:

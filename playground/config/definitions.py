@@ -5,6 +5,7 @@ and the other options below are registered with Hydra, and files hold what diffe
 """
 
 import dataclasses
+import fnmatch
 import functools
 import warnings
 from collections.abc import Callable, Iterable, Mapping
@@ -129,4 +130,6 @@ def chosen_names(resolved: Section) -> dict[str, Plain]:
 
 def _look_up(cls: type, name: str) -> Setting | None:
   found = settings(cls)
-  return found.get(name) or found.get(f"{name.rpartition('.')[0]}.*")
+  if name in found:
+    return found[name]
+  return next((found[key] for key in found if "*" in key and fnmatch.fnmatchcase(name, key)), None)

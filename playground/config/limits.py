@@ -1,13 +1,12 @@
 """Checks values against their definitions (choices, texts, limits), and values that must go together."""
 
-import fnmatch
 import operator
 import re
 from collections.abc import Iterable, Iterator, Mapping
 
 from playground.config.definitions import chosen_names, definition
 from playground.config.schema import is_of_terms, wrong_type
-from playground.envs.options import NUMBERS, sees
+from playground.envs.options import sees
 from playground.errors import ConfigError, nearest
 from playground.limits import Limit
 from playground.settings import TEXTS, Plain, Section, is_text
@@ -35,15 +34,6 @@ def check_limits(resolved: Section) -> None:
     raise ConfigError(f"env.naccdmax_per_env={convex} must not be above env.naconmax_per_env={contacts}.")
 
 
-def limit_of(key: str, names: Mapping[str, object]) -> Limit | None:
-  """Returns the limit of a dotted key's numbers, None if there is none; `names` as `definition` takes them."""
-  if (setting := definition(key, names)) and setting.limit:
-    return setting.limit
-  name = key.removeprefix("env.")
-  found = (limit for patterns, limit in NUMBERS.items() if any(fnmatch.fnmatchcase(name, p) for p in patterns.split()))
-  return next(found, None) if key.startswith("env.") else None
-
-
 def _check(key: str, value: object, names: Mapping[str, object]) -> None:
   shown, setting = f"{key}={format_value(value)}", definition(key, names)
   if setting and setting.choices and value not in setting.choices:
@@ -51,7 +41,7 @@ def _check(key: str, value: object, names: Mapping[str, object]) -> None:
     raise ConfigError(f"{shown} is unknown: choose from {', '.join(setting.choices)}.{near}")
   if setting and (depth := setting.text_depth) is not None and not is_text(value, depth):
     raise wrong_type(key, value, TEXTS[depth] + " (put quotes around a number)" * (depth == 0))
-  limit = limit_of(key, names) or (Limit().each if _numbers(value) else None)
+  limit = (setting and setting.limit) or (Limit().each if _numbers(value) else None)
   if limit is not None and not limit.allows(value):
     raise ConfigError(f"{shown} must be {limit}.")
 

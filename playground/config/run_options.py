@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Annotated, TypedDict
+from typing import Annotated, Any, TypedDict
 
 from playground.limits import SHARE, at_least_0, count
 
@@ -71,10 +71,10 @@ class ProfileConfig:
 
 
 class StageConfig(TypedDict):
-  """A stage of a chain: its own budget, null for the task's, and what it changes, as on the command line."""
+  """A stage of a chain."""
 
-  num_timesteps: int | None
-  overrides: Sequence[str]
+  num_timesteps: Annotated[int | None, "environment steps of the stage; null: the task's own budget"]
+  overrides: Annotated[Sequence[Any], "what this stage and the later ones change, as on the command line"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -132,7 +132,10 @@ def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   [
     (["agent", "agent=sac"], ["one of fast_sac, fast_td3, ppo,", "agent.num_envs 128 a whole number from 1"]),
     (["robot", "env=Go1Getup"], ["env.robot.root trunk body that is pushed", "env.robot.mjcf"]),
-    (["env.action_scale", "env=Go1Getup"], ["env.action_scale 0.5 rad", "Values are those of Go1Getup"]),
+    (
+      ["env.action_scale", "env=Go1Getup"],
+      ["env.action_scale 0.5 a number or a list of numbers above 0", "Values are those of Go1Getup"],
+    ),
     (["env.rewards", "env=Go1Getup"], ["factor on the function's value", "env.rewards.upright_exp"]),
     (["env.observations.privileged_state", "env=Go1JoystickFlatTerrain"], ["privileged_state.gyro"]),
     (["launcher", "launcher=slurm"], ["one of local, ray, slurm", "launcher.partition"]),
