@@ -99,12 +99,13 @@ def test_a_run_starts_from_one() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", list(cards()))
+@pytest.mark.parametrize("task", [task for task, card in cards().items() if card["status"] == "solved"])
 def test_what_the_card_says_is_met(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.chdir(tmp_path)
   card = cards()[task]["c_mujoco"]
   path = working_copy(task, [task])
   assert play(path, episodes=card["episodes"], seed=1) == 0
   scores = json.loads(next(Path(path).glob("export/play_step_*_seed_1.json")).read_text())["scores"]
-  standard_error = card["return_std"] / card["episodes"] ** 0.5
+  # A task that begins alike every time has hardly a deviation: another machine may differ by a thousandth.
+  standard_error = max(card["return_std"] / card["episodes"] ** 0.5, 1e-3 * abs(card["return"]))
   assert scores["episode_reward"] >= card["return"] - 4 * standard_error

@@ -146,6 +146,9 @@ def _parser() -> argparse.ArgumentParser:
   view.add_argument("--port", type=int, default=8080, help="port of the page (default: %(default)s)")
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
   pretrained.add_argument("--add", metavar="RUN", help="measure a run's policy in C MuJoCo and put it into the package")
+  pretrained.add_argument(
+    "--note", default="", metavar="TEXT", help="with --add: what else its card says of the training"
+  )
   sweep = add("sweep", _sweep, "Show a sweep, collect its results, or run its missing jobs.")
   sweep.add_argument(
     "action",
@@ -252,7 +255,7 @@ def _view(args: argparse.Namespace) -> int:
 def _pretrained(args: argparse.Namespace) -> int:
   from playground.cli import pretrained
 
-  return pretrained.add_policy(args.add) if args.add else pretrained.show_policies()
+  return pretrained.add_policy(args.add, args.note) if args.add else pretrained.show_policies()
 
 
 def _sweep(args: argparse.Namespace) -> int:

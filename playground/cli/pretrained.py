@@ -1,40 +1,47 @@
 """`playground pretrained`: the policies that come with the package, and how one is added."""
 
+import math
+
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from playground import catalog
 from playground.cli.play import play
 from playground.deploy.export import export_run
 from playground.errors import ConfigError
 from playground.files import read_json
 from playground.learning.checkpoints import find_checkpoints
 from playground.pretrained import add, cards
-from playground.runs.csv_tracker import read_metrics
+from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_metrics
 from playground.runs.run_dir import RunDirectory
 from playground.settings import Plain
 
 _EPISODES = 20  # in C MuJoCo
+_COLUMNS = ("task", "agent", "status", "M steps", "return", "in C MuJoCo", "falls")
 
 
 def show_policies(console: Console | None = None) -> int:
   """Prints a table of the cards; returns the exit code, 0."""
-  table = Table("task", "agent", "steps", "return", "in C MuJoCo", "falls", title="Pretrained policies")
-  table.columns[0].no_wrap = True
+  table = Table(*_COLUMNS, box=SIMPLE, padding=(0, 1, 0, 0), title="Pretrained policies")
+  for column in table.columns:
+    column.no_wrap = True
   for task, card in cards().items():
     trained, plain = card["training"], card["c_mujoco"]
-    said = f"{trained['return']:.1f} ({trained['action']})"
-    table.add_row(
-      task, card["agent"], f"{card['steps']:,}", said, _interval(plain), f"{plain['falls']} of {plain['episodes']}"
-    )
+    score = trained["sampled"] if trained["mode"] is None else trained["mode"]
+    falls = f"{plain['falls']}/{plain['episodes']}"
+    steps = f"{card['steps'] / 1e6:.3g}"
+    table.add_row(task, card["agent"], card["status"], steps, f"{score:.1f}", _interval(plain), falls)
   (console or Console()).print(table)
   return 0
 
 
-def add_policy(path: str) -> int:
+def add_policy(path: str, note: str = "") -> int:
   """Exports a run's newest policy, measures it in C MuJoCo and copies it, with its card, into the package.
 
   Args:
     path: a run directory.
+    note: what else the card should say of the training, such as that the run was cut short.
 
   Returns:
     The exit code, 0.
@@ -51,14 +58,17 @@ def add_policy(path: str) -> int:
     play(path, episodes=_EPISODES)
   scores = read_json(result)["scores"]
   rows = read_metrics(run.metrics_csv)
-  evaluated = rows[(rows["step"] == steps) & rows["eval/episode_reward"].notna()]
+  evaluated = rows[(rows["step"] == steps) & rows[RETURN].notna()]
   if evaluated.empty:
     raise ConfigError(f"{path} was not evaluated at its newest checkpoint, step {steps}.")
   config, manifest, row = run.config, run.manifest, evaluated.iloc[-1]
   git: dict[str, Plain] = manifest.get("git") or {}
+  as_set, other = ("mode", "sampled") if config["agent"]["deterministic_eval"] else ("sampled", "mode")
+  returns = {as_set: row[RETURN], other: row.get(OTHER_RETURNS[other], math.nan)}
   facts = {
     "task": config["choices"]["env"],
     "agent": config["choices"]["agent"],
+    "status": _status(scores),
     "steps": steps,
     "seed": config["seed"],
     "command": " ".join(["playground-run", *(o for o in run.overrides if not o.startswith("run_dir="))]),
@@ -67,9 +77,9 @@ def add_policy(path: str) -> int:
     "device": manifest["device"],
     "date": manifest["created"][:10],
     "wall_clock_s": round(float(row["time/wall_clock_s"]), 1),
+    "note": note,
     "training": {
-      "action": "mode" if config["agent"]["deterministic_eval"] else "sampled",
-      "return": round(float(row["eval/episode_reward"]), 2),
+      **{kind: None if math.isnan(returns[kind]) else round(float(returns[kind]), 2) for kind in ("sampled", "mode")},
       "episodes": config["agent"]["num_eval_envs"],
     },
     "c_mujoco": {
@@ -84,6 +94,13 @@ def add_policy(path: str) -> int:
   size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
   print(f"{folder}: {size / 1e6:.1f} MB")
   return 0
+
+
+def _status(scores: dict[str, float]) -> catalog.Status:
+  """How far the policy gets in C MuJoCo, by the measures of the catalogue."""
+  measured = {"falls_per_episode": "episode_fall", "success": "episode_success"}
+  row = {column: str(scores[name]) for column, name in measured.items() if name in scores}
+  return catalog.status({"note": "", "final_return": str(scores["episode_reward"]), **row})
 
 
 def _interval(measured: dict[str, Plain]) -> str:

@@ -27,6 +27,11 @@ def test_the_committed_curves() -> None:
   assert "PandaPickCube" not in curves, "episodes of another length"
 
 
+def test_reppo_is_not_ppo() -> None:
+  labels = [curve.label for curve in public_curves()["HumanoidWalk"] if public.is_ppo(curve)]
+  assert any("brax" in label for label in labels) and not any(label.startswith("REPPO") for label in labels)
+
+
 def runs(folder: Path) -> Evidence:
   rows = ["CheetahRun_ppo_s1,0,1,", "CheetahRun_ppo_s1,100,50,70", "CheetahRun_ppo_s2,100,40,90"]
   rows += ["CheetahRun_sac_s1,100,900,", "WalkerRun_ppo_s1,100,96,", "HopperHop_ppo_s1,100,-1,"]

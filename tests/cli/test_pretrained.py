@@ -21,11 +21,13 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
   monkeypatch.chdir(tmp_path)
   run = tmp_path / "run"
   assert train(compose([*TASK, "agent.num_timesteps=320", "agent.num_evals=2", f"run_dir={run}"])) == 0
-  assert add_policy(str(run)) == 0
+  assert add_policy(str(run), "cut short") == 0
   (folder,) = (tmp_path / "policies").iterdir()
   card = yaml.safe_load((folder / "card.yaml").read_text())
   checkpoint = weights_of(f"pretrained:{folder.name}")
   assert (card["task"], card["steps"], card["c_mujoco"]["episodes"]) == (folder.name, checkpoint.step, 20)
+  assert (card["status"], card["note"]) == ("open", "cut short")
+  assert card["training"]["sampled"] > 0 and card["training"]["mode"] > 0
   assert not checkpoint.has("state")
   console = Console(record=True, width=120)
   assert show_policies(console) == 0

@@ -96,9 +96,14 @@ class _Comparison:
 
 def _compared(task: str, curve: Curve, theirs: Sequence[Curve]) -> _Comparison:
   steps = curve.points[-1][0]
-  ppo = [(value, c.label) for c in theirs if "PPO" in c.label and (value := at(c.points, steps)) is not None]
+  ppo = [(value, c.label) for c in theirs if is_ppo(c) and (value := at(c.points, steps)) is not None]
   ends = [(c.points[-1][1], c.label) for c in theirs]
   return _Comparison(task, curve, max(ppo, default=None), max(ends))
+
+
+def is_ppo(public: Curve) -> bool:
+  """Whether a public curve is one of PPO; REPPO is another algorithm."""
+  return public.label.startswith("PPO")
 
 
 def at(points: Points, steps: float) -> float | None:

@@ -16,7 +16,9 @@ PARTS = ("physics", "task", "episodes", "pixels", "inference", "storing", "updat
 _BUDGET = re.compile(r" ?agent\.num_timesteps=\S+")  # in the setting of a whole run on a topology
 _TOPOLOGY = ("hardware.devices=", "hardware.scale_envs=")  # what a topology's setting varies
 _KEY = re.compile(r"^[\w.]+\.(?=\w+=)")  # what an override's key has before its last word
-_CURVE = re.compile(r"(.+?)_((?:ours|peer|ppo|sac|seed)(?:_.*)?)")  # a curve's name: task and run
+_CURVE = re.compile(
+  r"(.+?)_((?:ours|peer|ppo|reppo|sac|fast_td3|fast_sac|seed)(?:_.*)?)"
+)  # a curve's name: task and run
 
 
 class Notes:

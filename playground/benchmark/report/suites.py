@@ -1,26 +1,29 @@
 """The tables of the result pages and the grids of the gallery, from results/reference/ and the catalogue.
 
 A page is written by hand but for what stands between two comments, which `playground-bench report pages=docs` replaces.
-In a table of runs, tasks that are not learnt come first.
+Each suite has a page with a row for each task and one with every run, where tasks that are not learnt come first.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from playground.catalog import entries
+from playground.benchmark.report import tasks
+from playground.catalog import Entry, entries
 from playground.errors import ConfigError
 from playground.files import read_csv, write_text
 from playground.reporting.page import Block, Heading, Table, to_markdown
 
-PAGES = {  # page -> the tables that it shows
-  "results-dm-control.md": ("dm_control",),
-  "results-locomotion.md": ("locomotion",),
-  "results-manipulation.md": ("manipulation", "vision"),
+TABLES = {  # the pages results-<name>.md and runs-<name>.md -> the tables that they show
+  "dm-control": ("dm_control",),
+  "locomotion": ("locomotion",),
+  "manipulation": ("manipulation", "vision"),
 }
-BEGIN, END = "<!-- runs: written by `playground-bench report pages=docs` -->", "<!-- end of runs -->"
+GENERATED = "<!-- {}: written by `playground-bench report pages=docs` -->"
+TASKS_BEGIN, TASKS_END = GENERATED.format("tasks"), "<!-- end of tasks -->"
+RUNS_BEGIN, RUNS_END = GENERATED.format("runs"), "<!-- end of runs -->"
 GALLERY = "gallery.md"
-GRID_BEGIN, GRID_END = "<!-- grid {}: written by `playground-bench report pages=docs` -->", "<!-- end of grid -->"
+GRID_BEGIN, GRID_END = GENERATED.format("grid {}"), "<!-- end of grid -->"
 _GRID_WIDTH = 4  # loops in a row
 _TITLES = {"open": "Not learnt yet", "learning": "Learning", "solved": "Solved"}
 # What a row says in columns of its own.
@@ -44,21 +47,33 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
   Raises:
     ConfigError: a page or a table is missing, or a page has no place for its table.
   """
-  written = []
-  for name, tables in PAGES.items():
-    path = pages / name
-    try:
-      text = path.read_text(encoding="utf-8")
-      rows = [row for table in tables for row in read_csv(reference / f"{table}.csv")]
-    except FileNotFoundError as error:
-      raise ConfigError(f"pages={pages}: {error.filename} does not exist.") from None
-    write_text(path, _replaced(path, text, BEGIN, END, to_markdown(list(_blocks(rows)), "")))
-    written.append(path)
-  gallery = pages / GALLERY
-  for suite in dict.fromkeys(entry.suite for entry in entries().values()):
-    text = gallery.read_text(encoding="utf-8")
-    write_text(gallery, _replaced(gallery, text, GRID_BEGIN.format(suite), GRID_END, _grid(suite)))
-  return [*written, gallery]
+  try:
+    rows = {
+      name: [row for table in tables for row in read_csv(reference / f"{table}.csv")] for name, tables in TABLES.items()
+    }
+    written = []
+    for name in TABLES:
+      found = tasks.table(_entries(name, rows), rows[name])
+      written.append(_rewrite(pages / f"results-{name}.md", TASKS_BEGIN, TASKS_END, [found]))
+      written.append(_rewrite(pages / f"runs-{name}.md", RUNS_BEGIN, RUNS_END, list(_blocks(rows[name]))))
+    for suite in dict.fromkeys(entry.suite for entry in entries().values()):
+      _rewrite(pages / GALLERY, GRID_BEGIN.format(suite), GRID_END, _grid(suite))
+  except FileNotFoundError as error:
+    raise ConfigError(f"pages={pages}: {error.filename} does not exist.") from None
+  return [*written, pages / GALLERY]
+
+
+def _entries(name: str, rows: Mapping[str, Sequence[Row]]) -> list[Entry]:
+  """The tasks of a page: those of its tables, and those of its suite that no table has."""
+  pages = {row["task"]: page for page, found in rows.items() for row in found}
+  return [entry for entry in entries().values() if pages.get(entry.task, entry.suite.replace("_", "-")) == name]
+
+
+def _rewrite(path: Path, begin: str, end: str, content: Sequence[Block] | str) -> Path:
+  """Writes a page with other content between two comments; returns its path."""
+  text = content if isinstance(content, str) else to_markdown(content, "")
+  write_text(path, _replaced(path, path.read_text(encoding="utf-8"), begin, end, text))
+  return path
 
 
 def _replaced(path: Path, text: str, begin: str, end: str, content: str) -> str:

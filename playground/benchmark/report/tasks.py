@@ -1,0 +1,94 @@
+"""A row for each task: its best run, beside the best public ones at equal steps."""
+
+import re
+from collections.abc import Sequence
+
+from playground.benchmark.report.public import at, is_ppo, public_curves
+from playground.catalog import Entry
+from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
+
+_HEADER = ("task", "status", "best run", "M steps", "PPO's budget", "runs (seeds)", "sampled", "mode")
+_PUBLIC = ("best public PPO", "best public")  # at as many steps
+_BY_MODE = ("reppo", "fast_td3", "fast_sac")  # whose agent.deterministic_eval is true by default
+Row = dict[str, str]
+
+
+def best_runs(rows: Sequence[Row], task: str) -> list[Row]:
+  """Our runs of a task with the agent, setting, backend and steps that have the highest mean return at their end.
+
+  A chain counts only where there is nothing else, then by its last stage.
+  """
+  ours = [row for row in rows if row["task"] == task and row["who"] == "ours"]
+  single = [row for row in ours if "chain" not in row.get("experiment", "")] or ours[-1:]
+  groups: dict[tuple[str, ...], list[Row]] = {}
+  for row in single:
+    groups.setdefault((row["agent"], row.get("setting", ""), row["backend"], row["steps"]), []).append(row)
+  return max(groups.values(), key=lambda runs: mean_and_ci95(_returns(runs, "final_return"))[0], default=[])
+
+
+def by_mode(row: Row) -> bool:
+  """Whether a run's `final_return` is of the policy's mode, not of sampled actions."""
+  return row["agent"] in _BY_MODE or "deterministic_eval=true" in row.get("setting", "")
+
+
+def table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
+  """The tasks of a suite in the order of the catalogue.
+
+  Args:
+    entries: of the tasks.
+    rows: of their runs, from results/reference.
+  """
+  cells = []
+  for entry in entries:
+    budget = f"{entry.budget / 1e6:.3g}"
+    runs = best_runs(rows, entry.task)
+    if not runs:
+      cells.append([entry.task, entry.status, NOT_MEASURED, "", budget, "", "", "", "", ""])
+      continue
+    steps = float(runs[0]["steps"])
+    count = f"{len(runs)} ({len({row['seed'] for row in runs})})"
+    sampled = "" if by_mode(runs[0]) else _with_ci(runs, "final_return")
+    mode = _with_ci(runs, "final_return" if by_mode(runs[0]) else "final_mode_return")
+    public = [_public(entry.task, steps, ppo_only) for ppo_only in (True, False)]
+    cells.append(
+      [entry.task, entry.status, _name(runs[0]), f"{steps / 1e6:.3g}", budget, count, sampled, mode, *public]
+    )
+  return Table([*_HEADER, *_PUBLIC], cells)
+
+
+def _returns(runs: Sequence[Row], column: str) -> list[float]:
+  return [float(row[column]) for row in runs if row.get(column)]
+
+
+def _with_ci(runs: Sequence[Row], column: str) -> str:
+  """The mean over runs and, of several, half the width of its 95 % confidence interval; "" if it was not measured."""
+  values = _returns(runs, column)
+  if not values:
+    return ""
+  mean, ci95 = mean_and_ci95(values)
+  return short(mean) + ("" if ci95 is None else f" ± {ci95:.0f}" if ci95 >= 10 else f" ± {ci95:.2g}")
+
+
+def _name(row: Row) -> str:
+  """The agent, and what else a reader must know to read the return."""
+  pushed = "events.push.enabled=false" in row.get("setting", "")
+  stage = re.search(r"stage[ =](\w+)", row.get("setting", "")) if "chain" in row.get("experiment", "") else None
+  chain = f", {row['experiment']}'s {stage.group(1)}" if stage else ""
+  return row["agent"].replace("agent.", "") + chain + ", no pushes, nothing randomised" * pushed
+
+
+def _public(task: str, steps: float, ppo_only: bool) -> str:
+  """The best public return after as many steps, and whose: of curves that ended before their end.
+
+  Where all begin later it is the best of their first points, with its steps.
+  """
+  curves = [curve for curve in public_curves().get(task, ()) if is_ppo(curve) or not ppo_only]
+  named = lambda curve: f"{re.split(r'[ ,(]', curve.label)[0]}, {curve.actions}"
+  if found := [(value, named(curve)) for curve in curves if (value := at(curve.points, steps)) is not None]:
+    value, name = max(found)
+    return f"{short(value)} ({name})"
+  if curves:
+    first = min(curve.points[0][0] for curve in curves)
+    value, name = max((curve.points[0][1], named(curve)) for curve in curves if curve.points[0][0] == first)
+    return f"{short(value)} after {first / 1e6:.3g} ({name})"
+  return ""

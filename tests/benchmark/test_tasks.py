@@ -1,0 +1,57 @@
+"""The row of each task on a result page: its best runs, beside the public ones at equal steps."""
+
+import pytest
+
+from playground.benchmark.report import tasks
+from playground.benchmark.report.public import Curve
+from playground.benchmark.report.tasks import Row, best_runs, by_mode, table
+from playground.catalog import entries
+
+TASK = "CheetahRun"
+
+
+def run(value: float, **columns: str) -> Row:
+  same = {"task": TASK, "agent": "ppo", "who": "ours", "seed": "1", "backend": "warp", "steps": "60000000"}
+  return {**same, "final_return": str(value), "final_mode_return": "", **columns}
+
+
+def test_runs_that_differ_in_seed_alone_count_together():
+  rows = [
+    run(900, agent="sac"),
+    run(100),
+    run(300, seed="2"),
+    run(999, who="playground 0.2.0"),
+    run(999, task="WalkerRun"),
+  ]
+  assert best_runs(rows, TASK) == rows[:1]
+  assert best_runs(rows[1:], TASK) == rows[1:3]
+  assert best_runs(rows, "HopperHop") == []
+
+
+def test_a_chain_counts_by_its_last_stage_and_only_alone():
+  rows = [run(20, experiment="chain", setting="stage=a"), run(9, experiment="chain", setting="stage=b")]
+  assert best_runs(rows, TASK) == rows[1:]
+  assert best_runs([*rows, run(5)], TASK) == [run(5)]
+
+
+@pytest.mark.parametrize(
+  ("columns", "mode"), [({}, False), ({"agent": "reppo"}, True), ({"setting": "agent.deterministic_eval=true"}, True)]
+)
+def test_a_return_is_of_the_mode_where_the_run_was_evaluated_by_it(columns: Row, mode: bool):
+  assert by_mode(run(1, **columns)) == mode
+
+
+def test_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch):
+  theirs = [Curve("PPO (some)", "mode", [(10e6, 1.0), (90e6, 5.0)]), Curve("REPPO (x)", "sampled", [(50e6, 4.0)])]
+  monkeypatch.setattr(tasks, "public_curves", lambda: {TASK: theirs})
+  entry = entries()[TASK]
+  runs = [run(100, final_mode_return="110"), run(300, seed="2")]
+  (row,) = table([entry], runs).rows
+  assert row == [
+    *(TASK, entry.status, "ppo", "60", f"{entry.budget / 1e6:.3g}", "2 (2)", "200 ± 1271", "110"),
+    *("3.5 (PPO, mode)", "4 (REPPO, sampled)"),
+  ]
+  (row,) = table([entry], [run(50, agent="reppo", steps="5000000")]).rows
+  assert row[5:] == ["1 (1)", "", "50", "1 after 10 (PPO, mode)", "1 after 10 (PPO, mode)"]
+  (row,) = table([entry], []).rows
+  assert row[2] == "not measured"
