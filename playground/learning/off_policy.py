@@ -34,7 +34,7 @@ class Transition(struct.PyTreeNode):
     reward: unscaled.
     discount: factor on the value of `next_obs`: 0 where the task ended the episode, else 1 (after a time-out, too).
     nonfinite: 1 for a step with a number that is not finite, else 0; the critics learn nothing there.
-    done: 1 where an episode ended, by the task or by time; only with `num_steps` above 1, else None.
+    first: 1 where an episode begins with `obs`; only with `num_steps` above 1, else None.
   """
 
   obs: dict[str, jax.Array]
@@ -43,7 +43,7 @@ class Transition(struct.PyTreeNode):
   reward: jax.Array
   discount: jax.Array
   nonfinite: jax.Array
-  done: jax.Array | None = None
+  first: jax.Array | None = None
 
 
 class OffPolicyState(AlgorithmState):
@@ -76,8 +76,8 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
     shape = lambda *size: jax.ShapeDtypeStruct(size, jnp.float32)
     self._inside = groups_inside(env, networks.obs_sizes)
     obs = {key: shape(*size) for key, size in networks.obs_sizes.items() if key not in self._inside}
-    done = shape() if config.num_steps > 1 else None
-    example = Transition(obs, obs, shape(env.action_size), shape(), shape(), shape(), done)  # pyright: ignore
+    first = shape() if config.num_steps > 1 else None
+    example = Transition(obs, obs, shape(env.action_size), shape(), shape(), shape(), first)  # pyright: ignore
     dtype = jnp.dtype(config.replay_dtype)
     self.buffer = ReplayBuffer(config.max_replay_size, config.num_envs, example, config.checkpoint_replay, dtype)
     super().__init__(config, networks, self.buffer)
@@ -154,18 +154,20 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
 
   def collect(self, state: OffPolicyState, envs: Environments, key: jax.Array) -> tuple[Environments, Transition]:
     """Steps this device's environments once."""
-    before = envs.state.obs
-    action = self.explore(state, before, key)
+    before = envs.state
+    action = self.explore(state, before.obs, key)
     envs, final_obs = envs.step(action)
     after = envs.state
+    # A reset of all environments ends no episode, but those that begin have made no step.
+    first = jnp.maximum(before.done, before.info["steps"] == 0) if self.config.num_steps > 1 else None
     transition = Transition(
-      obs=self.networks.select(before),
+      obs=self.networks.select(before.obs),
       next_obs=self.networks.select(final_obs),
       action=action,
       reward=after.reward,
       discount=1 - after.done * (1 - after.info["truncation"]),
       nonfinite=after.info["nonfinite"],
-      done=after.done if self.config.num_steps > 1 else None,
+      first=first,
     )
     return envs, transition
 
@@ -193,18 +195,19 @@ def n_step(windows: Transition, discounting: float) -> Transition:
   """Makes one transition of several: rewards add up, discounted, until the episode or the window ends.
 
   Args:
-    windows: successive steps, each [n, ..., ] with `done`.
+    windows: successive steps, each [n, ..., ] with `first`.
     discounting: discount of one step.
 
   Returns:
     From the first observation and action to the last `next_obs`, where `discount` also holds the discount of all steps
     but one; it is not finite where any of its steps is not.
   """
-  assert windows.done is not None
+  assert windows.first is not None
   whole = jax.tree.map(lambda x: x[0], windows)
-  alive, discount = 1 - whole.done, jnp.ones_like(whole.reward)
+  alive, discount = jnp.ones_like(whole.reward), jnp.ones_like(whole.reward)
   for k in range(1, len(windows.reward)):
     step = jax.tree.map(lambda x, k=k: x[k], windows)
+    alive *= 1 - step.first
     goes_on = alive > 0
     discount = jnp.where(goes_on, discount * discounting, discount)
     latest = lambda new, old, on=goes_on: jnp.where(on.reshape(on.shape + (1,) * (new.ndim - on.ndim)), new, old)
@@ -214,5 +217,4 @@ def n_step(windows: Transition, discounting: float) -> Transition:
       discount=latest(step.discount, whole.discount),
       nonfinite=jnp.maximum(whole.nonfinite, alive * step.nonfinite),
     )
-    alive *= 1 - step.done
   return whole.replace(discount=whole.discount * discount)

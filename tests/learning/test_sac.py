@@ -75,6 +75,16 @@ def test_the_buffer_keeps_a_group_within_another_once() -> None:
     np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
+def test_an_episode_begins_where_all_environments_are_reset() -> None:
+  trainer = point_trainer(dataclasses.replace(SMALL_SAC, num_steps=2))
+  state = trained(2, trainer)
+  state = trainer.reset(state, jax.random.PRNGKey(1), MODEL)
+  state, _ = trainer.train(state, MODEL, np.int32(2))
+  first = algorithm(trainer).buffer.sample_windows(state.replay, jax.random.PRNGKey(2), (8,), 4).first
+  np.testing.assert_array_equal(first.T, [[1, 0, 1, 0]] * 8)
+
+
 def test_nothing_is_learned_before_there_is_enough_to_learn_from() -> None:
   states = trained(0), trained(PREFILL), trained(PREFILL + 1)
   start, filled, later = (state.algorithm for state in states)
