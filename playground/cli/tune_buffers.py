@@ -7,8 +7,9 @@ from rich.table import Table
 
 from playground import registry
 from playground.config import compose, config_dict, format_value
-from playground.envs.warp_buffer_sizes import ROOM, Act, BufferSizes, measure_buffers
+from playground.envs.wrappers import wrap_for_training
 from playground.errors import ConfigError
+from playground.physics.warp_buffer_sizes import ROOM, Act, BufferSizes, measure_buffers
 from playground.runs.loaded_policy import load_policy
 from playground.runs.progress import Progress
 
@@ -47,7 +48,7 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
       raise ConfigError(f"--run={run} is one of {trained.task}, not of {task}.")
     policies["trained"] = trained.act
     config = config if overrides else trained.config.env
-  build = lambda sizes: registry.build(config_dict({**config.to_dict(), **sizes}))
+  build = lambda sizes: wrap_for_training(registry.build(config_dict({**config.to_dict(), **sizes})))
   found = []
   with Progress(envs * steps, activity="rollout", console=Console(stderr=True)) as progress:
     for name, act in policies.items():

@@ -16,7 +16,6 @@ from playground.errors import ConfigError
 from playground.mdp.traced import traced_settings
 from playground.physics.backend import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.physics.warp_kernels import quiet_warp
-from playground.settings import below
 
 Observation = jax.Array | dict[str, jax.Array]
 PIXELS = "pixels/"  # what entries of an observation that are pictures begin with: [height, width, channels] uint8
@@ -127,7 +126,7 @@ class Env(abc.ABC):
     other = copy.copy(self)
     vars(other).pop("jitted", None)  # which has our own values
     for name in self.managers:
-      setattr(other, name, getattr(self, name).with_settings(below(name, values)))
+      setattr(other, name, getattr(self, name).with_settings(values))
     return other
 
   @property

@@ -67,9 +67,7 @@ class Task(Env):
     self.prepare_model(mj_model, config)
     self.rewards = RewardManager(config.rewards)
     self.terminations = TerminationManager(config.terminations)
-    self.observations = ObservationManager(
-      config.observations, config.noise_level, config.observation_frames, config.observation_order
-    )
+    self.observations = ObservationManager(config)
     if any(not term.func.__module__.startswith("playground.") for term in self.terms()):
       self.derived = DERIVED_FIELDS  # another package's term may read any of them
     super().__init__(config, mj_model)
@@ -77,7 +75,7 @@ class Task(Env):
     self.commands = CommandManager(config.get("commands"), self)
     self.events = EventManager(config.get("events"), self)
     if isinstance(self.robot, Robot):
-      for term in (*self.terms(), *self.events.resets):
+      for term in (*self.terms(), *self.events.groups["reset"]):
         self.robot.check_names(term.params, f"{term.key}.params")
     self._episode_models = Randomizer(mj_model, config.get("events"), "reset")
     self.redraws = bool(self._episode_models.fields)
@@ -86,8 +84,7 @@ class Task(Env):
 
   def terms(self) -> list[Any]:
     """All reward, termination and observation terms."""
-    observed = [term for terms in self.observations.groups.values() for term in terms]
-    return [*self.rewards.terms, *self.terminations.terms, *observed]
+    return [*self.rewards.terms, *self.terminations.terms, *self.observations.terms]
 
   def prepare_model(self, mj_model: mujoco.MjModel, config: Any) -> None:
     """Changes the compiled model in place before it goes to the device."""

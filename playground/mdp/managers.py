@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -12,21 +12,39 @@ from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 from playground.limits import at_least_0
 from playground.mdp import delays
 from playground.mdp.context import StepContext
-from playground.mdp.options import ObservationOptions, is_model_field
+from playground.mdp.options import ObservationOptions
 from playground.mdp.terms import Term, bind, bind_one
 from playground.physics.backend import PhysicsData
-from playground.settings import below
 from playground.text import format_value
 
 ACTOR = "state"  # the observation group that the policy reads: noisy; the other groups are exact
 Info = dict[str, Any]
 _WHEN = ("command_above", "command_below")
 _NOISE = ("uniform", "gaussian", "same_as")
-Settings = Mapping[str, jax.Array]  # numbers in place of the config's, by key (`playground.mdp.traced`)
-_Generator = TypeVar("_Generator")
 
 
-class RewardManager:
+class _Manager:
+  """Terms of one kind.
+
+  Attributes:
+    groups: the terms of each group, in their order; kinds that have no groups have one, named as the kind.
+  """
+
+  groups: dict[str, list[Term]]
+
+  @property
+  def terms(self) -> list[Term]:
+    """The terms of all groups."""
+    return [term for terms in self.groups.values() for term in terms]
+
+  def with_settings(self, values: Mapping[str, jax.Array]) -> Self:
+    """Returns the same terms with other numbers, by their keys in the task's config (`playground.mdp.traced`)."""
+    other = copy.copy(self)
+    other.groups = {name: [term.with_settings(values) for term in terms] for name, terms in self.groups.items()}
+    return other
+
+
+class RewardManager(_Manager):
   """Weighted reward terms."""
 
   def __init__(self, section: Mapping[str, Any]):
@@ -39,13 +57,7 @@ class RewardManager:
           raise UnknownNameError(f"{key} does not exist: choose {' or '.join(_WHEN)}.{nearest(name, _WHEN)}")
         if not at_least_0().allows(value):
           raise ConfigError(f"{key}={format_value(value)} must be {at_least_0()}.")
-    self.terms = [term for term in terms if term.options.weight != 0]
-
-  def with_settings(self, values: Settings) -> Self:
-    """Returns the same terms with other weights, `<term>.weight`."""
-    other = copy.copy(self)
-    other.terms = _terms_with(self.terms, values)
-    return other
+    self.groups = {"rewards": [term for term in terms if term.options.weight != 0]}
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns weight * value of each term, by name, each shape []."""
@@ -59,12 +71,12 @@ def _when(condition: Mapping[str, float] | None, c: StepContext, value: jax.Arra
   return value
 
 
-class TerminationManager:
+class TerminationManager(_Manager):
   """Reasons to end an episode."""
 
   def __init__(self, section: Mapping[str, Any]):
     """Binds `env.terminations`; raises as `terms.bind`."""
-    self.terms = bind("terminations", section)
+    self.groups = {"terminations": bind("terminations", section)}
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns whether each term ends the episode, by name, each a bool of shape []."""
@@ -75,29 +87,22 @@ class TerminationManager:
     return jnp.array(list(self.compute(c).values()), bool).any()
 
 
-class ObservationManager:
+class ObservationManager(_Manager):
   """Concatenates the terms of each observation group. Noise, delays and history keep their state in `info`.
 
   The entry `state: {}` of another group stands for the whole of the group `state`, as the policy reads it.
-
-  Attributes:
-    groups: the terms of each group, the group `state` first; an empty group is left out.
+  The group `state` is the first of `groups`; an empty group is left out.
   """
 
-  def __init__(
-    self,
-    section: Mapping[str, Any],
-    noise_level: float = 1.0,
-    frames: int = 1,
-    order: Mapping[str, Any] | None = None,
-  ):
-    """Binds `env.observations`; raises as `terms.bind`. The other arguments are those of `TermsConfig`."""
-    self._level = noise_level
-    self._frames = frames
-    self.groups: dict[str, list[Term]] = {}
+  def __init__(self, config: Any):
+    """Binds `observations` of a task's config, with the settings of `TermsConfig`; raises as `terms.bind`."""
+    section, order = config.observations, config.observation_order or {}
+    self._level: float = config.noise_level
+    self._frames: int = config.observation_frames
+    self.groups = {}
     for group in sorted(section, key=lambda name: (name != ACTOR, name)):
       entries = {name: entry for name, entry in (section[group] or {}).items() if entry is not None}
-      first = list((order or {}).get(group) or ())
+      first = list(order.get(group) or ())
       for name in first:
         lookup(entries, name, f"env.observation_order.{group}")
       noisy: list[str] = []
@@ -107,12 +112,6 @@ class ObservationManager:
         self.groups.setdefault(group, []).append(term)
     if ACTOR not in self.groups:
       raise ConfigError(f"env.observations.{ACTOR} is missing or empty: the policy would read nothing.")
-
-  def with_settings(self, values: Settings) -> Self:
-    """Returns the same terms with other noise, `<group>.<term>.noise.<kind>`."""
-    other = copy.copy(self)
-    other.groups = {group: _terms_with(terms, below(group, values)) for group, terms in self.groups.items()}
-    return other
 
   def compute(self, c: StepContext, key: jax.Array, buffers: Info | None = None) -> tuple[Any, Info]:
     """Returns the observation and the buffers for the next step; `buffers` is None at the start of an episode.
@@ -231,103 +230,61 @@ def _look_back(term: Term, value: jax.Array, key: jax.Array, buffer: jax.Array |
   return jax.lax.dynamic_slice_in_dim(buffer, delays.draw_delay(key, delay), term.options.history), buffer
 
 
-class CommandManager:
-  """Generators of commands: each is an object with `reset` and `step` (see `playground.mdp.commands`)."""
+class CommandManager(_Manager):
+  """Generators of commands: each term has an instance with `reset` and `step` (see `playground.mdp.commands`)."""
 
   def __init__(self, section: Mapping[str, Any], env: Any):
     """Binds `env.commands` and builds each generator with its parameters; raises as `terms.bind`."""
-    self.terms = bind("commands", section)
-    self._generators = [term() for term in self.terms]
-    for generator in self._generators:
-      generator.bind(env)
-
-  def with_settings(self, values: Settings) -> Self:
-    """Returns the same generators with other parameters, `<term>.params.<name>`."""
-    other = copy.copy(self)
-    pairs = zip(self.terms, self._generators, strict=True)
-    other._generators = [_generator_with(generator, below(term.name, values)) for term, generator in pairs]
-    return other
+    self.groups = {"commands": [term.instantiate(env) for term in bind("commands", section)]}
 
   def reset(self, key: jax.Array) -> Info:
     """Returns the entries of `info` that an episode starts with."""
-    return _union(generator.reset(k) for generator, k in _with_keys(self._generators, key))
+    return _union(term.instance.reset(k) for term, k in _with_keys(self.terms, key))
 
   def step(self, c: StepContext, key: jax.Array) -> Info:
     """Returns the entries of `info` for the next step."""
-    return _union(generator.step(c, k) for generator, k in _with_keys(self._generators, key))
+    return _union(term.instance.step(c, k) for term, k in _with_keys(self.terms, key))
 
 
-class EventManager:
-  """What acts on the simulation from outside: on its start state and while it runs.
+class EventManager(_Manager):
+  """What acts on the simulation from outside: on its start state and while it runs (groups `reset` and `interval`).
 
   Model fields of mode `startup` are the trainers' (`playground.randomization`), which hand them to `reset` and `step`.
-
-  Attributes:
-    resets: the terms of mode reset.
   """
 
   def __init__(self, section: Mapping[str, Any], env: Any):
     """Binds `env.events`; raises as `terms.bind`."""
-    self.resets: list[Term] = []
-    self._intervals: dict[str, tuple[Any, bool]] = {}  # and whether it is enabled
-    for name, entry in (section or {}).items():
-      if entry is None or is_model_field(name, entry):
-        continue
-      term = bind_one("events", f"env.events.{name}", name, entry)
-      if term.options.mode not in ("reset", "interval"):
-        raise ConfigError(f"env.events.{name}.mode={term.options.mode}: only func model_field has the mode startup.")
-      if isinstance(term.func, type) != (term.options.mode == "interval"):
-        mode = "interval" if isinstance(term.func, type) else "reset"
-        raise ConfigError(f"env.events.{name}.mode={term.options.mode}: {term.func.__name__} is for mode: {mode}.")
-      if term.options.mode == "interval":
-        event = term.func(**term.params)
-        event.bind(env)
-        self._intervals[name] = event, term.options.enabled
+    self.groups = {"reset": [], "interval": []}
+    for term in bind("events", section):
+      mode = "interval" if isinstance(term.func, type) else "reset"
+      if term.options.mode != mode:
+        raise ConfigError(f"{term.key}.mode={term.options.mode}: {term.func.__name__} is for mode: {mode}.")
+      if mode == "interval":
+        self.groups[mode].append(term.instantiate(env))
       elif term.options.enabled:
-        self.resets.append(term)
-
-  def with_settings(self, values: Settings) -> Self:
-    """Returns the same events with other parameters, `<term>.params.<name>`."""
-    other = copy.copy(self)
-    other.resets = _terms_with(self.resets, values)
-    other._intervals = {
-      name: (_generator_with(event, below(name, values)), enabled) for name, (event, enabled) in self._intervals.items()
-    }
-    return other
+        self.groups[mode].append(term)
 
   def start(self, key: jax.Array, env: Any, initial: Any) -> Any:
     """Applies the reset events, in order, to the state that an episode starts with."""
-    for term, k in _with_keys(self.resets, key):
+    for term, k in _with_keys(self.groups["reset"], key):
       initial = term.func(k, env, initial, **term.params)
     return initial
 
   def reset(self, key: jax.Array, model: Any) -> Info:
     """Returns the entries of `info` of the interval events that an episode starts with."""
-    return _union(event.reset(k, model) for (event, _), k in _with_keys([*self._intervals.values()], key))
+    return _union(term.instance.reset(k, model) for term, k in _with_keys(self.groups["interval"], key))
 
   def step(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
     """Returns the physics after the interval events, and `info`."""
     changed = dict(info)
-    for event, enabled in self._intervals.values():
-      if enabled:
-        data, entries = event.step(data, changed)
+    for term in self.groups["interval"]:
+      if term.options.enabled:
+        data, entries = term.instance.step(data, changed)
         changed |= entries
     return data, changed
 
 
-def _terms_with(terms: Iterable[Term], values: Settings) -> list[Term]:
-  return [term.with_settings(below(term.name, values)) for term in terms]
-
-
-def _generator_with(generator: _Generator, values: Settings) -> _Generator:
-  """The same command or event with other values of its fields, what `bind` found included."""
-  other = copy.copy(generator)
-  for name, value in below("params", values).items():
-    setattr(other, name, value)
-  return other
-
-
-def _with_keys(terms: list[Any], key: jax.Array) -> Iterable[tuple[Any, jax.Array]]:
+def _with_keys(terms: list[Term], key: jax.Array) -> Iterable[tuple[Term, jax.Array]]:
   """Each term with a random key of its own."""
   return zip(terms, jax.random.split(key, len(terms)) if terms else (), strict=True)
 

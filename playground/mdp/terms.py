@@ -15,6 +15,7 @@ snake_case). Its keyword arguments are the term's `params`, its docstring is the
 also name what a step context has (`CONTEXTS`): `gravity`, or `site_pos` with `params: {site: gripper}`.
 """
 
+import copy
 import functools
 import importlib
 import inspect
@@ -27,7 +28,7 @@ import jax
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.moved import renamed_function
-from playground.mdp.options import OPTIONS, keys
+from playground.mdp.options import OPTIONS, is_model_field, keys
 from playground.settings import below, members, problem
 from playground.text import format_value
 from playground.trust import trusted_object
@@ -53,6 +54,7 @@ class Term(NamedTuple):
     func: the function or class.
     params: keyword arguments of `func`.
     options: the other keys of the entry (weight, noise, mode, ...), a NamedTuple of the kind.
+    instance: of a command or an interval event: the object of the class `func` for a task.
   """
 
   name: str
@@ -60,16 +62,26 @@ class Term(NamedTuple):
   func: Callable[..., Any]
   params: dict[str, Any]
   options: Any
+  instance: Any = None
 
   def __call__(self, *args: Any) -> Any:
     return self.func(*args, **self.params)
 
+  def instantiate(self, env: Any) -> "Term":
+    """Returns the same term with an instance of its class, bound to a task."""
+    instance = self()
+    instance.bind(env)
+    return self._replace(instance=instance)
+
   def with_settings(self, values: Mapping[str, Any]) -> "Term":
-    """Returns the same term with other numbers: `weight`, `noise.<kind>`, `params.<name>`."""
-    options = {name: value for name, value in values.items() if "." not in name}
-    noise = below("noise", values)
-    options |= {"noise": noise} if noise else {}
-    return self._replace(params=self.params | below("params", values), options=self.options._replace(**options))
+    """Returns the same term with other numbers (`weight`, `noise.<kind>`, `params.<name>`), by key in the config."""
+    own = below(self.key.removeprefix("env."), values)
+    params, noise = below("params", own), below("noise", own)
+    options = {name: value for name, value in own.items() if "." not in name} | ({"noise": noise} if noise else {})
+    instance = copy.copy(self.instance)  # what `bind` found included
+    for name, value in params.items() if instance is not None else ():
+      setattr(instance, name, value)
+    return self._replace(params=self.params | params, options=self.options._replace(**options), instance=instance)
 
 
 @functools.cache
@@ -104,14 +116,18 @@ def _reader(getter: Callable[..., Any], is_method: bool) -> Callable[..., Any]:
   return read
 
 
-def bind(kind: str, section: Mapping[str, Any] | None) -> list[Term]:
-  """Binds the terms of `env.<kind>`, in their order; null entries are left out.
+def bind(kind: str, section: Mapping[str, Any] | None, group: str = "") -> list[Term]:
+  """Binds the terms of `env.<kind>`, in their order; null entries and events that draw model fields are left out.
+
+  `group` is that of observations, whose section is `env.observations.<group>`.
 
   Raises:
     ConfigError: an unknown or missing key, function or parameter, or a value of the wrong type.
   """
   entries = {name: entry for name, entry in (section or {}).items() if entry is not None}
-  return [bind_one(kind, f"env.{kind}.{name}", name, entry) for name, entry in entries.items()]
+  prefix = f"env.{kind}.{group}." if group else f"env.{kind}."
+  own = [name for name, entry in entries.items() if kind != "events" or not is_model_field(name, entry)]
+  return [bind_one(kind, prefix + name, name, entries[name]) for name in own]
 
 
 def bind_one(kind: str, key: str, name: str, entry: Any) -> Term:

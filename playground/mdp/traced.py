@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from playground.limits import Limit
-from playground.mdp.options import is_model_field
-from playground.mdp.terms import MODULES, Term, annotation, bind_one
+from playground.mdp.terms import MODULES, Term, annotation, bind
 from playground.settings import members
 
 
@@ -24,43 +23,31 @@ def traced_settings(config: Mapping[str, Any], kinds: Sequence[str]) -> dict[str
     By dotted key, such as `rewards.action_rate_l2.weight`, float32 arrays: of shape [], or of a list [numbers].
 
   Raises:
-    ConfigError: as `terms.bind_one`.
+    ConfigError: as `terms.bind`.
   """
-  found = {key: np.asarray(value, np.float32) for kind in kinds for key, value in _numbers(config, kind)}
+  traced = (pair for kind in kinds for term in _terms(config, kind) for pair in _numbers(config, kind, term))
+  found = {key.removeprefix("env."): np.asarray(value, np.float32) for key, value in traced}
   return {key: value for key, value in found.items() if value.any()}
 
 
-def _numbers(config: Mapping[str, Any], kind: str) -> Iterator[tuple[str, Any]]:
-  for key, entry in _entries(config, kind):
-    if entry is None or (kind == "events" and is_model_field(key, entry)):
-      continue
-    if kind == "observations" and not entry.get("noise"):  # `state: {}` of another group names no function
-      continue
-    term = bind_one(kind, f"env.{key}", key.rpartition(".")[2], entry)
-    if kind == "rewards" and config.get("reward_total") != "product":
-      yield f"{key}.weight", term.options.weight
-    if kind == "observations":
-      yield from ((f"{key}.noise.{name}", size) for name, size in term.options.noise.items() if name != "same_as")
-    if kind in ("commands", "events"):
-      yield from ((f"{key}.params.{name}", value) for name, value in _parameters(kind, term))
+def _terms(config: Mapping[str, Any], kind: str) -> list[Term]:
+  section = config.get(kind) or {}
+  if kind != "observations":
+    return bind(kind, section)
+  noisy = lambda group: {name: entry for name, entry in (section[group] or {}).items() if entry and entry.get("noise")}
+  return [term for group in section for term in bind(kind, noisy(group), group)]
 
 
-def _entries(config: Mapping[str, Any], kind: str) -> Iterator[tuple[str, Any]]:
-  """The entries of terms by key, without the first part `env`."""
-  for name, entry in (config.get(kind) or {}).items():
-    if kind == "observations":
-      yield from ((f"{kind}.{name}.{term}", each) for term, each in (entry or {}).items())
-    else:
-      yield f"{kind}.{name}", entry
-
-
-def _parameters(kind: str, term: Term) -> Iterator[tuple[str, Any]]:
-  if term.func.__module__ != MODULES[kind]:  # another package's function may decide by a number what it computes
-    return
-  arguments = inspect.signature(term.func).parameters
-  for name, value in term.params.items():
-    if _is_traced(kind, term.func, arguments[name]):
-      yield name, value
+def _numbers(config: Mapping[str, Any], kind: str, term: Term) -> Iterator[tuple[str, Any]]:
+  if kind == "rewards" and config.get("reward_total") != "product":
+    yield f"{term.key}.weight", term.options.weight
+  if kind == "observations":
+    yield from ((f"{term.key}.noise.{name}", size) for name, size in term.options.noise.items() if name != "same_as")
+  # Another package's function may decide by a number what it computes.
+  if kind in ("commands", "events") and term.func.__module__ == MODULES[kind]:
+    arguments = inspect.signature(term.func).parameters
+    traced = [name for name in term.params if _is_traced(kind, term.func, arguments[name])]
+    yield from ((f"{term.key}.params.{name}", term.params[name]) for name in traced)
 
 
 def _is_traced(kind: str, func: Callable[..., Any], argument: inspect.Parameter) -> bool:

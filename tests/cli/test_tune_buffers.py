@@ -9,7 +9,7 @@ from playground import registry
 from playground.cli import tune_buffers as command_module
 from playground.cli.main import main
 from playground.config import compose
-from playground.envs.warp_buffer_sizes import BufferSizes
+from playground.physics.warp_buffer_sizes import BufferSizes
 from tests.command import Command, caller
 
 RUN = "results/somewhere"
@@ -34,6 +34,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     return BufferSizes(19, 4.0, 1) if act is None else BufferSizes(49, 6.56, 4)
 
   monkeypatch.setattr(registry, "build", lambda config: config)
+  monkeypatch.setattr(command_module, "wrap_for_training", lambda task: task)
   monkeypatch.setattr(command_module, "measure_buffers", measure)
   monkeypatch.setattr(command_module, "load_policy", lambda path: LoadedPolicy)
   return asked

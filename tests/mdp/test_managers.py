@@ -101,8 +101,12 @@ def moment(q: float = 0.5, command: float = 3.0) -> Any:
 
 
 def manager(level: float = 1.0, frames: int = 1, order: Any = None, critic: Any = None, **state: Any):
-  groups = {"critic": critic, "state": state or {"joint_pos": {}}}
-  return ObservationManager(groups, level, frames, order)
+  return bound({"critic": critic, "state": state or {"joint_pos": {}}}, level, frames, order)
+
+
+def bound(groups: Any, level: float = 1.0, frames: int = 1, order: Any = None) -> ObservationManager:
+  settings = {"noise_level": level, "observation_frames": frames, "observation_order": order}
+  return ObservationManager(SimpleNamespace(observations=groups, **settings))
 
 
 def observe(of: ObservationManager, now: Any, buffers: Any = None, key: jax.Array = KEY) -> tuple[Any, Any]:
@@ -252,7 +256,7 @@ def test_observations_that_cannot_be(entry: Any, message: str) -> None:
 )
 def test_a_policy_reads_something(section: Any) -> None:
   with pytest.raises(ConfigError, match=r"env\.observations\.state is missing or empty"):
-    ObservationManager(section)
+    bound(section)
 
 
 # Events
@@ -262,7 +266,7 @@ def test_a_policy_reads_something(section: Any) -> None:
   ("entry", "message"),
   [
     ({"func": "reset_root_xy", "mode": "interval", "params": {"distance": 1.0}}, "reset_root_xy is for mode: reset"),
-    ({"func": "reset_root_xy", "mode": "startup", "params": {"distance": 1.0}}, "only func model_field has the mode"),
+    ({"func": "reset_root_xy", "mode": "startup", "params": {"distance": 1.0}}, "reset_root_xy is for mode: reset"),
     ({"func": "reset_root_xi", "mode": "reset"}, "Did you mean 'reset_root_xy'"),
     ({"func": "push_by_setting_velocity", "mode": "reset", "params": {"velocity": [0, 1], "interval_s": [1, 2]}},
      "PushBySettingVelocity is for mode: interval"),

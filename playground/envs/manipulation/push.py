@@ -155,7 +155,7 @@ class _DelayedObservations(ObservationManager):
   """Observations whose group `state` is late as a whole; at the start of an episode it is that of the start."""
 
   def __init__(self, config: Any, bounds: tuple[int, int]):
-    super().__init__(config.observations, config.noise_level, config.observation_frames, config.observation_order)
+    super().__init__(config)
     self._bounds = bounds
 
   def compute(self, c: ArmContext, key: jax.Array, buffers: Any = None) -> tuple[Any, dict[str, Any]]:

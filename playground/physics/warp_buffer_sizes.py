@@ -3,12 +3,11 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from playground.envs.base import Env, Observation, State
-from playground.envs.wrappers import wrap_for_training
 from playground.errors import ConfigError
 from playground.physics.backend import BufferUse
 
@@ -17,7 +16,9 @@ _TRIES = 12
 _REPORTS = 50  # of the progress of a rollout, which takes minutes on a CPU
 _CCD = 1 << 4  # mujoco_warp's OverflowType.CCD
 
-Act = Callable[[Observation, jax.Array], jax.Array]  # (observation [N, ...], key) -> actions [N, action_size]
+Act = Callable[[Any, jax.Array], jax.Array]  # (observation [N, ...], key) -> actions [N, action_size]
+Batch = Any  # a task as `playground.envs.wrappers.wrap_for_training` wraps it, and what it steps (`envs.base.State`)
+State = Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,7 @@ class BufferSizes:
 
 
 def measure_buffers(
-  build: Callable[[dict[str, int | str]], Env],
+  build: Callable[[dict[str, int | str]], Batch],
   njmax: int | None,
   act: Act | None,
   num_envs: int,
@@ -55,7 +56,7 @@ def measure_buffers(
   """Rolls a task out on Warp and returns the most that any step needed.
 
   Args:
-    build: builds the task with these values in its configuration.
+    build: builds and wraps the task, with these values in its configuration.
     njmax: its own size of that buffer, where the search for a sufficient one begins.
     act: the policy; uniformly random actions if None.
     num_envs: environments.
@@ -90,23 +91,22 @@ def measure_buffers(
 
 
 def _roll(
-  env: Env, act: Act | None, num_envs: int, num_steps: int, seed: int, on_steps: Callable[[int], None]
+  env: Batch, act: Act | None, num_envs: int, num_steps: int, seed: int, on_steps: Callable[[int], None]
 ) -> BufferUse:
-  wrapped = wrap_for_training(env)
   reset_key, act_key = jax.random.split(jax.random.PRNGKey(seed))
   uniform = lambda obs, key: jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
   keys = jax.random.split(act_key, num_steps)
 
   @jax.jit
   def start() -> tuple[State, BufferUse]:
-    state = wrapped.reset(jax.random.split(reset_key, num_envs), {})
+    state = env.reset(jax.random.split(reset_key, num_envs), {})
     return state, jax.tree.map(jnp.zeros_like, state.data.buffers)
 
   @jax.jit
   def advance(carry: tuple[State, BufferUse], first: int, end: int) -> tuple[State, BufferUse]:
     def step(index: jax.Array, carry: tuple[State, BufferUse]) -> tuple[State, BufferUse]:
       state, most = carry
-      state = wrapped.step(state, (act or uniform)(state.obs, keys[index]), {})
+      state = env.step(state, (act or uniform)(state.obs, keys[index]), {})
       assert state.data.buffers is not None, "the task is on Warp"
       return state, most.join(state.data.buffers)
 

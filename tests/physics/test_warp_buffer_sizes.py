@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import pytest
 
 from playground import registry
-from playground.envs import warp_buffer_sizes
-from playground.envs.warp_buffer_sizes import BufferSizes, measure_buffers
-from playground.envs.wrappers import wrap_for_evaluation
+from playground.envs.wrappers import wrap_for_evaluation, wrap_for_training
 from playground.errors import ConfigError
 from playground.learning.rollout import episode_sums
+from playground.physics import warp_buffer_sizes
 from playground.physics.backend import BufferUse, mjx
+from playground.physics.warp_buffer_sizes import BufferSizes, measure_buffers
 from tests.dummy import PointTask
 
 
@@ -96,7 +96,7 @@ def test_a_rollout_reports_its_steps_and_keeps_the_most():
 
   for num_steps, stride in ((7, 1), (125, 2)):
     reported: list[int] = []
-    found = warp_buffer_sizes._roll(Counting(), None, 2, num_steps, 0, reported.append)
+    found = warp_buffer_sizes._roll(wrap_for_training(Counting()), None, 2, num_steps, 0, reported.append)
     assert (found.constraints, found.contacts, found.overflow) == (num_steps, 3, 1)
     assert reported == [*range(stride, num_steps, stride), num_steps]
 
@@ -127,7 +127,7 @@ def test_what_was_measured_fits_into_what_is_configured():
 @pytest.mark.slow  # compiles Warp's kernels for the CPU: a minute
 def test_a_real_task_on_warp():
   pytest.importorskip("warp")
-  build = lambda sizes: registry.load("Go1JoystickFlatTerrain", overrides=sizes)
+  build = lambda sizes: wrap_for_training(registry.load("Go1JoystickFlatTerrain", overrides=sizes))
   found = measure_buffers(build, None, None, num_envs=2, num_steps=40)
   assert found.constraints >= 12, "a Go1 that stands on its feet"
   assert 1 <= found.contacts <= 4
