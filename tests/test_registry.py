@@ -195,6 +195,8 @@ def test_terms_of_any_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     ("observations.state.feet_ps={}", "no function 'feet_ps' is registered.* Did you mean 'feet_pos'"),
     ("events.push.mode=reset", r"env\.events\.push\.mode=reset: PushByForce is for mode: interval"),
     ("commands.velocity.params.max=[1,2]", r"params\.max=\[1, 2\] must be 3 numbers from"),
+    ("rewards.object_lifted={weight: 1, params: {height: 0.1}}", r"object_lifted needs 'object_pos', which this task"),
+    ("events.reset_cube_pose={mode: reset, params: {pos: [0, 0, 1], spread: 0}}", "reset_cube_pose needs 'cube_qpos'"),
   ],
 )
 def test_a_term_that_is_none_is_one_sentence(override: str, message: str) -> None:
@@ -203,6 +205,20 @@ def test_a_term_that_is_none_is_one_sentence(override: str, message: str) -> Non
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
   assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+  ("overrides", "message"),
+  [
+    (["env=joystick", "robot=leap_hand"], r"env\.robot\.root is missing: robot=leap_hand is no robot on legs"),
+    (["env=LeapCubeReorient", "robot=go1"], r"env\.robot\.cube is missing: robot=go1 is no hand"),
+    (["env=PandaPickCube", "env.commands.gait={params: {modes: [walk]}}"], r"env\.commands\.gait needs 'gait'"),
+    (["env=PointMass", "env.rewards.joint_vel_l2.weight=1"], r"env\.rewards\.joint_vel_l2 needs 'qvel', which this"),
+  ],
+)
+def test_a_robot_or_a_term_of_another_kind_of_task_is_one_sentence(overrides: list[str], message: str) -> None:
+  with pytest.raises(ConfigError, match=message):
+    jax.eval_shape(registry.build(compose([*overrides, "tuned=null"]).env).reset, jax.random.PRNGKey(0))
 
 
 # Every key of an env config is read: one that nobody reads is a typo that nobody notices.

@@ -267,7 +267,7 @@ class EventManager(_Manager):
   def start(self, key: jax.Array, env: Any, initial: Any) -> Any:
     """Applies the reset events, in order, to the state that an episode starts with."""
     for term, k in _with_keys(self.groups["reset"], key):
-      initial = term.func(k, env, initial, **term.params)
+      initial = term(k, env, initial)
     return initial
 
   def reset(self, key: jax.Array, model: Any) -> Info:

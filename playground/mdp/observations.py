@@ -25,16 +25,16 @@ Observe = Callable[[StepContext], jax.Array]
 
 def _sensor(name: str, what: str, mirror: MirrorKind | None = None) -> Observe:
   """Returns the term that reads a sensor, by its name in the robot's YAML."""
-  return _reads(name, what, lambda c: c.sensor(name), mirror)
+  return _reads(what, lambda c: c.sensor(name), mirror)
 
 
 def _carried(name: str, what: str, mirror: MirrorKind | None = None) -> Observe:
   """Returns the term that reads an entry of `info`."""
-  return _reads(name, what, lambda c: c.carried(name), mirror)
+  return _reads(what, lambda c: c.carried(name), mirror)
 
 
-def _reads(name: str, what: str, read: Observe, mirror: MirrorKind | None = None) -> Observe:
-  read.__name__, read.__doc__ = name, what
+def _reads(what: str, read: Observe, mirror: MirrorKind | None = None) -> Observe:
+  read.__doc__ = what
   return mirrors_as(mirror)(read) if mirror else read
 
 
@@ -62,17 +62,13 @@ def episode_time(c: StepContext) -> jax.Array:
   return c.data.time / (c.env.episode_length * c.env.dt)
 
 
-actuator_force = _reads(
-  "actuator_force", "Forces of the actuators, N m (N on a tendon) [nu].", lambda c: c.data.actuator_force, "joints"
-)
-action = _reads("action", "The action just applied [action_size].", lambda c: c.action)
+actuator_force = _reads("Forces of the actuators, N m (N on a tendon) [nu].", lambda c: c.data.actuator_force, "joints")
+action = _reads("The action just applied [action_size].", lambda c: c.action)
 
 # Robots on legs.
 
 gyro = _sensor("gyro", "Angular velocity of the base in its own frame, rad/s [3].", "axial")
-gyro_yaw = _reads(
-  "gyro_yaw", "Angular velocity of the base about its own z, rad/s [1].", lambda c: c.sensor("gyro")[2], "opposite"
-)
+gyro_yaw = _reads("Angular velocity of the base about its own z, rad/s [1].", lambda c: c.sensor("gyro")[2], "opposite")
 linvel = _sensor("linvel", "Linear velocity of the base in its own frame, m/s [3].", "polar")
 accelerometer = _sensor("accelerometer", "Proper acceleration of the base in its own frame, m/s² [3].", "polar")
 global_angvel = _sensor("global_angvel", "Angular velocity of the base in the world frame, rad/s [3].", "axial")
@@ -84,10 +80,10 @@ gait = _carried("gait", "Index of the episode's gait in the modes of the gait co
 gait_frequency = _carried("gait_freq", "Frequency of the gait's steps, Hz [1].", "same")
 foot_height = _carried("foot_height", "Highest swing of the feet in this episode's gait, m [1].", "same")
 pushed = _carried("pushing", "Whether a push is under way, 0 or 1 [1].", "same")
-root_height = _reads("root_height", "World z of the root joint, m [1].", lambda c: c.data.qpos[2], "same")
-root_pos = _reads("root_pos", "World position of the root joint, m [3].", lambda c: c.data.qpos[:3], "polar")
+root_height = _reads("World z of the root joint, m [1].", lambda c: c.data.qpos[2], "same")
+root_pos = _reads("World position of the root joint, m [3].", lambda c: c.data.qpos[:3], "polar")
 root_quat = _reads(
-  "root_quat", "Orientation of the root joint, a quaternion w, x, y, z [4].", lambda c: c.data.qpos[3:7], "quaternion"
+  "Orientation of the root joint, a quaternion w, x, y, z [4].", lambda c: c.data.qpos[3:7], "quaternion"
 )
 
 

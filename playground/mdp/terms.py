@@ -15,13 +15,14 @@ snake_case). Its keyword arguments are the term's `params`, its docstring is the
 also name what a step context has (`CONTEXTS`): `gravity`, or `site_pos` with `params: {site: gripper}`.
 """
 
+import contextlib
 import copy
 import functools
 import importlib
 import inspect
 import re
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -65,12 +66,25 @@ class Term(NamedTuple):
   instance: Any = None
 
   def __call__(self, *args: Any) -> Any:
-    return self.func(*args, **self.params)
+    with self._reading(*args):
+      return self.func(*args, **self.params)
+
+  @contextlib.contextmanager
+  def _reading(self, *args: Any) -> Iterator[None]:
+    """Raises ConfigError where the term reads what the task, its robot or its context, of `args`, does not have."""
+    try:
+      yield
+    except AttributeError as error:
+      parts = [part for arg in args for part in (arg, getattr(arg, "env", arg), getattr(arg, "robot", arg))]
+      if not any(error.obj is part for part in parts):
+        raise
+      raise ConfigError(f"{self.key} needs {error.name!r}, which this task does not have.") from error
 
   def instantiate(self, env: Any) -> "Term":
     """Returns the same term with an instance of its class, bound to a task."""
     instance = self()
-    instance.bind(env)
+    with self._reading(env):
+      instance.bind(env)
     return self._replace(instance=instance)
 
   def with_settings(self, values: Mapping[str, Any]) -> "Term":
@@ -93,6 +107,8 @@ def registered(kind: str) -> dict[str, Callable[..., Any]]:
     if not key.startswith("_") and callable(value) and getattr(value, "__module__", None) == module.__name__:
       name = re.sub(r"(?<!^)(?=[A-Z])", "_", key).lower() if isinstance(value, type) else key  # in snake_case
       found[name] = value
+      if value.__name__ == "<lambda>":  # of a helper that makes terms
+        value.__name__ = value.__qualname__ = name
   return _of_contexts() | found if kind == "observations" else found
 
 

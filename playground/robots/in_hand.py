@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 
 from playground.errors import ConfigError, lookup
-from playground.robots.scene import add_studio_floor, attach, read_mjcf
+from playground.robots.scene import add_studio_floor, attach, check_keys, read_mjcf
 
 # How the cube lies in the keyframe `home` (w x y z), and where the goal is then (m).
 _CUBE_ORIENTATION = (0.810966968, -0.0026289499, -0.585085977, -0.00025430299)
@@ -25,8 +25,9 @@ def build_in_hand_scene(robot: Any) -> mujoco.MjSpec:
       (position in the keyframe, m).
 
   Raises:
-    ConfigError: the file is missing or invalid, lacks keyframe or site, or `start` has not three numbers.
+    ConfigError: a key or the file is missing or invalid, it lacks keyframe or site, or `start` has not three numbers.
   """
+  check_keys(robot, ("mjcf", "cube", "sensors"), "hand")
   if len(robot.cube.start) != 3:
     raise ConfigError(f"env.robot.cube.start={list(robot.cube.start)} must be three numbers: x, y and z in m.")
   spec = read_mjcf(robot.mjcf)

@@ -65,6 +65,13 @@ def read_mjcf(mjcf: str) -> mujoco.MjSpec:
     raise ConfigError(f"env.robot.mjcf={mjcf} is not an MJCF that MuJoCo reads: {first_line(error)}.") from None
 
 
+def check_keys(robot: Mapping[str, Any], keys: Sequence[str], what: str) -> None:
+  """Raises ConfigError where `env.robot` lacks a key that robots of a kind (`what`) have."""
+  if missing := [key for key in keys if key not in robot]:
+    name = robot.get("name")
+    raise ConfigError(f"env.robot.{missing[0]} is missing: robot={name} is no {what}, or its YAML is not complete.")
+
+
 def build_scene(
   mjcf: str,
   *,

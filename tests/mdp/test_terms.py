@@ -5,7 +5,7 @@ import inspect
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -197,3 +197,16 @@ def test_a_robot_walks_on_rough_ground_as_on_flat_ground_but_for_the_ground(robo
   flat, rough = (read(f"{robot}Joystick{terrain}Terrain")[1] for terrain in ("Flat", "Rough"))
   differ = {key for key in flat | rough if flat.get(key) != rough.get(key)}
   assert "scene" in differ <= {"scene", "cuda_impl", "naconmax_per_env", "njmax"}
+
+
+def test_an_error_inside_a_term_is_its_own() -> None:
+  (term,) = rewards({"joint_vel_l2": {"weight": 1.0}})
+  with pytest.raises(ConfigError, match=r"env\.rewards\.joint_vel_l2 needs 'joint_vel', which this task does not have"):
+    term(SimpleNamespace())
+  with pytest.raises(AttributeError, match="shape"):
+    term._replace(func=lambda c: [].shape)(SimpleNamespace())  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_functions_have_the_names_under_which_they_are_registered() -> None:
+  for kind in ("rewards", "observations", "terminations"):
+    assert {func.__name__ for func in registered(kind).values()} == set(registered(kind))

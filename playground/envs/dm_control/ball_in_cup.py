@@ -29,9 +29,6 @@ class BallInCup(SuiteTask):
     free = self._clearance(tries) > 0
     return {"qpos": jnp.concatenate([jnp.zeros(2), tries[jnp.argmax(free)]])}  # the first that is free
 
-  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
-    return {"position": data.qpos, "velocity": data.qvel}
-
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
     offset = (data.site_xpos[self.site["target"]] - data.xpos[self.body["ball"]])[_XZ]
     play = self.mj_model.site("target").size - self.mj_model.geom("ball").size[0]  # half the target's, m

@@ -21,9 +21,6 @@ class PointMass(SuiteTask):
   def initial(self, rng: jax.Array) -> dict[str, jax.Array]:
     return {"qpos": self.draw_joints(jax.random.split(rng)[1])}
 
-  def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
-    return {"position": data.qpos, "velocity": data.qvel}
-
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:
     distance = jnp.linalg.norm(data.geom_xpos[self.geom["target"]] - data.geom_xpos[self.geom["pointmass"]])
     radius = self.mj_model.geom("target").size[0]

@@ -60,9 +60,9 @@ class SuiteTask(Env):
     """State fields at the start of an episode that are not the model's, by name ("qpos", ...), from one random key."""
     return {}
 
-  @abc.abstractmethod
   def parts(self, data: PhysicsData) -> dict[str, jax.Array]:
-    """The parts of the observation by name, in their order."""
+    """The parts of the observation by name, in their order; by default `qpos` and `qvel`."""
+    return {"position": data.qpos, "velocity": data.qvel}
 
   @abc.abstractmethod
   def reward(self, data: PhysicsData, action: jax.Array) -> tuple[jax.Array, Terms]:

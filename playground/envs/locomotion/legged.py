@@ -12,7 +12,7 @@ from playground.errors import ConfigError, lookup
 from playground.mdp.context import StepContext
 from playground.mdp.legged import LeggedContext, LeggedRobot
 from playground.physics.backend import PhysicsData, mjx
-from playground.robots.scene import build_scene, set_gains
+from playground.robots.scene import build_scene, check_keys, set_gains
 
 # What an action is added to: the joints' default pose, their position, or their target in the step before.
 _ACTION_BASES: dict[str, Callable[[LeggedRobot, PhysicsData], jax.Array]] = {
@@ -20,6 +20,9 @@ _ACTION_BASES: dict[str, Callable[[LeggedRobot, PhysicsData], jax.Array]] = {
   "joint_pos": lambda robot, data: data.qpos[7:],
   "last_target": lambda robot, data: data.ctrl,
 }
+# Keys that the YAML of every robot on legs has (docs/add-a-robot.md).
+_KEYS = ("mjcf", "root", "base_site", "feet", "keyframe", "joints", "pd", "sensors")
+_KEYS += ("foot_linvel", "foot_contact", "floor_contacts")
 
 
 class LeggedTask(Task):
@@ -48,6 +51,7 @@ class LeggedTask(Task):
   def scene(self, config: Any) -> mujoco.MjSpec:
     """Returns the scene to compile; called first of all."""
     scene, robot = config.scene, config.robot
+    check_keys(robot, _KEYS, "robot on legs")
     ground = {"terrain": scene.terrain, "parameters": dict(scene.terrain_params or {})}
     spec = build_scene(robot.mjcf, **ground, collision=scene.collision, floor_contacts=tuple(robot.floor_contacts))
     if config.restricted_joint_range:

@@ -43,11 +43,10 @@ class PushCube(ArmTask):
   # `goal_reached`: the goal was reached in the last step, and the next one is yet to appear.
   episode_info = (*ArmTask.episode_info, "action_history", "applied_act", "goal_reached", "goals_reached", "goal_steps")
   summaries: ClassVar[Mapping[str, str]] = {
+    **ArmTask.summaries,
     "success": "max",
     "success_1": "max",
     "success_2": "max",
-    "position_error_cm": "last",
-    "rotation_error_deg": "last",
     "goals_reached": "last",  # so far: of an event, an evaluation would see the last of the repeats of an action only
     "curriculum_level": "last",
   }
