@@ -141,9 +141,11 @@ def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> SweepSettin
 def _is_plain(setting: str) -> bool:
   """Whether a setting of a sweep.yaml, which another user may have written, is harmless.
 
-  Text that goes to a scheduler must be one word; CMA-ES keeps pickles in the sweep's study.
+  Text that goes to a scheduler must be one word; a list may be lines of shell, but for `launcher.explore`, which holds
+  keys; CMA-ES keeps pickles in the sweep's study.
   """
-  value = configs.parse_with_hydra(setting).value()
-  if isinstance(value, str):
-    return bool(re.fullmatch(r"[A-Za-z0-9_.-]+", value)) and value != "cmaes"
-  return value is None or isinstance(value, int | float)
+  override = configs.parse_with_hydra(setting)
+  value = override.value()
+  values = value if isinstance(value, list) and override.key_or_group == "launcher.explore" else [value]
+  harmless = lambda text: bool(re.fullmatch(r"[A-Za-z0-9_.-]+", text)) and text != "cmaes"
+  return all(harmless(one) if isinstance(one, str) else one is None or isinstance(one, int | float) for one in values)

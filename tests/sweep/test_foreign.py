@@ -7,7 +7,7 @@ import pytest
 import ray
 import yaml
 
-from playground.config.sweep_options import SlurmConfig
+from playground.config.sweep_options import SlurmConfig, TogetherConfig
 from playground.errors import CheckpointError, ConfigError
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.plan import settings_of
@@ -98,6 +98,7 @@ def test_a_job_says_nothing_that_only_a_command_line_can(tmp_path: Path, overrid
       "launcher.parameters={wrap: x}",
       "launcher.partition='a\nb'",
       "search.sampler=cmaes",
+      "launcher.setup=[reboot]",
     ),
     *("launcher.constraint='$(x)'", "launcher.address='ray://evil:1'"),
   ],
@@ -115,6 +116,13 @@ def test_plain_settings_hold(tmp_path: Path) -> None:
   plain = ["launcher=slurm", "launcher.partition=gpu-8", "launcher.minutes=60", "launcher.wait=false"]
   launcher = settings_of(change(make_sweep(tmp_path / "sweep", 0), settings=plain)).launcher
   assert (launcher.partition, launcher.minutes, launcher.wait) == ("gpu-8", 60, False)
+
+
+def test_a_population_is_tried_again(tmp_path: Path) -> None:
+  keys = ["agent.learning_rate", "agent.entropy_cost"]
+  settings = ["launcher=together", "launcher.exploit_every=1", f"launcher.explore=[{','.join(keys)}]"]
+  launcher = settings_of(change(make_sweep(tmp_path / "sweep", 0), settings=settings)).launcher
+  assert isinstance(launcher, TogetherConfig) and list(launcher.explore) == keys
 
 
 @pytest.mark.parametrize("content", [None, [], "text", {"jobs": 3}, {"jobs": []}])
