@@ -257,8 +257,9 @@ class Loop:
     callbacks: of each agent, called with rows, states to keep and for whether to stop, which it does if all say so.
     population: lets agents learn from each other; None does not.
     train_s: device time of training alone.
-    first_update_s: that of one training step, by the first row.
-    first_update_at: when the first training step was done, on the clock of `time.perf_counter`.
+    first_update_s: device time of one training step, the mean over the first training call.
+    first_update_at: when the first training step was done, on the clock of `time.perf_counter`: when the first training
+      call began, plus `first_update_s`.
   """
 
   trainer: Trainer
@@ -292,18 +293,23 @@ class Loop:
       The last state, and whether the schedule was completed.
     """
     events = [event for event in self.events if update is None or event.update > update]
-    at, reported = update or 0, None
+    at, reported, initial = update or 0, None, None
     self._last_save = time.perf_counter()
     with ThreadPoolExecutor(1, thread_name_prefix="report") as reports:
       for event in events:
+        if not event.update:  # evaluated after the first training call, which need not wait for it
+          initial = event, self.trainer.place_policy(self.trainer.policy(state)), self._place(self.trainer.settings)
+          continue
         state, done = self._work(state, event, event.update - at)
-        at = event.update
+        results, at = [done], event.update
+        if initial:
+          results, initial = [self._evaluate_initial(*initial), done], None
         if reported:
           reported.result()  # one row is in flight; what went wrong with it stops the run here
         stop = any_process(all(each.should_stop() for each in self.callbacks)) and event is not events[-1]
         if stop:
           done.snapshot = self.functions.copy(state) if is_multiprocess() else state
-        reported = reports.submit(self._report, done)
+        reported = reports.submit(lambda results=results: [self._report(each) for each in results])
         if stop:
           break
       if reported:
@@ -329,22 +335,35 @@ class Loop:
         first = lambda i: self.trainer.agent(capture, i).first(shapes[0], action_size, shapes[1])
         done.captured = [first(i) for i in range(len(self.callbacks))]
     if event.evaluate:
-      start = time.perf_counter()
-      policy, key = self.trainer.policy(state), self._key(self._eval_key, event)
-      done.evaluated = self.functions.evaluate(policy, key, self.functions.eval_model, state.settings)
-      jax.block_until_ready(done.evaluated)
-      done.eval_s = time.perf_counter() - start
+      scores = self._evaluate(done, self.trainer.policy(state), state.settings)
       if self.population:
-        state, done.lineage = self._exchange(state, event, done.evaluated[0]["episode_reward"], self.population)
+        state, done.lineage = self._exchange(state, event, scores["episode_reward"], self.population)
     if event.reset:
       state = self.functions.reset(state, self._key(self._reset_key, event), self.functions.model)
     late = any_process(time.perf_counter() - self._last_save > SAVE_EVERY_S)
     due = late or event.evaluate or event is self.events[-1]
-    if due and event.update:
+    if due:
       # A copy, because the next training call takes the state's buffers over while this one is written to disk.
       done.snapshot = self.functions.copy(state)
       self._last_save = time.perf_counter()
     return state, done
+
+  def _evaluate_initial(self, event: ScheduleEvent, policy: Policy, settings: PyTree) -> SegmentResult:
+    """The evaluation before training; no agent has anything to learn from another one yet."""
+    done = SegmentResult(event, 0)
+    self._evaluate(done, policy, settings)
+    if self.population:
+      done.lineage = np.arange(len(self.callbacks)), jax.device_get(settings)
+    return done
+
+  def _evaluate(self, done: SegmentResult, policy: Policy, settings: PyTree) -> dict[str, jax.Array]:
+    """Evaluates a policy with the random numbers of an event; returns the scores."""
+    start = time.perf_counter()
+    key = self._key(self._eval_key, done.event)
+    done.evaluated = self.functions.evaluate(policy, key, self.functions.eval_model, settings)
+    jax.block_until_ready(done.evaluated)
+    done.eval_s = time.perf_counter() - start
+    return done.evaluated[0]
 
   def _exchange(
     self, state: TrainState, event: ScheduleEvent, returns: jax.Array, population: Population
@@ -352,7 +371,7 @@ class Loop:
     """Lets agents learn from each other, where it is time for that; the end of the run is not."""
     settings = jax.device_get(state.settings)
     count = sum(each.evaluate and 0 < each.update <= event.update for each in self.events)
-    if not event.update or event is self.events[-1] or count % population.exploit_every:
+    if event is self.events[-1] or count % population.exploit_every:
       return state, (np.arange(len(self.callbacks)), settings)
     lineage = population.exchange(np.asarray(returns), settings, event.update)
     return self.trainer.inherit(state, *lineage), lineage

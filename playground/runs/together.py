@@ -105,6 +105,7 @@ def _train_group(
       member.begin(
         RunCallbacks(config, member.run_dir, training.env, training.trainer, shown, interrupts, plan, training.drawn)
       )
+    progress.phase("training")
     loop = Loop(training.trainer, program, training.events, [config.seed for config in configs], members, population)
     state, completed = training.run(loop, plans, interrupts)
     state = jax.device_get(state)

@@ -202,6 +202,7 @@ def _train_locked(
       config, run_dir, training.env, training.trainer, progress, interrupts, plan, training.drawn
     )
     with contextlib.closing(callbacks):
+      progress.phase("training")
       loop = Loop(training.trainer, program, training.events, [config.seed], [callbacks])
       state, completed = training.run(loop, [plan], interrupts)
       callbacks.finish(loop, state, completed)

@@ -33,7 +33,7 @@ class RunFailedError(PlaygroundError):
 def startup(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float) -> None:
   """Rows `cold` and `warm`: the same command twice in fresh processes, its budget cut to the first update that learns.
 
-  Evaluation is compiled, and the one before training is run, as in any run.
+  Evaluation is compiled, too; the one before training runs after the first training call, as in any run.
   """
   del seconds  # this times one run as it is
   chosen = [f"env={task}", f"agent={agent}", *overrides]
@@ -44,7 +44,7 @@ def startup(facts: Facts, task: str, agent: str, overrides: list[str], seconds: 
       run = Path(folder) / name
       run_training([*chosen, *short, f"run_dir={run}"], without=_CACHES)
       manifest = RunDirectory(run).manifest
-      facts.update(facts_of(manifest), conditions="whole command, evaluations included, one update, a cache of its own")
+      facts.update(facts_of(manifest), conditions="whole command, evaluation compiled, one update, a cache of its own")
       for quantity in ("trace_s", "compile_s", "start_to_first_update_s"):
         facts.emit(quantity, manifest["timings"][quantity], "s", setting=" ".join((*overrides, name)))
 
