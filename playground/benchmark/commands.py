@@ -44,6 +44,24 @@ class Throughput(OfTasks):
 
 
 @dataclasses.dataclass(frozen=True)
+class Together(OfTasks):
+  """Training steps/s of several agents in one program (`launcher=together`), added up, on one device; memory."""
+
+  num_agents: Annotated[Sequence[int], counts(1), "numbers of agents; 1 is a run alone"] = (1, 5)
+
+  name = "together"
+
+  def jobs(self, devices: int) -> list[Measurement]:
+    jobs = []
+    for task in self.chosen():
+      for number in self.num_agents:
+        job = self.on_one_device(self.job("training", task, seeds=[1], num_agents=number))
+        columns = self.columns(task, self.agent, [f"num_agents={number}"])
+        jobs.append(dataclasses.replace(job, columns=columns))
+    return jobs
+
+
+@dataclasses.dataclass(frozen=True)
 class Startup(OfTasks):
   """From the command to the first update, with empty caches and again with full ones, evaluation compiled too."""
 
@@ -280,7 +298,7 @@ class Learning(BesidePeer, OfRuns):
 
 COMMANDS: dict[str, type[Measuring]] = {
   command.name: command
-  for command in (Throughput, Startup, Scaling, Breakdown, Pixels, Topology, Chain, Compare, Learning)
+  for command in (Throughput, Together, Startup, Scaling, Breakdown, Pixels, Topology, Chain, Compare, Learning)
 }
 
 

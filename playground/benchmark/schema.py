@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 from playground.errors import ConfigError
 
 COLUMNS = {
-  "benchmark": "the command, such as throughput, startup, topology, chain, compare, learning or golden",
+  "benchmark": "the command, such as throughput, together, startup, topology, chain, compare, learning or golden",
   "task": "the task's name, of a chain the experiment's",
   "agent": "ppo, ppo_paper or sac",
   "who": "ours, or the peer's name and version",
@@ -31,7 +31,7 @@ COLUMNS = {
 }
 
 QUANTITIES = {
-  "training_steps_per_s": "control steps (action repeats counted) trained on a second: collecting and learning",
+  "training_steps_per_s": "control steps (action repeats counted) a second, of all agents: collecting and learning",
   "env_steps_per_s": "control steps a second with random actions, episodes limited and reset, nothing learned",
   "trace_s": "tracing the run's functions in Python",
   "compile_s": "compiling them, side by side, after tracing; on a GPU Warp's kernels, too",

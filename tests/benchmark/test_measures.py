@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import jax
 import pandas as pd
 import pytest
 
@@ -49,6 +50,19 @@ def test_a_training(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
   assert all(row["value"] > 0 and row["backend"] == "jax" and row["devices"] == 1 for row in found)
   assert found[0]["conditions"] == "hyperparameters ppo/CartpoleBalance"
   assert "s timed after the first update" in found[-1]["conditions"]
+
+
+def test_agents_in_one_program_have_seeds_of_their_own(monkeypatch: pytest.MonkeyPatch):
+  from playground.benchmark.measures import subject
+
+  monkeypatch.setattr(registry, "load", lambda name, config: Point())
+  facts = Facts()
+  two = subject.Subject.build(facts, "CartpoleBalance", "ppo", SMALL, num_agents=2)
+  assert two.trainer.num_agents == 2
+  assert two.key(3).tolist() == [jax.random.PRNGKey(seed).tolist() for seed in (3, 4)]
+  plan = commands.Together(tasks=["CartpoleBalance"], num_agents=[1, 5])
+  settings = [(job.columns["setting"], job.arguments["num_agents"]) for job in plan.jobs(1)]
+  assert settings == [("num_agents=1", 1), ("num_agents=5", 5)]
 
 
 def test_rate_counts_all_of_the_time():
@@ -345,6 +359,7 @@ def test_every_measuring_command_runs(tmp_path: Path):
     "scaling": ["num_envs=8,32"],
     "topology": [two, "seeds=1", "devices=1,2", "hyperparameters=scaled", "num_timesteps=320", "agent.num_evals=2"],
     "startup": [],
+    "together": ["num_agents=1,2"],
   }
   for name, extra in given.items():
     command = [sys.executable, "-m", "playground.cli.bench", name, *small, *extra, f"out={tmp_path / name}.csv"]

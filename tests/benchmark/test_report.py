@@ -72,6 +72,8 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
     {"benchmark": "compare", "seed": 2, "value": 300.0, **speed},
     {"benchmark": "compare", "who": "playground 0.2.0", "seed": 1, "value": 150.0, **speed},
     {"benchmark": "startup", "setting": "cold", "quantity": "start_to_first_update_s", "value": 12.5},
+    {"benchmark": "together", "setting": "num_agents=1", "value": 1e4, **speed},
+    {"benchmark": "together", "setting": "num_agents=5", "value": 3.5e4, **speed},
     {"benchmark": "scaling", "setting": "agent.num_envs=64", "value": 1e4, **speed},
     {"benchmark": "scaling", "setting": "agent.num_envs=128", "value": 2e4, **speed},
     {"benchmark": "topology", "setting": "hardware.devices=1", "value": 1e4, **speed},
@@ -104,6 +106,8 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
   assert devices["1"] == ["fixed", "10,000", "1.00", "1.00", "6,000", "NVIDIA X"]  # 60 M steps are the task's own
   assert devices["2"] == ["scaled", "15,000", "1.50", "0.75", "4,000", "NVIDIA X"]
   assert devices["4"] == ["fixed", "30,000", "", "", "2,000", "NVIDIA Y"], "of another device than the one alone"
+  agents = [list(row[:4]) for row in table_with(blocks, "times one run").rows]
+  assert agents == [["CheetahRun", "1", "10,000", "1.00"], ["CheetahRun", "5", "35,000", "3.50"]]
   scores = [list(row[:5]) for row in table_with(blocks, "return of each run").rows]
   assert scores == [["CheetahRun", "ppo", "ours", "", "612.5"], ["CheetahRun", "ppo", "playground 0.2.0", "", "598.5"]]
   shares = table_with(blocks, "update (µs)").rows[0]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
-from jax.sharding import NamedSharding
+import numpy as np
 from jax.sharding import PartitionSpec as P
 
 from playground import registry
@@ -19,8 +19,9 @@ from playground.benchmark.worker import Facts
 from playground.config import RunConfig, compose
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
+from playground.hardware.mesh import put
 from playground.hardware.setup import Hardware, setup
-from playground.learning.trainer import Trainer
+from playground.learning.trainer import Trainer, trainer_settings
 from playground.pytree import PyTree
 from playground.runs.scaling import scale_envs
 from playground.runs.train import model_sampler
@@ -30,7 +31,11 @@ ONE_DEVICE = "hardware.devices=1"
 
 @dataclasses.dataclass
 class Subject:
-  """A task as `playground-run env=<task> agent=<agent> <overrides>` would train it."""
+  """A task as `playground-run env=<task> agent=<agent> <overrides>` would train it.
+
+  Attributes:
+    draw: (seed) -> randomised models of the training and of the evaluation; those of several agents from its seed on.
+  """
 
   config: RunConfig
   hardware: Hardware
@@ -39,16 +44,22 @@ class Subject:
   draw: Callable[[int], tuple[ModelFields, ModelFields]]
 
   @classmethod
-  def build(cls, facts: Facts, task: str, agent: str, overrides: Sequence[str]) -> "Subject":
-    """Builds it and fills in the facts that its rows share."""
+  def build(cls, facts: Facts, task: str, agent: str, overrides: Sequence[str], num_agents: int = 1) -> "Subject":
+    """Builds it, one run or several agents in one program, and fills in the facts that its rows share."""
     config = compose([f"env={task}", f"agent={agent}", *overrides])
     hardware = setup(config.hardware)
     if config.hardware.scale_envs:
       config, _ = scale_envs(config, hardware.mesh.size)
     settings = config.agent
     env = registry.load(task, config=config.env)
-    draw = model_sampler(env, config, settings.num_envs, settings.num_eval_envs)
-    trainer = Trainer(env, settings, hardware.mesh, hardware.network_precision)
+    sample = model_sampler(env, config, settings.num_envs, settings.num_eval_envs)
+    each = trainer_settings(settings, env.settings_of(env.config))
+    several = [each] * num_agents if num_agents > 1 else ()
+    trainer = Trainer(env, settings, hardware.mesh, hardware.network_precision, several)
+
+    def draw(seed: int) -> tuple[ModelFields, ModelFields]:
+      return trainer.join([sample(seed + i) for i in range(num_agents)])
+
     facts.update(
       backend=env.impl,
       devices=hardware.mesh.size,
@@ -65,8 +76,9 @@ class Subject:
     return self.draw(self.config.seed)[0]
 
   def key(self, seed: int) -> jax.Array:
-    """A random key, on all devices."""
-    return jax.device_put(jax.random.PRNGKey(seed), NamedSharding(self.hardware.mesh, P()))
+    """A random key, on all devices; of several agents one each."""
+    keys = [np.asarray(jax.random.PRNGKey(seed + i)) for i in range(max(self.trainer.num_agents, 1))]
+    return put(self.trainer.join(keys), self.trainer.mesh, P())
 
 
 def told(overrides: Sequence[str]) -> list[str]:

@@ -21,6 +21,7 @@ def measure(
   seeds: list[int],
   seconds: float,
   watch_memory: bool = False,
+  num_agents: int = 1,
 ) -> None:
   """Rows for compile time, time to the first update and memory, and for each seed the steps a second.
 
@@ -35,9 +36,10 @@ def measure(
     seeds: of the trainings.
     seconds: how long to time each, at least one update.
     watch_memory: ask the GPU's driver, too, how much is in use.
+    num_agents: how many train in one program, each from a seed of its own; their steps are added up.
   """
   with used_memory(facts, seeds[0]) if watch_memory else nullcontext():
-    subject = Subject.build(facts, task, agent, overrides)
+    subject = Subject.build(facts, task, agent, overrides, num_agents)
     trainer, conditions = subject.trainer, facts["conditions"]
     no_evaluation = jax.jit(lambda policy, key, model, settings: ())
     program = compile_program(trainer, no_evaluation, partial(subject.draw, seeds[0]))
@@ -58,7 +60,7 @@ def measure(
         jax.block_until_ready(train(warm_up))
         if seed == seeds[0] and facts.lock is None:  # with a lock, waiting for it would be in the time
           facts.emit("start_to_first_update_s", process_age_s(), "s", seed=seed)
-        speed, timed = rate(train, trainer.steps_per_update, seconds)
+        speed, timed = rate(train, trainer.steps_per_update * num_agents, seconds)
       how = f"{timed:.1f} s timed after the first update, no evaluation, no outer resets"
       facts.emit("training_steps_per_s", speed, "steps/s", seed=seed, conditions=f"{conditions}; {how}")
     emit_peak(facts, seed=seeds[0])

@@ -18,7 +18,7 @@ ROWS = ("results/reference", "results/benchmarks")
 PICTURES = "report_pictures"
 TITLE = "Measured"
 SECTIONS = (
-  *(sections.throughput, sections.compared, sections.startup, sections.scaling),
+  *(sections.throughput, sections.compared, sections.together, sections.startup, sections.scaling),
   *(sections.topology, sections.breakdown, pixels, sections.chains, sections.returns, beside_public),
 )
 

@@ -148,6 +148,22 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   yield Table(["task", "", "environments", "steps/s", "memory (GiB)", "device", "note"], sorted(rows, key=order))
 
 
+def together(evidence: Evidence, notes: Notes) -> Iterable[Block]:
+  """Several agents in one program beside one run."""
+  yield Heading(2, "Agents in one program")
+  agents = lambda figure: int(figure["setting"].rpartition("num_agents=")[2])
+  found = evidence.find(benchmark="together", who="ours", quantity=SPEED)
+  rows = []
+  for figure in sorted(found, key=agents):
+    same = lambda other, figure=figure: all(other[name] == figure[name] for name in ("source", "device", "commit"))
+    task, device, note = _named(figure, "num_agents="), figure["device"], notes.number(figure)
+    one = [each for each in found if agents(each) == 1 and _named(each, "num_agents=") == task and same(each)]
+    times = f"{figure.mean / one[0].mean:.2f}" if one else ""
+    rows.append([task, str(agents(figure)), _with_ci(figure), times, device, note])
+  columns = ["task", "agents", "steps/s of all", "times one run", "device", "note"]
+  yield Table(columns, sorted(rows, key=lambda row: row[0])) if rows else nothing("together")
+
+
 def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   """One device and several: rates and what they make of a budget, then whole runs."""
   yield Heading(2, "Devices")
