@@ -11,8 +11,10 @@ INSTALLED := .venv/.installed
 # `make test-slow` tests what users run.
 CACHES := JAX_COMPILATION_CACHE_DIR="$(CURDIR)/.pytest_cache/xla" WARP_CACHE_PATH="$(CURDIR)/.pytest_cache/warp" \
   JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES=-1
-FAST_COMPILE := XLA_FLAGS="--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true \
-  --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 $$XLA_FLAGS"
+FAST_COMPILE = XLA_FLAGS="--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true \
+  --xla_cpu_parallel_codegen_split_count=1 $(OLD_FLAGS) $$XLA_FLAGS"
+# JAX 0.11, which is for Python 3.12 and newer, has lost this one, and XLA ends a process over a flag it does not know.
+OLD_FLAGS = $(shell $(BIN)/python -c 'import sys; sys.version_info < (3, 12) and print("--xla_cpu_use_fusion_emitters=false")')
 
 .DEFAULT_GOAL := setup
 .PHONY: setup run test test-slow test-rsl-rl test-slurm lint catalog docs wheel

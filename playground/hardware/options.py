@@ -49,5 +49,7 @@ class HardwareConfig:
   cache_dir: Annotated[
     str | None, "folder of compiled programs, of this command alone (docs/security.md); null is ~/.cache/playground"
   ] = None
-  xla_flags: Annotated[str, "added to XLA_FLAGS: switches and numbers, such as --xla_gpu_deterministic_ops=true"] = ""
+  xla_flags: Annotated[
+    str, "added to XLA_FLAGS, but for those that JAX removed: switches and numbers (--xla_gpu_deterministic_ops=true)"
+  ] = ""
   distributed: Annotated[DistributedConfig, "several machines"] = dataclasses.field(default_factory=DistributedConfig)

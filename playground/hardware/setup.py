@@ -1,6 +1,7 @@
 """From the `hardware` config to devices: platform, precision, memory and compilation caches."""
 
 import dataclasses
+import math
 import os
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from playground.hardware.mesh import make_mesh
 from playground.hardware.options import HardwareConfig, Platform
 
 CACHE = Path("~/.cache/playground")
+# Flags by the first version of JAX without them: XLA ends the process over a flag that it does not know.
+_REMOVED_FLAGS = {"--xla_cpu_use_fusion_emitters": (0, 11)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,8 +83,11 @@ def _environment(config: HardwareConfig) -> None:
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", str(bool(config.preallocate)).lower())
   if config.memory_fraction is not None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", str(config.memory_fraction))
-  if config.xla_flags and config.xla_flags not in os.environ.get("XLA_FLAGS", ""):  # a chain comes here often
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {config.xla_flags}".strip()
+  known = lambda flag: jax.__version_info__ < _REMOVED_FLAGS.get(flag.partition("=")[0], (math.inf,))
+  exported = os.environ.get("XLA_FLAGS", "").split()
+  added = [flag for flag in config.xla_flags.split() if known(flag) and flag not in exported]
+  if added:  # a chain comes here often
+    os.environ["XLA_FLAGS"] = " ".join([*exported, *added])
 
 
 def _caches(config: HardwareConfig) -> str | None:

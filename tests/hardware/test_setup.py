@@ -93,6 +93,16 @@ def test_what_cannot_be_had_is_one_sentence(changes: dict[str, Any], error: type
   assert all(word in str(caught.value) for word in words)
 
 
+def test_flags_that_this_jax_has_no_more_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setenv("XLA_FLAGS", "--xla_exported=1")
+  config = hardware(xla_flags="--xla_cpu_use_fusion_emitters=false --xla_given=2", devices=99)
+  for version, flags in (((0, 11, 2), []), ((0, 10, 2), ["--xla_cpu_use_fusion_emitters=false"])):
+    monkeypatch.setattr("jax.__version_info__", version)
+    with pytest.raises(HardwareError):
+      setup(config)
+    assert os.environ["XLA_FLAGS"].split() == ["--xla_exported=1", "--xla_given=2", *flags]
+
+
 @pytest.mark.parametrize("preset", [name for name in options("hardware") if "_x" in name])
 def test_presets_are_named_after_their_devices(preset: str) -> None:
   kind, _, count = preset.rpartition("_x")
