@@ -18,8 +18,8 @@ LINE = ["env=CartpoleBalance", "seed=1,2", "tuned=null", "debug=fast", "hardware
 LINE += [f"agent.num_timesteps={STEPS}", "agent.num_evals=5", "launcher.cores_per_job=1"]
 
 
-def start(folder: Path) -> "subprocess.Popen[str]":
-  command = [sys.executable, "-m", "playground.cli.run", "-m", *LINE]
+def start(folder: Path, *overrides: str) -> "subprocess.Popen[str]":
+  command = [sys.executable, "-m", "playground.cli.run", "-m", *LINE, *overrides]
   env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
   return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
@@ -53,3 +53,33 @@ def test_interrupted_and_started_again(tmp_path: Path) -> None:
   assert (sweep / "report.html").stat().st_size > 20_000
   logs = [path.read_text() for path in sweep.rglob("job.log")]
   assert any("Resuming the whole training state" in log for log in logs)  # the other may not have come to save yet
+
+
+def test_a_group_that_is_killed_loses_nothing(tmp_path: Path) -> None:
+  def group(folder: Path) -> "subprocess.Popen[str]":
+    return start(tmp_path, "launcher=together", f"sweep_dir={folder}", f"hardware.cache_dir={tmp_path / 'cache'}")
+
+  def saved(job: Path) -> list[int]:
+    return sorted(int(path.name) for path in (job / "checkpoints").glob("*") if path.name.isdigit())
+
+  def rows(job: Path, to: int) -> pd.DataFrame:
+    return pd.read_csv(job / "metrics.csv").filter(regex="^(?!time/)").query(f"step <= {to}")
+
+  whole, killed = tmp_path / "whole", tmp_path / "killed"
+  assert group(whole).wait(900) == 0
+  process, until = group(killed), time.monotonic() + 600
+  jobs = lambda: sorted((killed / "jobs").glob("*"))
+  while not jobs() or not all(saved(job) for job in jobs()):
+    assert process.poll() is None and time.monotonic() < until
+    time.sleep(0.02)
+  os.kill(json.loads((jobs()[0] / "job.json").read_text())["job_pid"], signal.SIGKILL)
+  out, _ = process.communicate(timeout=120)
+  assert process.returncode == 2 and out.count("killed by SIGKILL") == 2, out
+  newest = [saved(job)[-1] for job in jobs()]
+
+  assert group(killed).wait(900) == 0
+  for job, step in zip(jobs(), newest, strict=True):
+    # After a kill between two saves the agents stand at different steps, train apart, and end the same to rounding.
+    to = STEPS if len(set(newest)) == 1 else step
+    pd.testing.assert_frame_equal(rows(job, to), rows(whole / "jobs" / job.name, to), check_like=True)
+    assert json.loads((job / "summary.json").read_text())["steps"] == STEPS
