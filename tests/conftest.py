@@ -52,9 +52,13 @@ def trusted_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def nothing_stored(monkeypatch: pytest.MonkeyPatch) -> None:
-  """A stored program is found by the code in files, which is not what runs where a test replaces some of it."""
-  monkeypatch.setattr("playground.runs.train.stored_program", lambda *_, **__: None)
+def nothing_stored(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+  """A stored program is found by the code in files, which is not what runs where a test replaces some of it.
+
+  Tests that are marked `stored_programs` replace nothing that is traced: what one of them compiled, others load.
+  """
+  if not request.node.get_closest_marker("stored_programs"):
+    monkeypatch.setattr("playground.runs.train.stored_program", lambda *_, **__: None)
 
 
 @pytest.fixture(autouse=True)

@@ -8,13 +8,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 COMMAND = "from playground.cli.run import main; main()"
+# For a process that does not use Warp, as where it is not installed: its import is most of the time that MJX's takes.
+WITHOUT_WARP = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests" / "without_warp")])}
 
 
 def start(script: str, folder: Path, *overrides: str, devices: int = 1) -> "subprocess.Popen[str]":
   """Starts a Python script in `folder`, with its arguments, on so many devices."""
   simulated = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu"}
   command = [sys.executable, "-c", script, *overrides]
-  env = os.environ | simulated | {"PYTHONPATH": str(ROOT)}
+  env = os.environ | simulated | WITHOUT_WARP
   return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 

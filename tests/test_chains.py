@@ -108,8 +108,14 @@ def test_every_chain_we_ship_composes(experiment: str):
   stages = shipped(experiment).stages
   assert len(stages) > 1
   assert all(stage.choices["tuned"] == f"ppo/{stage.choices['env']}" for stage in stages)
+
+
+@pytest.mark.parametrize(
+  "experiment", [CHAINS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in CHAINS[1:])]
+)
+def test_a_chain_is_small_with_debug_fast(experiment: str):
   tiny = compose([f"experiment={experiment}", "debug=fast"]).stages
-  assert [stage.agent.num_timesteps for stage in tiny] == [320] * len(stages)
+  assert [stage.agent.num_timesteps for stage in tiny] == [320] * len(tiny)
 
 
 def test_every_chain_has_an_experiment():

@@ -20,6 +20,7 @@ from playground.errors import ConfigError, PlaygroundError, UnknownNameError
 from playground.registry import names
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from tests.dummy import Point
+from tests.processes import WITHOUT_WARP
 
 SHORT = {"episode_length": 5}
 
@@ -53,7 +54,8 @@ def test_gymnasium_finds_nothing_to_complain_about(env: GymEnv) -> None:
 def test_renders_without_a_screen(end: str) -> None:
   if find_gl() is None:
     pytest.skip(NO_GL_REMEDY)
-  headless = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")} | {"JAX_PLATFORMS": "cpu"}
+  others = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
+  headless = others | WITHOUT_WARP | {"JAX_PLATFORMS": "cpu"}
   done = subprocess.run([sys.executable, "-c", RENDER + end], env=headless, capture_output=True, text=True)
   assert (done.returncode, done.stderr) == (0, "")
 

@@ -1,6 +1,7 @@
 """Who may connect to the viewer in the browser and what that may say: a real server, and websocket clients."""
 
 import http.client
+import os
 import re
 import signal
 import socket
@@ -27,6 +28,7 @@ from playground.deploy.web.server import Watch
 from tests.command import caller
 from tests.deploy.test_web import browser, eventually, running
 from tests.deploy.untrained import UntrainedRun, free_port
+from tests.processes import WITHOUT_WARP
 
 CAMERA = {
   "type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [1, 1, 1], "fov": 1.0, "near": 0.1, "far": 10.0,
@@ -223,7 +225,8 @@ def test_requests_without_end_do_not_stop_time(watch: Watch) -> None:
 def test_a_signal_ends_it_whatever_its_clients_say(run: Path, signum: signal.Signals) -> None:
   port = free_port()
   command = [sys.executable, "-m", "playground.cli.main", "play", str(run), "--web", "--port", str(port)]
-  with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+  env = os.environ | WITHOUT_WARP
+  with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env) as process:
     try:
       assert process.stdout is not None
       assert any(f"http://127.0.0.1:{port}/" in line and "ctrl+c" in line for line in process.stdout)

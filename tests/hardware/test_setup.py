@@ -4,7 +4,6 @@ import dataclasses
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +13,7 @@ from playground.config import compose, config_roots, options
 from playground.errors import HardwareError
 from playground.hardware.options import HardwareConfig
 from playground.hardware.setup import setup
+from tests.processes import ROOT, WITHOUT_WARP
 
 TWO_DEVICES = """
 import jax, numpy as np
@@ -113,7 +113,8 @@ def test_presets_are_named_after_their_devices(preset: str) -> None:
 
 def test_more_than_there_are_is_one_sentence() -> None:
   command = [sys.executable, "-m", "playground.cli.run", "hardware=gpu_x2", "hardware.platform=auto", "debug=fast"]
-  done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"JAX_PLATFORMS": "cpu"}, timeout=120)
+  env = os.environ | WITHOUT_WARP | {"JAX_PLATFORMS": "cpu"}
+  done = subprocess.run(command, capture_output=True, text=True, env=env, timeout=120)
   assert done.returncode == 2
   assert done.stderr.splitlines()[-1] == "error: hardware.devices=2, but this machine has 1 (cpu)."
 
@@ -130,8 +131,8 @@ def test_training_over_two_devices(code: str) -> None:
   simulated = {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
   done = subprocess.run(
     [sys.executable, "-c", code],
-    cwd=Path(__file__).parents[2],
-    env=os.environ | simulated,
+    cwd=ROOT,
+    env=os.environ | WITHOUT_WARP | simulated,
     capture_output=True,
     text=True,
     timeout=300,

@@ -79,7 +79,7 @@ def test_checkpoints_go_on_on_another_topology(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", ["point", pytest.param("cart and pole", marks=pytest.mark.slow)])
 def test_two_processes_are_one_training(task: str, tmp_path: Path) -> None:
-  """Two devices each: the same parameters everywhere, one run directory, one process's return curve."""
+  """Two devices each: the same parameters everywhere, one run directory; of the cart one process's return curve."""
   params = "{field:dof_damping,target:all,operation:scale,range:[0.5,2.0]}"
   damping = f"env.events.damping={{mode:startup,func:model_field,params:{params}}}"
   line = [*LINE, "agent.num_timesteps=640", "agent.num_evals=3", "run_dir=run"]
@@ -93,14 +93,16 @@ def test_two_processes_are_one_training(task: str, tmp_path: Path) -> None:
   assert (summary["status"], summary["steps"], summary["params_sha256"]) == ("finished", 640, ours)
   assert [path.name for path in tmp_path.iterdir()] == ["run"]
   assert "finished" not in second and "metrics" not in second, "only process 0 reports"
+  curve = pd.read_csv(tmp_path / "run/metrics.csv")["eval/episode_reward"].dropna().to_numpy()
+  assert len(set(curve)) == 3, "the policy changes"
+  if task == "point":
+    return
 
   alone = start(script, tmp_path, *line, "hardware=cpu", "hardware.devices=4", "run_dir=alone", devices=4)
   out, _ = alone.communicate(timeout=800)
   assert alone.returncode == 0, out[-3000:]
-  tables = [pd.read_csv(tmp_path / run / "metrics.csv") for run in ("run", "alone")]
-  curve, its = (table["eval/episode_reward"].dropna().to_numpy() for table in tables)
+  its = pd.read_csv(tmp_path / "alone/metrics.csv")["eval/episode_reward"].dropna().to_numpy()
   np.testing.assert_allclose(curve, its, atol=0.01)
-  assert len(set(curve)) == 3, "the policy changes"
 
 
 # What cannot be

@@ -155,17 +155,17 @@ def test_targets_of_the_first_epoch_are_those_of_the_first_minibatch(networks: A
 
 def test_an_epoch_that_goes_too_far_is_the_last() -> None:
   trainers = [
-    point_trainer(dataclasses.replace(SMALL_PPO, num_updates_per_batch=count, learning_rate=0.05, max_kl=limit))
-    for count, limit in ((3, 1e-6), (1, None), (3, 1e9))
+    point_trainer(dataclasses.replace(SMALL_PPO, num_updates_per_batch=3, learning_rate=0.05, max_kl=limit))
+    for limit in (1e-6, 1e9)
   ]
   first, metrics = [], []
   for trainer in trainers:
     state, log = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings), {}, np.int32(1))
     first.append(jax.device_get(trainer.policy(state).params))
     metrics.append(log)
-  assert (float(metrics[0]["stopped_early"]), float(metrics[2]["stopped_early"])) == (1, 0)
+  assert [float(log["stopped_early"]) for log in metrics] == [1, 0]
   same = lambda a, b: all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-  assert not same(first[0], first[2]), "with room all three epochs count"
+  assert not same(*first), "with room all three epochs count"
 
 
 def test_all_of_them_learn_and_resume_bit_for_bit() -> None:

@@ -1,6 +1,7 @@
 """Training as a whole, with every algorithm, on a task that compiles in seconds."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -29,6 +30,7 @@ from tests.dummy import (
   numbers,
   point_trainer,
 )
+from tests.processes import WITHOUT_WARP
 
 
 def algorithms(*fast: str) -> pytest.MarkDecorator:
@@ -129,7 +131,7 @@ def test_nan_in_first_observations_is_counted_and_kept_from_what_is_learned(conf
     assert np.isfinite(leaf).all()
 
 
-@every_algorithm
+@two_of_them
 def test_nan_is_counted_captured_and_kept_from_the_parameters(config: Config) -> None:
   callbacks = Recorder()
   state, _ = run(config, callbacks, updates=8, nan_at=3)
@@ -177,7 +179,7 @@ def test_a_mean_over_nothing_is_left_out(config: Config) -> None:
 
 def test_no_torch_is_imported() -> None:
   code = "import sys, playground.runs.train, playground.cli.main; assert not {'torch', 'rsl_rl'} & set(sys.modules)"
-  subprocess.run([sys.executable, "-c", code], check=True)
+  subprocess.run([sys.executable, "-c", code], env=os.environ | WITHOUT_WARP, check=True)
 
 
 class Weighted(PointTask):
@@ -196,7 +198,7 @@ class Weighted(PointTask):
     return state.replace(reward=sum(self.rewards.compute(c).values(), state.reward))
 
 
-@two_of_them
+@algorithms("ppo")
 def test_agents_of_one_program_end_as_they_do_alone(config: Config) -> None:
   faster = dataclasses.replace(config, learning_rate=2 * config.learning_rate)
   agents = [(config, 0.1, 3), (faster, 0.1, 3), (config, 0.1, 4), (config, -0.5, 3)]

@@ -8,6 +8,8 @@ import textwrap
 import tomllib
 from pathlib import Path
 
+from tests.processes import WITHOUT_WARP
+
 PACKAGES = Path(__file__).parent
 
 
@@ -28,7 +30,7 @@ def install(package: Path, site: Path) -> Path:
 
 def run(site: Path, *command: str, cwd: Path | None = None) -> str:
   """Runs Python with the folder's packages installed, `-c code` or `-m module ...`; returns what it prints."""
-  path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
+  path = os.pathsep.join([str(site), WITHOUT_WARP["PYTHONPATH"]])
   command = tuple(textwrap.dedent(word) for word in command)
   env = {**os.environ, "PYTHONPATH": path}
   done = subprocess.run([sys.executable, *command], env=env, cwd=cwd, capture_output=True, text=True)

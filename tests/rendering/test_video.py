@@ -16,6 +16,7 @@ from playground import registry
 from playground.rendering import gl, video
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.rendering.video import choose_camera, frame_stride, render_video
+from tests.processes import WITHOUT_WARP
 
 XML = """
 <mujoco>
@@ -184,7 +185,7 @@ def test_the_renderer_dies_with_a_run_that_is_killed(tmp_path: Path, needs_gl: s
   scratch.mkdir()
   run = subprocess.Popen(
     [sys.executable, "-c", ENDLESS, str(tmp_path / "videos/a.mp4")],
-    env={**os.environ, "TMPDIR": str(scratch), "JAX_PLATFORMS": "cpu"},
+    env={**os.environ, **WITHOUT_WARP, "TMPDIR": str(scratch), "JAX_PLATFORMS": "cpu"},
   )
   try:
     until(lambda: any("ffmpeg" in command for command in commands(scratch).values()))  # it draws and encodes

@@ -23,6 +23,7 @@ from tests.dummy import Point
 
 FAST = ["env=CartpoleBalance", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv"]
 STEPS = 1600
+pytestmark = pytest.mark.stored_programs
 LONG = [*FAST, f"agent.num_timesteps={STEPS}", "agent.num_evals=5"]
 
 

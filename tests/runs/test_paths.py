@@ -110,6 +110,7 @@ def test_a_sweep_dir_of_any_name() -> None:
     assert compose_settings([f"sweep_dir={quoted(shape)}"]).sweep_dir == shape
 
 
+@pytest.mark.stored_programs
 @pytest.mark.parametrize("shape", [ALL, *(pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES)])
 def test_a_run_a_sweep_and_what_reads_them(
   shape: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -21,6 +21,7 @@ from tests.runs.helpers import TASK, resume
 STEPS = 2000
 EFFORT = "env.rewards.action_l2.weight"
 BUDGET = [*TASK, f"agent.num_timesteps={STEPS}", "agent.num_evals=3", f"{EFFORT}=-0.1"]
+pytestmark = pytest.mark.stored_programs
 AGENTS = {"a": ["seed=1"], "b": ["seed=2"], "c": ["seed=1", "agent.learning_rate=3e-3", f"{EFFORT}=-0.5"]}
 
 

@@ -32,13 +32,15 @@ from playground.runs import train as train_module
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import cut_short, train
+from tests.processes import WITHOUT_WARP
 from tests.runs.helpers import TASK, resume
 
 BATCH = 80  # environment steps of one training step with debug=fast
-STEPS = 400_000  # seconds of training, so that a signal finds the run at work
+STEPS = 240_000  # seconds of training, so that a signal finds the run at work
 LONG = [*TASK, f"agent.num_timesteps={STEPS - 10}", "agent.num_evals=5"]  # a checkpoint every quarter
 COMMAND = [sys.executable, "-c", "from playground.cli.run import main; main()"]
 slow = functools.partial(pytest.param, marks=pytest.mark.slow)
+pytestmark = pytest.mark.stored_programs
 
 
 def start(run: Path, cache: Path, *overrides: str, resumed: bool = False) -> "subprocess.Popen[str]":
@@ -46,7 +48,7 @@ def start(run: Path, cache: Path, *overrides: str, resumed: bool = False) -> "su
   log = run.with_suffix(".log").open("w")
   what = [f"resume={run}"] if resumed else [*LONG, f"run_dir={run}"]
   args = [*COMMAND, *what, f"hardware.cache_dir={cache}", *overrides]
-  env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+  env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | WITHOUT_WARP
   return subprocess.Popen(args, stdout=log, stderr=subprocess.STDOUT, text=True, env=env)
 
 

@@ -14,6 +14,7 @@ from playground.errors import ConfigError
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import LocalLauncher
 from playground.sweep.together import TogetherLauncher
+from tests.processes import WITHOUT_WARP
 from tests.runs.helpers import TASK
 
 
@@ -89,6 +90,7 @@ def test_what_is_no_population(jobs: list[str], settings: dict[str, Any], messag
 def test_a_sweep_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   sweep = ["-m", *TASK, "agent.num_timesteps=200", "seed=1,2", "launcher=together", f"sweep_dir={tmp_path / 'sweep'}"]
   monkeypatch.setattr("sys.argv", ["playground-run", *sweep])
+  monkeypatch.setenv("PYTHONPATH", WITHOUT_WARP["PYTHONPATH"])
   with pytest.raises(SystemExit) as exit_:
     main()
   assert exit_.value.code == 0

@@ -13,7 +13,8 @@ FIGURES = {
   for path in sorted(_DOMAINS.glob("*.xml"))
   if path.stem != "looks"
 }  # domain to file
-COSTLY = ("cheetah", "finger", "fish", "humanoid", "swimmer", "walker")  # `make test-slow` compiles their physics
+# `make test-slow` compiles their physics.
+COSTLY = ("cheetah", "finger", "fish", "hopper", "humanoid", "swimmer", "walker")
 DOMAIN = {env["name"]: domain for domain, file in FIGURES.items() for env in figures(file)["envs"]}  # of every task
 
 
