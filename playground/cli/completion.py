@@ -14,7 +14,7 @@ from playground.settings import Plain, Section
 
 PROGRAMS = ("playground", "playground-run")
 _FLAGS = ("-m", "--multirun", "--cfg", "--help", "--verbose", "--version", "--package")
-_OF_TASKS = ("task", "policy", "word", "run")  # positional arguments that a task can be
+_OF_TASKS = ("task", "policy", "word", "path")  # positional arguments that a task can be
 _SCRIPTS = {
   "bash": """\
 _playground() {

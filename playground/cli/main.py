@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from playground import __version__, registry
@@ -31,6 +32,7 @@ _PROGRAMS = {
 }
 _RUN = "run directory, checkpoint, a task for its pretrained policy, or wandb:<entity>/<project>/<run>"
 _CAMERA = "camera of --video (default: one that shows the whole scene)"
+Command = Callable[[argparse.Namespace], int]  # returns the exit code
 
 
 def main() -> None:
@@ -79,10 +81,10 @@ def _parser() -> argparse.ArgumentParser:
   parser.add_argument("--version", action="version", version=version, help="print the version")
   commands = parser.add_subparsers(required=True, metavar="command")
 
-  def add(name: str, command: Any, what: str) -> argparse.ArgumentParser:
+  def add(name: str, command: Command | str, what: str) -> argparse.ArgumentParser:
     sub = commands.add_parser(name, help=what, description=what)
     sub.add_argument("--version", action="version", version=version, help=argparse.SUPPRESS)
-    sub.set_defaults(command=command, trust=[])
+    sub.set_defaults(command=_call(command) if isinstance(command, str) else command, trust=[])
     return sub
 
   for name, (_, what) in _PROGRAMS.items():
@@ -93,20 +95,20 @@ def _parser() -> argparse.ArgumentParser:
   for name in ("suite", "robot", "status", "backend"):
     tasks.add_argument(f"--{name}", metavar="NAME", help=f"only tasks of this {name}")
   tasks.add_argument("--json", action="store_true", help="print JSON instead of a table")
-  show = add("show", _show, "Show a task's observations, rewards, terminations, events and hyperparameters.")
+  show = add("show", "cli.show:show", "Show a task's observations, rewards, terminations, events and hyperparameters.")
   show.add_argument("task", help="a task, or randomization=<name> for its events")
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
   show.add_argument("--views", metavar="FILE", help="write images of its camera on randomised models instead")
   show.add_argument("--num-views", type=int, default=16, help="randomised models of --views (default: %(default)s)")
-  keys = add("keys", _keys, "Explain a section's or group's keys: value, allowed values and meaning.")
+  keys = add("keys", "cli.keys:show_keys", "Explain a section's or group's keys: value, allowed values and meaning.")
   keys.add_argument("prefix", help="such as agent, env.rewards, hardware.platform or tracking")
   keys.add_argument("overrides", nargs="*", help="as for playground-run, such as env=Go1Getup or agent=sac")
   completion = add("completion", _completion, "Print a script that completes our commands in a shell.")
   completion.add_argument("shell", choices=("bash", "zsh", "fish", "query"), help="eval it in the shell's start file")
   completion.add_argument("line", nargs="?", default="", help=argparse.SUPPRESS)  # of query, which the scripts call
-  add("doctor", _doctor, "Check this machine: backend, versions, rendering, caches, missing packages.")
-  evaluate = add("eval", _eval, "Evaluate a run's newest checkpoint, or the one given.")
-  evaluate.add_argument("run", help=_RUN)
+  add("doctor", "cli.doctor:doctor", "Check this machine: backend, versions, rendering, caches, missing packages.")
+  evaluate = add("eval", "cli.eval:evaluate_run", "Evaluate a run's newest checkpoint, or the one given.")
+  evaluate.add_argument("path", metavar="run", help=_RUN)
   evaluate.add_argument("--episodes", type=int, help="episodes to run (default: the run's agent.num_eval_envs)")
   evaluate.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
   evaluate.add_argument(
@@ -114,21 +116,18 @@ def _parser() -> argparse.ArgumentParser:
   )
   evaluate.add_argument("--video", metavar="FILE", help="also render an episode to this .mp4")
   evaluate.add_argument("--camera", metavar="NAME", help=_CAMERA)
-  export = add("export", _export, "Write a run's policy as ONNX, with the contract that a controller needs.")
-  export.add_argument("run", help=_RUN)
+  export = add(
+    "export", "deploy.export:export_run", "Write a run's policy as ONNX, with the contract that a controller needs."
+  )
+  export.add_argument("path", metavar="run", help=_RUN)
   export.add_argument("--out", metavar="FOLDER", help="folder to write to (default: <run>/export)")
   play = add("play", _play, "Run a policy in plain C MuJoCo: measure it, film it or watch it.")
   play.add_argument("policy", help=f"{_RUN}, or a policy.onnx beside its policy.yaml")
   play.add_argument("--agent", choices=("zero", "random"), help="act so on a task instead of with a policy")
   play.add_argument("--episodes", type=int, default=10, help="episodes to measure (default: %(default)s)")
   play.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
-  shown = play.add_mutually_exclusive_group()
-  shown.add_argument("--video", metavar="FILE", help="also render an episode to this .mp4")
-  shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
+  shown = _add_places(play, "also render an episode to this .mp4")
   shown.add_argument("--web", action="store_true", help="show it in the browser instead")
-  play.add_argument("--camera", metavar="NAME", help=_CAMERA)
-  play.add_argument("--host", default="127.0.0.1", help="address that --web listens on (default: %(default)s)")
-  play.add_argument("--port", type=int, default=8080, help="port of --web (default: %(default)s)")
   view = add("view", _view, "Look at a task without a policy, in the browser.")
   view.add_argument("task", help="a task of `playground list`")
   view.add_argument("overrides", nargs="*", help="as for playground-run, such as terrain=stairs")
@@ -138,12 +137,7 @@ def _parser() -> argparse.ArgumentParser:
   view.add_argument("--randomize", action="store_true", help="draw the model by the task's startup events")
   view.add_argument("--no-events", action="store_true", help="switch pushes and other interval events off")
   view.add_argument("--seed", type=int, default=0, help="seed of episodes and model (default: %(default)s)")
-  shown = view.add_mutually_exclusive_group()
-  shown.add_argument("--video", metavar="FILE", help="render an episode to this .mp4 instead")
-  shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
-  view.add_argument("--camera", metavar="NAME", help=_CAMERA)
-  view.add_argument("--host", default="127.0.0.1", help="address of the page (default: %(default)s)")
-  view.add_argument("--port", type=int, default=8080, help="port of the page (default: %(default)s)")
+  _add_places(view, "render an episode to this .mp4 instead")
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
   pretrained.add_argument("--add", metavar="RUN", help="measure a run's policy in C MuJoCo and put it into the package")
   pretrained.add_argument(
@@ -157,19 +151,48 @@ def _parser() -> argparse.ArgumentParser:
   )
   sweep.add_argument("folder", help="folder of the sweep")
   sweep.add_argument("overrides", nargs="*", help="for retry, such as launcher=slurm or launcher.slots_per_gpu=2")
-  tune = add("tune-buffers", _tune_buffers, "Measure how large Warp's buffers must be for a task.")
+  tune = add("tune-buffers", "cli.tune_buffers:tune_buffers", "Measure how large Warp's buffers must be for a task.")
   tune.add_argument("task", help="a task of `playground list`")
   tune.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or agent.num_envs=4096")
   tune.add_argument("--run", help="a run or checkpoint whose policy acts, beside random actions")
   tune.add_argument("--envs", type=int, default=256, help="environments (default: %(default)s)")
   tune.add_argument("--steps", type=int, default=500, help="policy steps in each environment (default: %(default)s)")
-  replay = add("replay", _replay, "Repeat the step that was NaN or infinite.")
-  replay.add_argument("dump", help="a run's nan_dump/step_*.npz")
+  replay = add("replay", "cli.replay:replay", "Repeat the step that was NaN or infinite.")
+  replay.add_argument("file", metavar="dump", help="a run's nan_dump/step_*.npz")
   for builds_tasks in (show, keys, evaluate, export, play, view, sweep, tune, replay):
     builds_tasks.add_argument(
       "--trust", action="append", metavar="PACKAGE", help="let the configuration name task classes of this package, too"
     )
   return parser
+
+
+def _add_places(parser: argparse.ArgumentParser, video: str) -> argparse._MutuallyExclusiveGroup:
+  """Adds the options of where a policy or a task is shown; returns the group of those that exclude each other."""
+  shown = parser.add_mutually_exclusive_group()
+  shown.add_argument("--video", metavar="FILE", help=video)
+  shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
+  parser.add_argument("--camera", metavar="NAME", help=_CAMERA)
+  parser.add_argument("--host", default="127.0.0.1", help="address that the page listens on (default: %(default)s)")
+  parser.add_argument("--port", type=int, default=8080, help="port of the page (default: %(default)s)")
+  return shown
+
+
+def _call(place: str) -> Command:
+  """A command that is a function, `module:function`, whose parameters have the names of the arguments."""
+  module, _, function = place.partition(":")
+
+  def command(args: argparse.Namespace) -> int:
+    values = _named(args)
+    if "path" in values:
+      values["path"] = _run_path(values["path"])
+    return getattr(importlib.import_module(f"playground.{module}"), function)(**values)
+
+  return command
+
+
+def _named(args: argparse.Namespace, *others: str) -> dict[str, Any]:
+  """The arguments by name, without these others and what all commands have."""
+  return {name: value for name, value in vars(args).items() if name not in ("command", "trust", *others)}
 
 
 def _list(args: argparse.Namespace) -> int:
@@ -182,34 +205,9 @@ def _list(args: argparse.Namespace) -> int:
   return list_tasks(found, {name: getattr(args, name) for name in FILTERS}, args.json)
 
 
-def _doctor(args: argparse.Namespace) -> int:
-  from playground.cli.doctor import doctor
-
-  return doctor()
-
-
 def _run_path(name: str) -> str:
   """The path of a run that a command line names: a path, a pretrained policy or one on W&B."""
   return working_copy(local_path(name), registry.names())
-
-
-def _eval(args: argparse.Namespace) -> int:
-  from playground.cli.eval import evaluate_run
-
-  return evaluate_run(
-    _run_path(args.run),
-    episodes=args.episodes,
-    seed=args.seed,
-    deterministic=args.deterministic,
-    video=args.video,
-    camera=args.camera,
-  )
-
-
-def _export(args: argparse.Namespace) -> int:
-  from playground.deploy.export import export_run
-
-  return export_run(_run_path(args.run), out=args.out)
 
 
 def _play(args: argparse.Namespace) -> int:
@@ -218,38 +216,14 @@ def _play(args: argparse.Namespace) -> int:
   if args.agent and args.policy not in registry.names():
     near = nearest(args.policy, registry.names())
     raise UnknownNameError(f"--agent={args.agent} acts on a task, and {args.policy} is none.{near}")
-  return play(
-    args.policy if args.agent else _run_path(args.policy),
-    agent=args.agent,
-    episodes=args.episodes,
-    seed=args.seed,
-    video=args.video,
-    camera=args.camera,
-    viewer=args.viewer,
-    web=args.web,
-    host=args.host,
-    port=args.port,
-  )
+  return play(args.policy if args.agent else _run_path(args.policy), **_named(args, "policy"))
 
 
 def _view(args: argparse.Namespace) -> int:
   from playground.cli.play import play
 
-  return play(
-    args.task,
-    agent=args.agent,
-    overrides=args.overrides,
-    randomize=args.randomize,
-    interval_events=not args.no_events,
-    episodes=1,
-    seed=args.seed,
-    video=args.video,
-    camera=args.camera,
-    viewer=args.viewer,
-    web=not (args.video or args.viewer),
-    host=args.host,
-    port=args.port,
-  )
+  own = {"interval_events": not args.no_events, "episodes": 1, "web": not (args.video or args.viewer)}
+  return play(args.task, **own, **_named(args, "task", "no_events"))
 
 
 def _pretrained(args: argparse.Namespace) -> int:
@@ -268,35 +242,11 @@ def _sweep(args: argparse.Namespace) -> int:
   return getattr(sweep, args.action)(args.folder)
 
 
-def _tune_buffers(args: argparse.Namespace) -> int:
-  from playground.cli.tune_buffers import tune_buffers
-
-  return tune_buffers(args.task, args.overrides, run=args.run, envs=args.envs, steps=args.steps)
-
-
-def _replay(args: argparse.Namespace) -> int:
-  from playground.cli.replay import replay
-
-  return replay(args.dump)
-
-
 def _completion(args: argparse.Namespace) -> int:
   from playground.cli.completion import candidates, script
 
   print("\n".join(candidates(args.line, _parser())) if args.shell == "query" else script(args.shell), end="")
   return 0
-
-
-def _keys(args: argparse.Namespace) -> int:
-  from playground.cli.keys import show_keys
-
-  return show_keys(args.prefix, args.overrides)
-
-
-def _show(args: argparse.Namespace) -> int:
-  from playground.cli.show import show
-
-  return show(args.task, args.overrides, views=args.views, num_views=args.num_views)
 
 
 if __name__ == "__main__":

@@ -165,7 +165,7 @@ def test_eval_and_replay(command: Command, monkeypatch: pytest.MonkeyPatch, caps
   calls = _stub(monkeypatch, "playground.cli.eval", "evaluate_run", 0)
   assert command("eval", "results/a", "--episodes", "4") == 0
   options = {"episodes": 4, "seed": 0, "deterministic": False, "video": None, "camera": None}
-  assert calls == [(("results/a",), options)]
+  assert calls == [((), {"path": "results/a", **options})]
   _stub(monkeypatch, "playground.cli.replay", "replay", CheckpointError("No dump\nthere."))
   assert command("replay", "dump.npz") == 2
   assert capsys.readouterr().err == "error: No dump there.\n"
