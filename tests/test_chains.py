@@ -10,6 +10,7 @@ import pytest
 
 from playground.config import RunConfig, compose, config_roots, options
 from playground.errors import ConfigError, UnknownNameError
+from tests.sampling import some
 
 CHAINS = [name for name in options("experiment") if name.endswith("_chain")]
 STAGES = """
@@ -110,9 +111,7 @@ def test_every_chain_we_ship_composes(experiment: str):
   assert all(stage.choices["tuned"] == f"ppo/{stage.choices['env']}" for stage in stages)
 
 
-@pytest.mark.parametrize(
-  "experiment", [CHAINS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in CHAINS[1:])]
-)
+@pytest.mark.parametrize("experiment", some(CHAINS, len(CHAINS)))
 def test_a_chain_is_small_with_debug_fast(experiment: str):
   tiny = compose([f"experiment={experiment}", "debug=fast"]).stages
   assert [stage.agent.num_timesteps for stage in tiny] == [320] * len(tiny)

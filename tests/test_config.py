@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from playground.errors import ConfigError, UnknownNameError
 from playground.hardware.options import DistributedConfig
 from playground.learning.hyperparameters import config_class
 from playground.settings import plain
+from tests.sampling import some
 
 TUNED = ["experiment=cartpole_balance"]
 
@@ -108,11 +108,6 @@ def test_a_generic_task_takes_any_robot():
   run = compose(["env=joystick", "robot=go1"])
   assert run.name == "joystick"
   assert run.env.robot.name == "go1"
-
-
-def some(names: Sequence[str], every: int) -> list[Any]:
-  """All names as parameters, of which `make test` takes one in so many."""
-  return [pytest.param(name, marks=[pytest.mark.slow] * (i % every != 0)) for i, name in enumerate(names)]
 
 
 @pytest.mark.parametrize("env", [*some(config.task_names(), 5), "joystick robot=go1"])

@@ -1,5 +1,6 @@
 """Task names to tasks: ours, and those of an outside package."""
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -17,6 +18,8 @@ from playground import registry, trust
 from playground.config import compose
 from playground.errors import ConfigError, UnknownNameError
 from playground.randomization import Randomizer
+from tests.processes import WITHOUT_WARP
+from tests.sampling import some
 
 GENERIC = [
   ["env=joystick", "robot=go1"],
@@ -260,7 +263,10 @@ def _leaves(config: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
       yield f"{prefix}{key}"
 
 
-@pytest.mark.parametrize("overrides", [*([f"env={name}"] for name in registry.names()), *GENERIC], ids=" ".join)
+OF_TASKS = [[f"env={name}"] for name in registry.names()]
+
+
+@pytest.mark.parametrize("overrides", [*some(OF_TASKS, 3), *GENERIC], ids=" ".join)
 def test_every_key_is_read_and_a_step_keeps_the_states_structure(overrides: list[str]):
   config = compose([*overrides, "tuned=null"]).resolved["env"]
   read: set[str] = set()
@@ -360,6 +366,7 @@ def test_an_outside_package_adds_tasks(site: Path):
     from playground.cli.run import main
     main()
     """
-  done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True)
+  env = os.environ | WITHOUT_WARP
+  done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], env=env, capture_output=True, text=True)
   assert done.returncode == 0, done.stderr
   assert "bonus: 1.5" in done.stdout

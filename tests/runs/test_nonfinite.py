@@ -19,6 +19,7 @@ from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.runs.helpers import TASK, resume
 
+pytestmark = pytest.mark.stored_programs
 UNSTABLE = [*TASK, "agent.num_timesteps=800", "env.ctrl_dt=10", "env.sim_dt=10"]  # blows up within a few steps
 
 
