@@ -26,7 +26,6 @@ def evaluate_run(
   deterministic: bool = False,
   video: str | None = None,
   camera: str | None = None,
-  console: Console | None = None,
 ) -> int:
   """Evaluates a run's newest checkpoint, or the one given, prints the scores and writes them beside the run.
 
@@ -37,7 +36,6 @@ def evaluate_run(
     deterministic: whether the policy acts with its mode instead of sampling (the run's own setting if False).
     video: where to render the first episode to (.mp4).
     camera: the video's, see `render_video`; None is the run's `video.camera`.
-    console: for the output.
 
   Returns:
     The exit code, 0.
@@ -46,7 +44,7 @@ def evaluate_run(
     PlaygroundError: no such run or checkpoint, or one that does not fit, no such camera, or no folder that can be
       written to.
   """
-  console = console or Console()
+  console = Console()
   film = need_place(video, camera)
   trained = load_policy(path)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware

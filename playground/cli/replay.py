@@ -9,17 +9,16 @@ from playground.hardware.setup import setup, this_machine
 from playground.runs.nonfinite import Dump, nonfinite_fields
 
 
-def replay(file: str, console: Console | None = None) -> int:
+def replay(file: str) -> int:
   """Prints what was NaN, infinite or absurd in the dumped step and in its replay on this machine.
 
   Args:
     file: a run's `nan_dump/step_*.npz`.
-    console: for the output.
 
   Returns:
     0 if the replay is not finite either, 1 if this machine cannot reproduce it.
   """
-  console = console or Console()
+  console = Console()
   dump = Dump(file)
   run = configs.from_saved(dump.config)
   hardware = setup(this_machine(run.hardware))

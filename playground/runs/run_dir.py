@@ -140,7 +140,7 @@ class RunDirectory:
     """
     earlier = self.manifest
     starts = [*earlier.pop("earlier_starts", []), *([earlier] if earlier else [])]
-    facts = {"created": _now(), "host": socket.gethostname(), "git": git_state(), "versions": package_versions()}
+    facts = {"created": now(), "host": socket.gethostname(), "git": git_state(), "versions": package_versions()}
     write_json(self.path / "manifest.json", _merged(facts, fields) | {"earlier_starts": starts})
 
   def update_manifest(self, **fields: object) -> None:
@@ -151,8 +151,8 @@ class RunDirectory:
     """Records how the run stands, when it first started, and which process says so."""
     if status not in get_args(RunStatus):
       raise ValueError(f"status must be one of {get_args(RunStatus)}, not {status!r}")
-    started = self.status.get("started", _now())
-    content = {"status": status, "reason": reason, "pid": os.getpid(), "started": started, "updated": _now()}
+    started = self.status.get("started", now())
+    content = {"status": status, "reason": reason, "pid": os.getpid(), "started": started, "updated": now()}
     write_json(self.path / "status.json", content)
 
   def note_loss(self, reason: str) -> None:
@@ -241,7 +241,8 @@ def _make_new(path: Path) -> Path:
       return folder
 
 
-def _now() -> str:
+def now() -> str:
+  """Returns the time (ISO 8601)."""
   return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
 
 

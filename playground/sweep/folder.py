@@ -17,7 +17,7 @@ from playground.config import RunConfig, format_value, is_of_command
 from playground.errors import CheckpointError, ConfigError, nearest
 from playground.files import is_locked, lock_holder, locking, read_json, write_json, write_text
 from playground.runs.csv_tracker import RETURN
-from playground.runs.run_dir import RunDirectory
+from playground.runs.run_dir import RunDirectory, now
 from playground.settings import Plain
 from playground.text import first_line
 
@@ -295,7 +295,3 @@ def _need(what: str, value: Plain, kind: type | types.UnionType) -> Plain:
   if not isinstance(value, kind):
     raise TypeError(f"{what} is {format_value(value)}")
   return value
-
-
-def now() -> str:
-  return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")

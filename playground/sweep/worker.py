@@ -17,7 +17,8 @@ from pathlib import Path
 
 from playground.interpreter import PYTHON
 from playground.runs.interrupts import on_signals
-from playground.sweep.folder import STOP_FILE, JobFolder, SweepDirectory, now
+from playground.runs.run_dir import now
+from playground.sweep.folder import STOP_FILE, JobFolder, SweepDirectory
 from playground.text import quoted
 
 COMMAND = (*PYTHON, "-m", "playground.cli.run")

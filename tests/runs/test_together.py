@@ -94,8 +94,9 @@ def test_what_ends_one_lets_the_others_go_on(
   assert "No space left on device" in runs["b"].status["reason"] and "b failed" in capsys.readouterr().err
   for name in ("a", "c"):
     assert runs[name].summary["params_sha256"] == RunDirectory(group / name).summary["params_sha256"]
-  assert train_together(resumed(tmp_path, *AGENTS)) == 0, "the finished ones have nothing left to do"
+  assert resume(runs["b"].path) == 0
   assert runs["b"].summary["steps"] == runs["a"].summary["steps"]
+  assert train_together(resumed(tmp_path, *AGENTS)) == 0, "the finished ones have nothing left to do"
 
 
 @pytest.mark.slow
