@@ -6,6 +6,8 @@ SHA-256 of every file. `playground pretrained` lists them; `add` makes one from 
 """
 
 import hashlib
+import json
+import re
 import shutil
 import tempfile
 from collections.abc import Container, Mapping
@@ -119,6 +121,18 @@ def copy_policy(run: Path, folder: Path) -> None:
   shutil.copytree(step, folder / "checkpoints" / step.name, ignore=shutil.ignore_patterns("state", "replay"))
 
 
+def _forget_machine(folder: Path) -> None:
+  """Removes the paths and the name of the machine from a policy's configuration and manifest."""
+  config = folder / "config.yaml"
+  config.write_text(re.sub(r"^run_dir: .*$", "run_dir: null", config.read_text(), flags=re.MULTILINE))
+  overrides = folder / "overrides.yaml"
+  kept = [line for line in overrides.read_text().splitlines(keepends=True) if not line.startswith("- run_dir=")]
+  overrides.write_text("".join(kept))
+  manifest = json.loads((folder / "manifest.json").read_text())
+  told = {key: value for key, value in manifest.items() if key not in ("host", "compilation_cache")}
+  (folder / "manifest.json").write_text(json.dumps(told, indent=2) + "\n")
+
+
 def add(run: Path, task: str, facts: Section) -> Path:
   """Copies a run's policy into the package and writes its card.
 
@@ -133,6 +147,7 @@ def add(run: Path, task: str, facts: Section) -> Path:
   folder = POLICIES / task
   shutil.rmtree(folder, ignore_errors=True)
   copy_policy(run, folder)
+  _forget_machine(folder)
   (folder / "export").mkdir()
   for name in ("policy.onnx", "policy.yaml"):
     shutil.copyfile(run / "export" / name, folder / "export" / name)

@@ -29,6 +29,8 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
   assert (card["status"], card["note"]) == ("open", "cut short")
   assert card["training"]["sampled"] > 0 and card["training"]["mode"] > 0
   assert not checkpoint.has("state")
+  texts = [path.read_text() for name in ("*.yaml", "*.json", "export/*.yaml") for path in folder.glob(name)]
+  assert len(texts) >= 5 and str(tmp_path) not in "".join(texts), "paths of this machine"
   console = Console(record=True, width=120)
   assert show_policies(console) == 0
   assert f"{card['c_mujoco']['return']:.1f} ±" in console.export_text()
