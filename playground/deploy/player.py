@@ -1,5 +1,6 @@
-"""A policy that acts for as long as somebody watches: its task step by step, and what the watcher does to it."""
+"""A task under a policy, step by step, with the commands and pushes of the person who watches it."""
 
+import copy
 import time
 
 import jax
@@ -20,52 +21,70 @@ class Player:
 
   Attributes:
     env: the task.
-    exported: the policy; another may take its place at any time.
+    exported: the policy; it may be replaced at any time.
     state: the present state.
+    previous_qpos: joint positions one policy step before `state`, [nq].
     command: forward m/s, left m/s, turn rad/s; None leaves it to the task, which draws one from time to time.
-    force: forces and torques from outside in the next decisions, world frame, N and N m, [nbody, 6].
-    takes_commands: whether the task is to follow a joystick.
-    period: seconds of one decision.
+    manual_action: acts instead of the policy, in [-1, 1], [action_size]; None lets the policy act.
+    action: the last action, [action_size].
+    force: external forces and torques in the next policy steps, world frame, N and N m, [nbody, 6].
+    takes_commands: whether the task follows a velocity command.
+    period: seconds of one policy step.
     seconds: since this episode began.
     episode_return: sum of rewards in this episode.
-    term_sums: the same of each weighted term of the reward, by name.
+    terms: each weighted reward term of the last policy step, by name.
   """
 
   def __init__(self, env: Env, exported: ActingPolicy, seed: int = 0):
     """Starts an episode."""
     self.env = env
     self.exported = exported
-    self._key = jax.random.PRNGKey(seed)
-    self._directions = np.random.default_rng(seed)
+    self._seed(seed)
     self._reset = jax.jit(env.reset)
     self._step = jax.jit(self._driven_step)
     self.takes_commands = _COMMAND in jax.eval_shape(env.reset, self._key).info
     self.command: np.ndarray | None = None
+    self.manual_action: np.ndarray | None = None
     self.force = np.zeros((env.mj_model.nbody, 6), np.float32)
     self.period = env.dt * env.action_repeat
     self.reset()
+
+  def copy(self, seed: int) -> "Player":
+    """Returns another environment of the same task, policy and compiled functions, in an episode of its own."""
+    other = copy.copy(self)
+    other._seed(seed)
+    other.reset()
+    return other
 
   def reset(self) -> None:
     """Starts the next episode."""
     self._key, key = jax.random.split(self._key)
     self.state: State = self._reset(key)
     self._steps, self.episode_return = 0, 0.0
-    self.term_sums = {name.removeprefix(_TERM): 0.0 for name in self.state.metrics if name.startswith(_TERM)}
+    self.action = np.zeros(self.env.action_size)
+    self.terms = {name.removeprefix(_TERM): 0.0 for name in self.state.metrics if name.startswith(_TERM)}
+    self.show_present()
 
-  def decide(self) -> State:
-    """Lets the policy act once; an episode that has ended begins anew."""
+  def policy_step(self) -> State:
+    """Advances by one policy step; resets first if the episode has ended."""
     broken = not np.isfinite(self.state.data.qpos).all()
     if self.state.done or broken or self._steps >= self.env.episode_length:
       self.reset()
-    action = self.exported.actions(self.state.obs)
+    self.show_present()
+    self.action = self.exported.actions(self.state.obs) if self.manual_action is None else self.manual_action
+    self.terms = dict.fromkeys(self.terms, 0.0)
     for _ in range(self.env.action_repeat):
       asked = np.zeros(3) if self.command is None else self.command
-      self.state = self._step(self.state, action, self.force, asked, self.command is not None)
+      self.state = self._step(self.state, self.action, self.force, asked, self.command is not None)
       self.episode_return += float(self.state.reward)
-      for name in self.term_sums:
-        self.term_sums[name] += float(self.state.metrics[_TERM + name])
+      for name in self.terms:
+        self.terms[name] += float(self.state.metrics[_TERM + name])
     self._steps += self.env.action_repeat
     return self.state
+
+  def show_present(self) -> None:
+    """Makes the present state the one that poses are interpolated from."""
+    self.previous_qpos = np.asarray(self.state.data.qpos)
 
   @property
   def seconds(self) -> float:
@@ -73,11 +92,11 @@ class Player:
 
   @property
   def task_command(self) -> np.ndarray:
-    """What the joystick asks for now, whoever moves it."""
+    """The command in force, of the task or of the person who watches."""
     return np.asarray(self.state.info[_COMMAND]) if self.command is None else self.command
 
   def push(self, speed: float) -> None:
-    """Gives what moves freely (else the first joint) `speed` m/s (rad/s) more, in any horizontal direction."""
+    """Adds `speed` m/s (rad/s) to what moves freely (else to the first joint), in a random horizontal direction."""
     model = self.env.mj_model
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     angle = self._directions.uniform(0, 2 * np.pi)
@@ -87,9 +106,20 @@ class Player:
     qvel[first : first + len(kick)] += speed * np.array(kick)
     self.state = self.state.replace(data=self.state.data.replace(qvel=jnp.asarray(qvel)))
 
+  def set_joint(self, address: int, position: float) -> None:
+    """Moves one hinge or slide joint, by its address in `qpos`, to a position in rad or m."""
+    qpos = np.array(self.state.data.qpos)
+    qpos[address] = position
+    self.state = self.state.replace(data=self.state.data.replace(qpos=jnp.asarray(qpos)))
+    self.show_present()
+
   def pause_until_due(self, began: float) -> None:
-    """Sleeps for what is left of a decision that began at `began` (`time.perf_counter()`)."""
+    """Sleeps for the rest of a policy step that began at `began` (`time.perf_counter()`)."""
     time.sleep(max(0.0, began + self.period - time.perf_counter()))
+
+  def _seed(self, seed: int) -> None:
+    self._key = jax.random.PRNGKey(seed)
+    self._directions = np.random.default_rng(seed)
 
   def _driven_step(
     self, state: State, action: jax.Array, force: jax.Array, command: jax.Array, driven: jax.Array

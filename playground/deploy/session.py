@@ -1,4 +1,4 @@
-"""What somebody watches from another thread or window: a player in time, and what the watcher asks for in between."""
+"""Runs environments in time for a viewer, and carries out what the viewer asks for between policy steps."""
 
 import queue
 from collections.abc import Callable
@@ -17,83 +17,104 @@ from playground.envs.base import Env
 from playground.learning.checkpoints import BEST
 
 LATEST = "latest"
-_MOST_REQUESTS = 100  # that wait: whoever asks faster than the session acts is not heard
+_MOST_REQUESTS = 100  # that may wait; further requests are dropped
 
 
 class Session:
-  """A player that time passes for.
+  """Environments of one task side by side, advanced in time.
 
-  One thread lets time pass. Others may set `paused`, `speed` and the player's command, and `ask` for the rest.
+  One thread calls `advance` and `carry_out`. Other threads may set `paused`, `speed` and `selected`, and `ask` for the
+  rest.
 
   Attributes:
-    player: who acts; another takes its place when the terrain changes.
+    players: the environments. Changing the terrain replaces all of them.
+    selected: index of the environment that is plotted and followed.
     trained: the run's policy that acts; None without a run.
-    following: `LATEST` or `BEST` if that checkpoint is to act, as training goes on, None if the one that does.
+    following: `LATEST` or `BEST` to change to that checkpoint as training writes it, None to keep the present one.
     paused: whether time stands still.
-    speed: simulated seconds in one.
-    previous_qpos: the joints' positions at the decision before the last, [nq].
+    speed: simulated seconds per second.
+    on_step: functions that are called with the selected environment after each of its policy steps.
   """
 
   def __init__(
     self, env: Env, exported: ActingPolicy, seed: int, menu: Menu | None = None, following: str | None = LATEST
   ):
-    """Starts an episode of a policy; `menu` holds the checkpoint that it is from, if a run is at hand."""
+    """Starts an episode of a policy; `menu` holds its checkpoint, if it is a run's."""
     self._seed = seed
-    self.player = Player(env, exported, seed)
+    self.players = [Player(env, exported, seed)]
+    self.selected = 0
     self._menu = menu
     self.trained = menu.trained if menu else None
     self.following = following
     self.paused = False
     self.speed = 1.0
+    self.on_step: list[Callable[[Player], None]] = []
     self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-    self._tried: Path | None = None  # to follow: a checkpoint that cannot be read is said to be so once
-    self._due = 0.0  # simulated seconds for which nothing has been decided yet
-    self.previous_qpos = np.asarray(self.player.state.data.qpos)
+    self._tried: Path | None = None  # the last checkpoint followed; one that cannot be read is reported once
+    self._due = 0.0  # simulated seconds since the last policy step
+
+  @property
+  def player(self) -> Player:
+    """The selected environment."""
+    return self.players[min(self.selected, len(self.players) - 1)]
+
+  def set_num_envs(self, number: int) -> None:
+    """Adds environments, each in an episode of its own, or removes the last ones."""
+    first, have = self.players[0], len(self.players)
+    self.players = self.players[:number] + [first.copy(self._seed + i) for i in range(have, number)]
+
+  def set_command(self, command: np.ndarray | None) -> None:
+    """Commands all environments, see `Player.command`."""
+    for player in self.players:
+      player.command = command
 
   def ask(self, request: Callable[[], None]) -> None:
-    """Has something done between two decisions, unless many requests wait already."""
+    """Queues a function to call between two policy steps, unless too many wait already."""
     if self._requests.qsize() < _MOST_REQUESTS:
       self._requests.put(request)
 
   def carry_out(self) -> None:
-    """Does what was asked for by now, up to the first that fails; raises PlaygroundError for that."""
+    """Calls the queued functions up to the first that raises PlaygroundError, which it raises."""
     for _ in range(self._requests.qsize()):
       self._requests.get()()
 
   def advance(self, seconds: float) -> None:
-    """Lets so much time pass at the chosen speed."""
+    """Advances by so many seconds at the chosen speed."""
     if self.paused:
       return
     self._due += seconds * self.speed
     while self._due >= self.player.period:
       self._due -= self.player.period
-      self.previous_qpos = np.asarray(self.player.state.data.qpos)
-      self.player.decide()
-      if self.player.seconds <= self.player.period:  # of a new episode: nothing lies between it and the last
-        self.previous_qpos = np.asarray(self.player.state.data.qpos)
+      self._policy_step()
 
   def step(self) -> None:
-    """Lets the policy act once, and shows the state after it."""
-    self.player.decide()
-    self._begin()
+    """Advances by one policy step, and shows the state after it."""
+    self._policy_step()
+    self._show_present()
 
-  def qpos(self) -> np.ndarray:
-    """The joints' positions at this instant, which lies between the last two decisions' [nq]."""
-    model = self.player.env.mj_model
-    now = np.asarray(self.player.state.data.qpos, float)
-    pose, change = self.previous_qpos.astype(float), np.empty(model.nv)
+  def qpos(self, player: Player) -> np.ndarray:
+    """Returns joint positions at this instant, interpolated between the last two policy steps, [nq]."""
+    model = player.env.mj_model
+    now = np.asarray(player.state.data.qpos, float)
+    pose, change = player.previous_qpos.astype(float), np.empty(model.nv)
     mujoco.mj_differentiatePos(model, change, 1.0, pose, now)
-    mujoco.mj_integratePos(model, pose, change, min(1.0, self._due / self.player.period))
+    mujoco.mj_integratePos(model, pose, change, min(1.0, self._due / player.period))
     return pose
 
   def reset(self) -> None:
-    """Starts the next episode."""
-    self.player.reset()
-    self._begin()
+    """Starts the next episode of every environment."""
+    for player in self.players:
+      player.reset()
+    self._show_present()
+
+  def push(self, speed: float) -> None:
+    """Pushes every environment's robot, see `Player.push`."""
+    for player in self.players:
+      player.push(speed)
 
   @property
   def terrain(self) -> str | None:
-    """What the robot stands on, if the task lets that be chosen."""
+    """The terrain's name; None if the task has no choice of terrain."""
     scene = self.player.env.config.get("scene")
     return scene.get("terrain") if hasattr(scene, "get") else None
 
@@ -105,26 +126,27 @@ class Session:
     return next((max(event.params.velocity) for event in pushes if "velocity" in (event.get("params") or {})), 3.0)
 
   def choose_terrain(self, name: str) -> None:
-    """Builds the task on another terrain, which takes seconds; raises ConfigError if the task has none of it."""
+    """Builds the task on another terrain, which takes seconds; raises ConfigError if the task has no terrain."""
     old = self.player
     config: Any = config_dict(old.env.config)
     config.scene.terrain = name
     env = load_on_c_physics(old.exported.contract["task"], config)
-    self.player = Player(env, old.exported, self._seed)
-    self.player.command = old.command
-    self._begin()
+    number, self.players = len(self.players), [Player(env, old.exported, self._seed)]
+    self.players[0].command = old.command
+    self.set_num_envs(number)
+    self._show_present()
 
   @property
   def acting(self) -> str:
-    """Control steps trained of the policy that acts, in a chain behind its stage's name."""
+    """Control steps that the acting policy was trained for, after its stage's name in a curriculum."""
     if self._menu is None or self.trained is None:
       return f"{self.player.exported.contract['origin']['steps']:,}"
     return self._menu.label(self.trained.checkpoint.path)
 
   def choices(self) -> dict[str, str | Path]:
-    """What can be chosen to act, by label: `LATEST`, `BEST` if there is one, and checkpoints, newest last.
+    """Returns what `choose_checkpoint` takes, by label: `LATEST`, `BEST` if there is one, and checkpoints, newest last.
 
-    The one that acts is among them, though gone. Empty without a run.
+    The acting checkpoint is always among them, even if it was deleted. Empty without a run.
     """
     if self._menu is None or self.trained is None:
       return {}
@@ -135,13 +157,13 @@ class Session:
     return choices | {self._menu.label(path): path for path in checkpoints}
 
   def choose_checkpoint(self, choice: str | Path) -> None:
-    """Lets one of `choices` act; raises CheckpointError if it is gone."""
+    """Changes the policy to one of `choices`; raises CheckpointError if it was deleted."""
     self.following, self._tried = None if isinstance(choice, Path) else choice, None
     if isinstance(choice, Path):
       self._act_as(choice)
 
   def follow(self) -> None:
-    """Lets the newest or best checkpoint act, if that is asked for; raises CheckpointError if it cannot be read."""
+    """Changes to the newest or best checkpoint if `following` says so; raises CheckpointError if it is unreadable."""
     if self.following is None or self._menu is None:
       return
     wanted = self._menu.best() if self.following == BEST else self._menu.checkpoints()[-1]
@@ -154,8 +176,18 @@ class Session:
     if path == self.trained.checkpoint.path:
       return
     self.trained = self.trained.at(path)
-    self.player.exported = export_policy(self.trained, self.player.state)
+    exported = export_policy(self.trained, self.player.state)
+    for player in self.players:
+      player.exported = exported
 
-  def _begin(self) -> None:
+  def _policy_step(self) -> None:
+    for player in self.players:
+      player.policy_step()
+    for function in self.on_step:
+      function(self.player)
+
+  def _show_present(self) -> None:
+    """Shows the present states, without interpolation."""
     self._due = 0.0
-    self.previous_qpos = np.asarray(self.player.state.data.qpos)
+    for player in self.players:
+      player.show_present()

@@ -75,7 +75,7 @@ def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
       follow(window.cam, env.mj_model)
     while window.is_running() and not told.is_set():
       began = time.perf_counter()
-      state = player.decide()
+      state = player.policy_step()
       with window.lock():
         for name in ("qpos", "mocap_pos", "mocap_quat"):
           getattr(data, name)[:] = getattr(state.data, name)

@@ -151,13 +151,20 @@ def test_a_host_that_is_empty(
 
 
 def bad_messages(watch: Watch) -> list[Any]:
-  panel = watch.panel
-  ids = {name: getattr(panel, name)._impl.uuid for name in ("speed", "checkpoint", "paused", "push", "push_speed")}
+  panel, view = watch.panel, watch.panel.view
+  controls: dict[str, Any] = {n: getattr(panel, n) for n in ("speed", "checkpoint", "paused", "push", "push_speed")}
+  controls |= {"num_envs": view.num_envs, "selected": view.selected, "camera": view.camera, "plot": panel.plots.choice}
+  controls |= {"by_hand": panel.joints.by_hand, "action": panel.joints.actions[0]}
+  controls["joint"] = next(iter(panel.joints.joints.values()))
+  ids = {name: control._impl.uuid for name, control in controls.items()}
   update = lambda name, value: {"type": "GuiUpdateMessage", "uuid": ids[name], "updates": {"value": value}}
   values = (1e9, -1, float("nan"), float("inf"), "fast", None, [], {}, True, b"x", 10**18)
-  speeds = [update(name, value) for name in ("speed", "push_speed") for value in values]
-  labels = [update("checkpoint", value) for value in ("no such", "9,999", "", 3, None, ["latest"], "x" * 20_000)]
-  others = [update(name, value) for name in ("paused", "push") for value in ("yes", 2, None, [], float("nan"))]
+  sliders = ("speed", "push_speed", "num_envs", "selected", "action", "joint")
+  speeds = [update(name, value) for name in sliders for value in values]
+  texts = ("no such", "9,999", "", 3, None, ["latest"], "x" * 20_000)
+  labels = [update(name, value) for name in ("checkpoint", "camera", "plot") for value in texts]
+  switches = ("paused", "push", "by_hand")
+  others = [update(name, value) for name in switches for value in ("yes", 2, None, [], float("nan"))]
   properties = ({"min": -1e9}, {"max": 1e9, "value": 1e9}, {"update_cb": 1}, {"sync_cb": None}, {"removed": True}, {})
   changes = [{"type": "GuiUpdateMessage", "uuid": ids["speed"], "updates": change} for change in properties]
   kinds = [
@@ -176,7 +183,14 @@ def bad_messages(watch: Watch) -> list[Any]:
 
 def test_bad_messages_change_nothing(watch: Watch, capfd: pytest.CaptureFixture[str]) -> None:
   panel, session = watch.panel, watch.session
-  before = (session.speed, panel.speed.min, panel.speed.max, panel.push_speed.value, panel.checkpoint.value)
+
+  def values() -> tuple[object, ...]:
+    limits = panel.speed.min, panel.speed.max
+    players = len(session.players), session.selected, session.player.manual_action
+    return (*limits, *players, session.speed, panel.push_speed.value, panel.view.model_camera, panel.checkpoint.value)
+
+  watch.frame()
+  before = values()
   port = watch.server.get_port()
   with running(watch), client(port, origin=f"http://127.0.0.1:{port}") as connection:
     connection.send(msgspec.msgpack.encode(CAMERA))
@@ -187,10 +201,10 @@ def test_bad_messages_change_nothing(watch: Watch, capfd: pytest.CaptureFixture[
     wait_for(lambda: session.speed == 2.0)  # all before it have been heard
     begun = session.player.seconds
     wait_for(lambda: session.player.seconds != begun)
-    panel.speed.value = before[0]
+    panel.speed.value = 1.0
     wait_for(lambda: panel.checkpoint.value == before[-1])
     assert not session.paused
-  assert (session.speed, panel.speed.min, panel.speed.max, panel.push_speed.value, panel.checkpoint.value) == before
+  assert values() == before
   assert "Traceback" not in capfd.readouterr().err
 
 

@@ -48,7 +48,7 @@ def test_a_chain(
   assert (session.acting, origin()["run"], origin()["steps"]) == ("far 500", "10_far", 500)
   session.choose_checkpoint(session.choices()["near 1,000"])
   assert (session.acting, origin()["run"], origin()["steps"]) == ("near 1,000", "9_near", 1000)
-  session.player.decide()
+  session.player.policy_step()
   session.choose_checkpoint("best")
   session.follow()
   assert session.acting == "far 500"

@@ -49,23 +49,23 @@ class Commanded(Point):
 def test_what_the_watcher_asks_for() -> None:
   player = Player(Commanded(episode_length=4), NO_ACTION)
   assert player.takes_commands and player.period == 0.1
-  assert player.decide().reward == 0
-  assert player.decide().reward == 7  # the task's own
+  assert player.policy_step().reward == 0
+  assert player.policy_step().reward == 7  # the task's own
   player.command, player.force[0, 0] = np.array([0.5, 0, 0]), 20.0
-  state = player.decide()
+  state = player.policy_step()
   assert (state.reward, state.metrics["force"]) == (0.5, 20)
   assert player.episode_return == 7.5
   player.command, player.force[0, 0] = None, 0.0
-  assert (player.decide().reward, player.state.metrics["force"]) == (7, 0)
-  player.decide()  # of the next episode
+  assert (player.policy_step().reward, player.state.metrics["force"]) == (7, 0)
+  player.policy_step()  # of the next episode
   assert (player.state.info["age"], player.episode_return) == (1, 0)
 
 
 def test_an_episode_that_breaks_begins_anew() -> None:
   player = Player(Commanded(nan_at=2), NO_ACTION)
-  player.decide()
-  assert np.isnan(player.decide().data.qpos).all()
-  assert np.isfinite(player.decide().data.qpos).all() and player.state.info["age"] == 1
+  player.policy_step()
+  assert np.isnan(player.policy_step().data.qpos).all()
+  assert np.isfinite(player.policy_step().data.qpos).all() and player.state.info["age"] == 1
 
 
 @pytest.mark.parametrize(

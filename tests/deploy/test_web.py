@@ -80,8 +80,8 @@ def test_time(watch: Watch, session: Session) -> None:
   session.advance(0.08)  # with the rest from before, one decision and a half
   watch.panel.speed.value = 1.0
   assert player.seconds == pytest.approx(0.12)
-  before, now = (np.asarray(qpos) for qpos in (session.previous_qpos, player.state.data.qpos))
-  np.testing.assert_allclose(session.qpos()[:3], (before + now)[:3] / 2, atol=1e-6)
+  before, now = (np.asarray(qpos) for qpos in (player.previous_qpos, player.state.data.qpos))
+  np.testing.assert_allclose(session.qpos(session.player)[:3], (before + now)[:3] / 2, atol=1e-6)
   watch.panel.reset.value = True
   watch.frame()
   assert player.seconds <= 0.12  # a frame passes at most 0.1 s
@@ -92,11 +92,11 @@ def test_a_single_step_pauses(watch: Watch, session: Session) -> None:
   watch.panel.step.value = True
   session.carry_out()
   assert session.paused and session.player.seconds == pytest.approx(session.player.period)
-  np.testing.assert_allclose(session.qpos(), session.player.state.data.qpos, atol=1e-6)
+  np.testing.assert_allclose(session.qpos(session.player), session.player.state.data.qpos, atol=1e-6)
 
 
 def test_what_is_shown(watch: Watch, session: Session) -> None:
-  view = watch.view
+  view = watch.panel.view
   watch.panel.command[0].value = 0.5
   watch.frame()
   arrow = view.arrows["commanded"]
@@ -129,22 +129,131 @@ def test_push(watch: Watch, session: Session) -> None:
 
 
 def test_plots(watch: Watch, session: Session) -> None:
-  watch.panel.record()
+  plots, player = watch.panel.plots, session.player
   watch.panel.paused.value = False
-  for _ in range(10):
-    session.advance(0.2)
-    watch.panel.record()
+  session.advance(1.01)
+  plots.draw()
+  total, term = plots.charts["return of the episode"], plots.charts["track_linear_velocity_exp"]
+  assert total.data[0][0] == pytest.approx(-10, abs=0.1) and total.data[0][-1] == 0
+  assert total.data[1][-1] == pytest.approx(player.episode_return)
+  assert term.data[1][-1] == pytest.approx(player.terms["track_linear_velocity_exp"]) and len(term.data) == 2
+
+  assert plots.choice.options == (
+    "Reward terms",
+    *(f"Observations: {n}" for n in player.state.obs),
+    "Actions",
+    "Nothing",
+  )
+  for choice, titles in (("Observations: state", "gyro"), ("Actions", "FR_hip"), ("Nothing", None), ("no such", None)):
+    plots.choice.value = choice
+    session.carry_out()
+    assert plots.charts == {} if titles is None else titles in plots.charts
+    session.advance(0.1)
+    plots.draw()
+    if choice == "Observations: state":
+      shown = np.concatenate([chart.data[1:] for chart in plots.charts.values()])
+      np.testing.assert_allclose(shown[:, -1], player.state.obs["state"], rtol=1e-5)
+    if choice == "Actions":
+      np.testing.assert_allclose([chart.data[1][-1] for chart in plots.charts.values()], player.action, rtol=1e-5)
+  plots.choice.value = "Reward terms"
+  session.carry_out()
+
+
+def test_joints_are_posed_while_paused(watch: Watch, session: Session) -> None:
+  joints, player = watch.panel.joints, session.player
+  joints.draw()
+  address, slider = next(iter(joints.joints.items()))
+  assert not slider.disabled and slider.value == pytest.approx(float(player.state.data.qpos[address]), abs=1e-3)
+  session.carry_out()
+  unchanged = player.state
+  assert session.player.state is unchanged, "to show positions sets none"
+  slider.value = slider.max
+  session.carry_out()
+  assert player.state.data.qpos[address] == pytest.approx(slider.max)
+  np.testing.assert_allclose(session.qpos(player)[address], slider.max, rtol=1e-6)
+  watch.panel.paused.value = False
+  slider.value = slider.min
+  session.carry_out()
+  joints.draw()
+  assert slider.disabled and player.state.data.qpos[address] == pytest.approx(slider.max)
+
+
+def test_actions_by_hand(watch: Watch, session: Session) -> None:
+  joints, player = watch.panel.joints, session.player
+  joints.actions[0].value = 0.5  # shows what the policy does, until they are the hand's
+  session.step()
+  assert player.action[0] != 0.5
+  joints.draw()
+  np.testing.assert_allclose([slider.value for slider in joints.actions], player.action, atol=1e-3)
+  joints.by_hand.value = True
+  joints.actions[0].value = -0.5
+  session.carry_out()
+  session.step()
+  assert player.action[0] == -0.5
+  joints.by_hand.value = False
+  session.carry_out()
+  session.step()
+  assert player.action[0] != -0.5
+
+
+def test_environments_side_by_side(watch: Watch, session: Session) -> None:
+  view, panel = watch.panel.view, watch.panel
+  panel.command[0].value = 0.5
+  view.num_envs.value = 4
+  watch.frame()
+  first, *others = session.players
+  assert len(others) == 3 and view.scene.num_envs == 4 and all(p.command is first.command for p in others)
+  assert not np.array_equal(first.state.data.qpos, others[0].state.data.qpos)
+  session.step()
+  assert all(p.seconds == pytest.approx(p.period) for p in session.players)
+  view.selected.value = 3
+  watch.frame()
+  assert session.player is others[1] and view.scene.env_idx == 2
+  view.num_envs.value = 1
+  watch.frame()
+  assert session.players == [first] and session.player is first and view.selected.value == 1
+  panel.leave.value = True
+  watch.frame()
+
+
+def test_cameras(watch: Watch, session: Session) -> None:
+  view = watch.panel.view
+  assert view.camera.options[:2] == ("free", "track") and view.model_camera is None
+  view.next_camera()
+  watch.frame()
+  assert view.model_camera == "track"
+  view.camera.value = "no such"
+  watch.frame()
+  assert view.model_camera is None
+  view.next_camera()
+  assert view.camera.value == "free"
+
+
+def test_a_recording_is_a_video(watch: Watch, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+  recorder, sent = watch.panel.recorder, []
+  monkeypatch.setattr(watch.server, "send_file_download", lambda name, content: sent.append((name, content)))
+  watch.panel.record.value = True
+  session.carry_out()
+  assert recorder.seconds == 0
+  for _ in range(3):
+    session.step()
   watch.panel.draw()
-  total, terms = watch.panel.plots.charts
-  assert terms.series[-1].get("label") == "track_linear_velocity_exp"
-  seconds, values = total.data
-  assert len(seconds) == 11 and seconds[-1] == pytest.approx(session.player.seconds)
-  assert values[-1] == pytest.approx(session.player.episode_return)
-  assert terms.data[-1][-1] == pytest.approx(session.player.term_sums["track_linear_velocity_exp"])
-  session.reset()
-  watch.panel.record()
-  watch.panel.draw()
-  assert len(total.data[0]) == 1
+  assert "recording 0.1 s" in watch.panel._status.content
+  rendered: dict[str, Any] = {}
+
+  def render(model: Any, out_path: Path, **options: Any) -> Path:
+    rendered.update(options)
+    out_path.write_bytes(b"video")
+    return out_path
+
+  monkeypatch.setattr("playground.deploy.web.recording.render_video", render)
+  monkeypatch.setattr(threading.Thread, "start", threading.Thread.run)
+  watch.panel.record.value = True
+  session.carry_out()
+  assert sent == [("Go1JoystickFlatTerrain.mp4", b"video")] and recorder.seconds is None
+  assert rendered["dt"] == session.player.period and rendered["camera"] is None
+  np.testing.assert_array_equal(rendered["qpos"][-1], session.player.state.data.qpos)
+  assert len(rendered["qpos"]) == 3
 
 
 def test_checkpoints_follow_the_training(watch: Watch, session: Session, run: UntrainedRun) -> None:
@@ -227,7 +336,7 @@ def test_page(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     page = chromium.new_page(viewport={"width": 640, "height": 480})
     complaints: list[str] = []
     page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
-    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("pageerror", lambda error: complaints.append(f"{error} {error.stack}"))
     page.add_init_script("window.pad = null; navigator.getGamepads = () => [window.pad]")
     page.goto(f"http://127.0.0.1:{watch.server.get_port()}")
     page.get_by_text("Go1JoystickFlatTerrain").wait_for(timeout=_WAIT)
@@ -266,6 +375,25 @@ def test_page(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Player, "push", lambda player, by: pushes.append(by))
     page.get_by_role("button", name="Push (P)").click(timeout=_WAIT)
     eventually(page, lambda: pushes == [0.5])
+
+    view, recorder = watch.panel.view, watch.panel.recorder
+    for tab, shown in (("Scene", "Environments"), ("Plots", "track_linear_velocity_exp"), ("Joints", "FR_hip_joint")):
+      page.get_by_role("tab", name=tab).click(timeout=_WAIT)
+      page.get_by_text(shown, exact=True).first.wait_for(timeout=_WAIT)
+    page.get_by_role("tab", name="Keys").click(timeout=_WAIT)
+    page.get_by_text("next camera").wait_for(timeout=_WAIT)
+    page.locator("body").press("c")
+    eventually(page, lambda: view.model_camera == "track")
+    page.get_by_role("tab", name="Scene").click(timeout=_WAIT)
+    page.get_by_role("slider").first.press("ArrowRight")
+    eventually(page, lambda: len(session.players) == 2)
+
+    page.locator("body").press("v")
+    eventually(page, lambda: (recorder.seconds or 0.0) > 0.2)
+    page.locator("body").press("v")
+    with page.expect_download(timeout=2 * _WAIT) as download:
+      page.get_by_role("link", name="Go1JoystickFlatTerrain.mp4").click(timeout=2 * _WAIT)
+    assert b"ftyp" in Path(download.value.path()).read_bytes()[:16]
     assert complaints == []
 
 

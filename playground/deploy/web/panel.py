@@ -1,11 +1,11 @@
-"""What the watcher can do: sliders, buttons, menus, and keys for most of them.
+"""The viewer's controls: sliders, buttons, menus, and keys for most of them.
 
-Keys move the sliders, and the sliders move the player, so that there is one way for a command to go.
+Keys and gamepads move the sliders, and only the sliders set the command.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
@@ -13,7 +13,10 @@ import viser
 from playground.deploy.player import STEP
 from playground.deploy.session import Session
 from playground.deploy.web.gamepad import Gamepads
+from playground.deploy.web.joints import Joints
 from playground.deploy.web.plots import Plots
+from playground.deploy.web.recording import Recorder
+from playground.deploy.web.view import View
 from playground.robots.terrain import TERRAINS
 
 Key = Any  # a literal type of viser that is not public
@@ -24,32 +27,60 @@ AXES: tuple[tuple[str, Key, Key], ...] = (
   ("turn, rad/s", "J", "L"),
 )
 _KEYS = """
-I K, U O, J L: command; T: automatic commands
+| Key | |
+|---|---|
+| I K | command: forward, back |
+| U O | command: left, right |
+| J L | command: turn left, right |
+| T | automatic commands |
+| space | pause |
+| N | one step |
+| R | reset |
+| P | push |
+| V | record |
+| C | next camera |
+| W A S D, Q E, arrows, mouse | move the camera |
+| ctrl K | all commands |
 
-space: pause; N: one step; R: reset; P: push
-
-W A S D, Q E, arrows, mouse: camera; ctrl K: all commands
-
-Gamepad: left stick moves, right stick turns; first button pushes, second resets, start pauses
+| Gamepad | |
+|---|---|
+| left stick | command: forward, left |
+| right stick | command: turn |
+| first button | push |
+| second button | reset |
+| start | pause |
 """
-_ELSE = 1.0  # m/s and rad/s: the sliders' range for a task that does not tell one
+_ELSE = 1.0  # m/s and rad/s: the sliders' range for a task without one
 
 
 class Panel:
-  """The controls of a session."""
+  """The controls of a session, in tabs.
+
+  Attributes:
+    view: draws the scene.
+    plots: of rewards, observations and actions.
+    joints: sliders of joints and actions.
+    recorder: of videos.
+  """
 
   def __init__(self, server: viser.ViserServer, session: Session):
     """Adds them."""
     self._server, self._gui, self._session = server, server.gui, session
-    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     self._status = self._gui.add_markdown("")
-    self.command = self._add_command() if session.player.takes_commands else []
-    self._add_time()
-    self._add_choices()
-    with self._gui.add_folder("Return"):
-      self.plots = Plots(self._gui, session.player)
-    with self._gui.add_folder("Keys and gamepad", expand_by_default=False):
+    tabs = self._gui.add_tab_group()
+    with tabs.add_tab("Control"):
+      self.command = self._add_command() if session.player.takes_commands else []
+      self._add_time()
+      self._add_choices()
+    self.view = View(server, session, tabs.add_tab("Scene"))
+    self._add_key("Next camera", "C", lambda: self.view.next_camera())
+    with tabs.add_tab("Plots"):
+      self.plots = Plots(self._gui, session)
+    with tabs.add_tab("Joints"):
+      self.joints = Joints(self._gui, session)
+    with tabs.add_tab("Keys"):
       self._gui.add_markdown(_KEYS)
+    self.recorder = Recorder(server, session, lambda: self.view.model_camera, self.say)
     self._gamepads = Gamepads(
       server, session.ask, self._steer, {0: self._push, 1: session.reset, 9: self._toggle_pause}
     )
@@ -58,29 +89,28 @@ class Panel:
     """Lets go of the gamepads."""
     self._gamepads.close()
 
-  def record(self) -> None:
-    """Notes the present state for the plots."""
-    self.plots.record(self._session.player)
-
   def draw(self) -> None:
-    """Shows where the session stands."""
+    """Shows the session's present state."""
     session, player = self._session, self._session.player
     lines = [
-      f"{session.acting} steps trained",
+      f"{session.acting} steps trained" if session.acting != "0" else "no policy",
       f"{player.seconds:.1f} s, return {player.episode_return:.2f}",
     ]
     if player.takes_commands:
       who = "the task's" if player.command is None else "yours"
       lines.append(f"command {' / '.join(f'{value:.2f}' for value in player.task_command)} ({who})")
+    if (seconds := self.recorder.seconds) is not None:
+      lines.append(f"**recording {seconds:.1f} s**")
     self._status.content = "  \n".join(lines)
     self.plots.draw()
+    self.joints.draw()
     if choices := session.choices():
       self._offer(choices)
 
-  def say(self, title: str, body: str) -> None:
+  def say(self, title: str, body: str, color: Literal["red", "blue"] = "red") -> None:
     """Shows a sentence to all who watch."""
     for client in self._server.get_clients().values():
-      client.add_notification(title, body, color="red", auto_close_seconds=10.0)
+      client.add_notification(title, body, color=color, auto_close_seconds=10.0)
 
   def _add_command(self) -> list[viser.GuiSliderHandle[float]]:
     player = self._session.player
@@ -90,12 +120,12 @@ class Panel:
     sliders: list[viser.GuiSliderHandle[float]] = []
 
     def take(_: object) -> None:
-      self._session.player.command = np.array([slider.value for slider in sliders])
+      self._session.set_command(np.array([slider.value for slider in sliders]))
 
     def leave() -> None:
       for slider in sliders:
         _set(slider, 0.0)
-      self._session.player.command = None
+      self._session.set_command(None)
 
     with self._gui.add_folder("Command"):
       for (label, more, less), least, most in zip(AXES, low.tolist(), high.tolist(), strict=True):
@@ -121,6 +151,7 @@ class Panel:
       self.push_speed = self._gui.add_slider("Push, m/s", 0.1, most, 0.1, 0.5, hint="which the robot gains at once")
       self.push = self._add_button("Push", "P", self._push)
       self.reset = self._add_button("Reset", "R", session.reset)
+      self.record = self._add_button("Record", "V", lambda: self.recorder.toggle())
 
   def _add_choices(self) -> None:
     session = self._session
@@ -151,7 +182,7 @@ class Panel:
       _set(slider, stick * slider.max if stick > 0 else -stick * slider.min)
 
   def _push(self) -> None:
-    self._session.player.push(self.push_speed.value)
+    self._session.push(self.push_speed.value)
 
   def _step(self) -> None:
     self.paused.value = True

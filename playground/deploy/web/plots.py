@@ -1,52 +1,108 @@
-"""The return of the present episode as it grows, and what each term of the reward has added."""
+"""Plots of the last seconds: reward terms, an observation group or the actions, one small chart for each."""
 
+from collections import deque
+from collections.abc import Callable, Mapping
+
+import mujoco
 import numpy as np
 import viser
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from playground.deploy.player import Player
+from playground.deploy.session import Session
 
-_EVERY = 0.1  # s of the episode between two points
+_SECONDS = 10.0  # that a chart shows
+_POINTS = 250  # on a line, at most
+_LINES = 20  # in a chart, at most
+_DECIMALS = 6  # uPlot's ticks overflow on ranges near the smallest numbers
+_HEIGHT = 110  # pixels of a chart
+_REWARDS, _OBSERVATIONS, _ACTIONS, _NOTHING = "Reward terms", "Observations", "Actions", "Nothing"
+Values = Callable[[Player], np.ndarray]
 
 
 class Plots:
-  """Two charts over the seconds of an episode."""
+  """A menu of what to plot, and its charts below it.
 
-  def __init__(self, gui: viser.GuiApi, player: Player):
-    """Adds the charts; the second only if the task tells the terms of its reward."""
-    self._gui = gui
-    self._rows: list[list[float]] = []
-    self.charts = [self._add("return", ["return"])]
-    if player.term_sums:
-      self.charts.append(self._add("sums of weighted reward terms", list(player.term_sums)))
+  Attributes:
+    choice: the menu.
+    charts: by title.
+  """
 
-  def record(self, player: Player) -> None:
-    """Notes where the episode stands."""
-    last = self._rows[-1][0] if self._rows else -np.inf
-    if player.seconds < last:
-      self._rows.clear()
-    elif player.seconds < last + _EVERY:
-      return
-    self._rows.append([player.seconds, player.episode_return, *player.term_sums.values()])
+  def __init__(self, gui: viser.GuiApi, session: Session):
+    """Adds the menu, and the charts of the reward."""
+    self._gui, self._session = gui, session
+    groups = [f"{_OBSERVATIONS}: {group}" for group in _groups(session.player)]
+    self.choice = gui.add_dropdown("Plot", (_REWARDS, *groups, _ACTIONS, _NOTHING))
+    self.choice.on_update(lambda _: session.ask(self._choose))
+    self.charts: dict[str, viser.GuiUplotHandle] = {}
+    self._choose()
+    session.on_step.append(self._record)
 
   def draw(self) -> None:
-    """Shows what was noted."""
-    if self._rows:
-      seconds, total, *terms = np.array(self._rows).T
-      for chart, lines in zip(self.charts, ([total], terms), strict=False):
-        chart.data = (seconds, *lines)
+    """Updates the charts."""
+    if not self._rows or not self.charts:
+      return
+    stride = -(-len(self._rows) // _POINTS)
+    lines = list(np.array(self._rows)[::-1][::stride][::-1].T.round(_DECIMALS))
+    seconds = -stride * self._session.player.period * np.arange(len(lines[0]))[::-1]
+    for title, size in self._sizes.items():
+      self.charts[title].data = (seconds, *lines[: min(size, _LINES)])
+      lines = lines[size:]
 
-  def _add(self, title: str, names: list[str]) -> viser.GuiUplotHandle:
-    colors = colormaps["tab20"].colors  # pyright: ignore[reportAttributeAccessIssue]
-    lines = [
-      viser.uplot.Series(label=name, stroke=to_hex(colors[i % len(colors)]), width=2) for i, name in enumerate(names)
-    ]
+  def _choose(self) -> None:
+    """Replaces the charts by those of the menu's choice."""
+    for chart in self.charts.values():
+      chart.remove()
+    self._sizes, self._values = _quantities(self.choice.value, self._session.player)
+    self._rows: deque[np.ndarray] = deque(maxlen=round(_SECONDS / self._session.player.period))
+    self.charts = {title: self._add_chart(title, size) for title, size in self._sizes.items()}
+
+  def _record(self, player: Player) -> None:
+    """Notes the state after a policy step."""
+    row = self._values(player)
+    # The axis of time never changes: viser's charts lose it where it gets shorter.
+    self._rows.extend([row] * (1 if self._rows else self._rows.maxlen or 1))
+
+  def _add_chart(self, title: str, size: int) -> viser.GuiUplotHandle:
+    colors = colormaps["tab20" if size > 10 else "tab10"].colors  # pyright: ignore[reportAttributeAccessIssue]
+    lines = [viser.uplot.Series(stroke=to_hex(color), width=2) for color in colors[: min(size, _LINES)]]
     return self._gui.add_uplot(
-      tuple(np.zeros(1) for _ in range(1 + len(names))),
+      tuple(np.zeros(1) for _ in range(1 + len(lines))),
       (viser.uplot.Series(label="s"), *lines),
       title=title,
       scales={"x": viser.uplot.Scale(time=False)},
-      aspect=1.6,
-      padding=(12, 24, 0, 0),  # the topmost number would be cut
+      legend=viser.uplot.Legend(show=False),
+      height=_HEIGHT,
+      padding=(8, 24, 0, 0),  # the topmost number would be cut
     )
+
+
+def _groups(player: Player) -> Mapping[str, np.ndarray]:
+  """The state's observation groups that are vectors, by name."""
+  obs = player.state.obs
+  groups = obs if isinstance(obs, Mapping) else {"state": obs}
+  return {name: np.asarray(value) for name, value in groups.items() if np.ndim(value) == 1}
+
+
+def _quantities(choice: str, player: Player) -> tuple[dict[str, int], Values]:
+  """Returns the number of values in each chart, by title, and the function that reads them all."""
+  if choice == _REWARDS:
+    sizes = {"return of the episode": 1} | dict.fromkeys(player.terms, 1)
+    return sizes, lambda now: np.array([now.episode_return, *now.terms.values()])
+  if choice == _ACTIONS:
+    return dict.fromkeys(action_names(player), 1), lambda now: np.asarray(now.action)
+  group = choice.removeprefix(f"{_OBSERVATIONS}: ")
+  if group not in (groups := _groups(player)):  # nothing, or a choice that no menu offers
+    return {}, lambda now: np.zeros(0)
+  sizes, size = player.env.observation_parts.get(group, {}), len(groups[group])
+  if sum(sizes.values()) != size:  # frames, one after another
+    sizes = {group: size}
+  return dict(sizes), lambda now: _groups(now)[group]
+
+
+def action_names(player: Player) -> list[str]:
+  """Names of the actions: those of their actuators, if each action has one."""
+  model, size = player.env.mj_model, player.env.action_size
+  names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
+  return [names[i] or f"actuator {i}" if model.nu == size else f"action {i}" for i in range(size)]

@@ -1,4 +1,4 @@
-"""The viewer in the browser: a server, and the loop that lets time pass."""
+"""The viewer in the browser: a server, and the loop that advances time."""
 
 import time
 
@@ -7,12 +7,11 @@ from rich.console import Console
 from playground.deploy.session import Session
 from playground.deploy.web.gate import Gate, need_port
 from playground.deploy.web.panel import Panel
-from playground.deploy.web.view import View
 from playground.errors import PlaygroundError
 from playground.runs.interrupts import noted_signals
 
-_FRAME = 1 / 30  # s between two pictures: more than a browser without a GPU can draw
-_DRAW = 0.25  # s between two looks at what changes slowly: text, plots, the run's checkpoints
+_FRAME = 1 / 30  # s between two frames: more than a browser without a GPU can draw
+_DRAW = 0.25  # s between two updates of what changes slowly: text, plots, the run's checkpoints
 _LONGEST = 0.1  # s that may pass at once; a machine that is too slow falls behind
 
 
@@ -30,12 +29,11 @@ class Watch:
     gate = Gate(host, port, session.player.exported.contract["task"])
     self.server, self.url = gate.server, gate.url
     self.panel = Panel(self.server, session)
-    self.view = View(self.server)
     self._now = time.perf_counter()
     self._drawn = 0.0
 
   def frame(self) -> None:
-    """Does what was asked for, lets the time since the last frame pass, and draws."""
+    """Carries out requests, advances by the time since the last frame, and draws."""
     session, last = self.session, self._now
     time.sleep(max(0.0, last + _FRAME - time.perf_counter()))
     self._now = time.perf_counter()
@@ -46,8 +44,7 @@ class Watch:
     except PlaygroundError as error:
       self.panel.say("This did not work", str(error))
     session.advance(min(self._now - last, _LONGEST))
-    self.panel.record()
-    self.view.show(session.player, session.qpos())
+    self.panel.view.show()
     if self._now - self._drawn > _DRAW:
       self.panel.draw()
       self._drawn = self._now
