@@ -40,7 +40,8 @@ MISTAKE = "joint_powr_l1"  # which a page misspells
 TOP_LEVEL = ("CONTRIBUTING.md", "CHANGELOG.md", "AGENTS.md", "llms.txt")
 BANNED = (
   *("decisions?", "fresh starts?", "slips?", "(?<!standard )deviations?", "passes over the data", "paid for", "afresh"),
-  *("anew", "pictures?", "stands? by"),
+  *("anew", "pictures?", "stands? by", "eyes?", "facts?", "told", "learners?", "the like", "what there is"),
+  *("what is kept", "is one sentence", "tapes?", "houses?"),
 )
 # Names that a page introduces itself.
 OWN = ("SlideToTarget", "go1_worn", "=pup", "PupJoystick", "go1_in_wind", "reinforce", MISTAKE)
