@@ -13,7 +13,7 @@ from playground.settings import Section
 
 
 class DmEnv(dm_env.Environment):
-  """One environment. A dict observation is a dict, an end by the task has discount 0, one by the time limit 1."""
+  """One environment. Dict observations stay dicts; the discount is 0 at a termination, 1 at the time limit."""
 
   def __init__(self, task: str, overrides: Section | None = None, physics: str = "c", seed: int = 0):
     """Builds a task; `physics` is `c` or `mjx`, see `playground.adapters.episodes.load_task`."""
@@ -46,7 +46,7 @@ class DmEnv(dm_env.Environment):
 
 
 def _spec(name: str, shape: tuple[int, ...]) -> specs.Array:
-  """Of one entry: pictures are bytes."""
+  """Returns the spec of one observation group; images are bytes."""
   if name.startswith(PIXELS):
     return specs.BoundedArray(shape, np.uint8, 0, 255, name)
   return specs.Array(shape, np.float32, name)

@@ -1,4 +1,4 @@
-"""One environment of a task, in numpy: what the interfaces of other libraries are made of."""
+"""One environment of a task in NumPy, which the interfaces of other libraries wrap."""
 
 from typing import NamedTuple
 
@@ -17,14 +17,14 @@ Arrays = np.ndarray | dict[str, np.ndarray]
 
 
 class Moment(NamedTuple):
-  """What one environment shows, after a reset or a step.
+  """The outputs of one environment after a reset or a step.
 
   Attributes:
     obs: one vector, or a dict of them.
     reward: of the step.
     terminated: the task ended the episode.
-    truncated: time did.
-    metrics: what the task measures in a step, by name.
+    truncated: the time limit ended the episode.
+    metrics: metrics of the step, by name.
   """
 
   obs: Arrays
@@ -35,7 +35,7 @@ class Moment(NamedTuple):
 
 
 class Episodes:
-  """A task, one episode after another. The time limit and the repeats of an action are the task's.
+  """Runs episodes of a task, with the task's time limit and action repeat.
 
   Attributes:
     env: the task.
@@ -74,7 +74,7 @@ def load_task(task: str, overrides: Section | None = None, physics: str = "mjx")
   Args:
     task: its name.
     overrides: values of its config by dotted key.
-    physics: `mjx`, or `c`: plain C MuJoCo, which needs no compiling and is the faster for one environment on a CPU.
+    physics: `mjx`, or `c`: plain C MuJoCo, which needs no compilation and is faster for one environment on a CPU.
 
   Raises:
     UnknownNameError: no such task, key or physics.

@@ -54,7 +54,7 @@ class GymEnv(gymnasium.Env[PyTree, np.ndarray]):
       task: its name.
       overrides: values of its config by dotted key.
       physics: `c` or `mjx`, see `load_task`.
-      entry: the one entry of a dict observation to give, such as `state`; None gives all.
+      entry: the observation group to return, such as `state`; None returns all.
       render_mode: `rgb_array` or None.
 
     Raises:
@@ -80,7 +80,7 @@ class GymEnv(gymnasium.Env[PyTree, np.ndarray]):
     return _entry(moment.obs, self._entry), moment.reward, moment.terminated, moment.truncated, moment.metrics
 
   def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-    """The present state as an image, [height, width, 3] uint8, in the render mode `rgb_array`.
+    """Renders the current state, an image [height, width, 3] uint8, in the render mode `rgb_array`.
 
     Raises:
       PlaygroundError: no OpenGL works on this machine.
@@ -111,16 +111,16 @@ def _close(env: "weakref.ref[GymEnv]") -> None:
 
 
 def _open_renderer(model: mujoco.MjModel) -> mujoco.Renderer:
-  """A renderer that uses the OpenGL which works here, as the videos of runs do.
+  """Returns a renderer with the OpenGL backend that works here, as for videos of runs.
 
-  MuJoCo chooses when it is imported: GLFW, which needs a screen, unless MUJOCO_GL says otherwise.
+  MuJoCo chooses at import: GLFW, which needs a screen, unless MUJOCO_GL is set.
   """
   from mujoco.rendering.classic import gl_context
 
   backend = find_gl()
   if backend is None:
     raise PlaygroundError(f"render() draws nothing. {NO_GL_REMEDY}")
-  os.environ.pop("PYOPENGL_PLATFORM", None)  # the backend sets its own and refuses another
+  os.environ.pop("PYOPENGL_PLATFORM", None)  # the backend sets its own value and refuses another
   library = backend if backend in ("egl", "osmesa", "cgl") else "glfw"
   chosen = gl_context.GLContext
   gl_context.GLContext = importlib.import_module(f"mujoco.{library}").GLContext
@@ -131,9 +131,9 @@ def _open_renderer(model: mujoco.MjModel) -> mujoco.Renderer:
 
 
 class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
-  """A batch of environments in one program. An episode that has ended begins anew by itself, freshly drawn.
+  """A batch of environments in one program. An environment whose episode has ended resets itself.
 
-  That is in the next step, which takes no action of it, or (`AutoresetMode.SAME_STEP`) in the step that ends it: `info`
+  It resets in the next step, which ignores its action, or (`AutoresetMode.SAME_STEP`) in the step that ends it: `info`
   then has the episode's last observation and metrics under `final_obs` and `final_info`, as gymnasium's own have them.
   """
 
@@ -170,7 +170,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
       return batch.reset(jax.random.split(key, num_envs))
 
     def advance(state: State, action: jax.Array, key: jax.Array) -> tuple[State, State]:
-      """The state to go on from, and what the step itself came to."""
+      """Returns the state after the auto-reset, and the outputs of the step itself."""
       after = batch.step(state, action)
       ended = after.done if same_step else state.done
       begun = jax.lax.cond(ended.any(), lambda: where_done(ended, start(key), after), lambda: after)
@@ -194,7 +194,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
     return obs, np.array(last.reward), done & ~truncated, truncated, info
 
   def _final(self, last: State, done: np.ndarray) -> Info:
-    """The entries on the episodes that ended: an object each in `final_obs`, and who has one under `_<name>`."""
+    """Returns the entries of ended episodes: objects in `final_obs`, and a mask of them under `_<name>`."""
     obs, metrics = self._seen(last)
     final_obs = np.full(self.num_envs, None, object)
     for i in np.flatnonzero(done):
@@ -212,7 +212,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
 
 
 def observation_space(env: Env, entry: str | None = None) -> Space[PyTree]:
-  """The space of a task's observation, or of one entry of it: unbounded numbers, pictures in bytes.
+  """Returns the space of a task's observation, or of one group of it: unbounded numbers, images in bytes.
 
   Raises:
     UnknownNameError: no such entry.
@@ -231,7 +231,7 @@ def _entry(obs: Arrays, entry: str | None) -> Arrays:
 
 
 def register() -> None:
-  """Registers every task that is not yet, as `playground/<Task>`; importing this module has done it once."""
+  """Registers tasks that are not registered yet as `playground/<Task>`; importing this module calls it."""
   for task in registry.names():
     if (name := f"{NAMESPACE}/{task}") not in gymnasium.registry:
       one, batch = f"{__name__}:GymEnv", f"{__name__}:GymVectorEnv"

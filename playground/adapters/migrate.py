@@ -1,6 +1,6 @@
-"""The suites of Playground 0.2.0 as code written for it knows them: `from playground import locomotion` and the like.
+"""The suites of Playground 0.2.0, for code written for it: `from playground import locomotion`.
 
-`registry` and `wrapper` are our own modules under 0.2.0's names. docs/migrate.md says what else there is to change.
+`registry` and `wrapper` are our own modules under 0.2.0's names. docs/migrate.md lists the other changes.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,10 +14,10 @@ from playground.settings import Section
 
 
 class Suite:
-  """A part of the registry."""
+  """A suite of the registry."""
 
   def __init__(self, members: Callable[[], Sequence[str]]):
-    """Takes what says the names of its tasks."""
+    """Takes a function that returns the names of its tasks."""
     self._members = members
 
   @property

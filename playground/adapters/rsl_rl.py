@@ -1,8 +1,8 @@
 """A batch of environments for RSL-RL (rsl-rl-lib 5): `OnPolicyRunner(vec_env(task, num_envs=4096), config)`.
 
-Tensors are views of JAX's arrays and the other way round (DLPack), on a GPU as on a CPU: nothing is copied. Neither
-side may write to what it was given. DLPack orders the two libraries' work on a GPU; what JAX frees while torch still
-reads it is used again by the next step at the earliest, which waits for torch's actions.
+Tensors are views of JAX's arrays and the other way round (DLPack), on a GPU and on a CPU: nothing is copied. Neither
+side may write to an array that it received. DLPack orders the two libraries' work on a GPU. Memory that JAX frees
+while torch still reads it is reused in the next step at the earliest, which waits for torch's actions.
 """
 
 # torch is in an extra, which the type checker may not find
@@ -29,27 +29,27 @@ OBS_GROUPS = {"actor": ["policy"], "critic": ["critic"]}  # for RSL-RL's configu
 
 
 def to_torch(array: jax.Array) -> torch.Tensor:
-  """A tensor in the memory of an array."""
+  """Returns a tensor in the memory of an array."""
   return torch.from_dlpack(array)
 
 
 def to_jax(tensor: torch.Tensor) -> jax.Array:
-  """An array in the memory of a tensor, which nobody may write to from then on."""
+  """Returns an array in the memory of a tensor, which must not be written to afterwards."""
   return jax.dlpack.from_dlpack(tensor.detach().contiguous())
 
 
 class VecEnv(rsl_rl_env.VecEnv):
-  """What RSL-RL steps: episodes that begin anew by themselves, one batch on one device.
+  """The environment that RSL-RL steps: one batch on one device, with auto-reset.
 
   Observations have the groups `policy` and `critic`. `extras["time_outs"]` is 1 where time ended the episode, and not
-  the task, so that RSL-RL adds the value of what would have come; `extras["final_obs"]` are the observations that the
+  the task, so that RSL-RL bootstraps the value; `extras["final_obs"]` are the observations that the
   step itself made, in the same groups: where an episode ended, its last (RSL-RL 5 does not look at them and takes the
   value of the observation before instead; an algorithm of yours may). `extras["log"]` has the means of reward, length
   and the task's metrics over the episodes that ended in the step, if any did.
 
   Attributes:
-    state: the present state, a batch.
-    max_episode_length: control steps; `episode_length_buf` counts those of the present episodes.
+    state: the current batch of states.
+    max_episode_length: control steps; `episode_length_buf` counts those of the current episodes.
   """
 
   def __init__(
@@ -64,9 +64,9 @@ class VecEnv(rsl_rl_env.VecEnv):
 
     Args:
       env: the task.
-      state: where the batch stands.
-      step: advances it by actions [N, action_size].
-      groups: the entry of the task's observation that each group is; by default those that actor and critic are for.
+      state: the batch of states to start from.
+      step: advances the state by actions [N, action_size].
+      groups: the task's observation group for each RSL-RL group; the default is those of actor and critic.
       log: whether there is an `extras["log"]`, which waits for the device.
     """
     self.state, self._step, self._log = state, step, log
@@ -79,7 +79,7 @@ class VecEnv(rsl_rl_env.VecEnv):
 
   @property
   def episode_length_buf(self) -> torch.Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-    return (to_torch(self.state.info["steps"]) * (1 - to_torch(self.state.done))).long()  # one that ended begins anew
+    return (to_torch(self.state.info["steps"]) * (1 - to_torch(self.state.done))).long()  # auto-reset
 
   @episode_length_buf.setter
   def episode_length_buf(self, steps: torch.Tensor) -> None:
@@ -88,7 +88,7 @@ class VecEnv(rsl_rl_env.VecEnv):
     self.state = state.replace(done=jnp.zeros_like(state.done), info=state.info | {"steps": placed})
 
   def get_observations(self) -> TensorDict:
-    """The present observations."""
+    """Returns the current observations."""
     return self._grouped(self.state.obs)
 
   def _grouped(self, obs: Observation) -> TensorDict:
@@ -122,13 +122,13 @@ def vec_env(
 
   Args:
     env: the task, from `registry.load`.
-    num_envs: how many.
+    num_envs: number of environments.
     seed: of the episodes and the models.
     events: domain randomisation, drawn once for each environment (`compose(["env=..."]).env.events`).
     groups: see `VecEnv`.
 
   Raises:
-    ConfigError: the task shows pictures.
+    ConfigError: the task has images.
   """
   batch = AutoReset(wrap_for_evaluation(env), keep_final_obs=True)
   groups = dict(groups or group_entries(env))
@@ -141,10 +141,10 @@ def vec_env(
 
 
 def group_entries(env: Env) -> dict[str, str]:
-  """Which entry of the task's observation is for the policy, and which for the critic.
+  """Returns the observation groups of the policy and of the critic.
 
   Raises:
-    ConfigError: the task shows pictures, which the bridge does not pass on.
+    ConfigError: the task has images, which the adapter does not pass on.
   """
   sizes = env.observation_size
   entries = list(sizes) if isinstance(sizes, Mapping) else ["state"]

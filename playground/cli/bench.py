@@ -1,4 +1,4 @@
-"""`playground-bench`: measures speed and memory, tells a page from the rows, and guards ratios."""
+"""`playground-bench`: measures speed and memory, reports the rows and checks ratios."""
 
 import importlib
 import signal
@@ -9,7 +9,7 @@ from playground import __version__
 from playground.benchmark.arguments import help_of, parse
 from playground.errors import PlaygroundError, UnknownNameError, nearest, one_sentence
 
-# What measures is one module's; the others are a module each, with `Options` and `run(options) -> exit code`.
+# Measurements are in one module; each other command is a module with `Options` and `run(options) -> exit code`.
 OTHERS = {name: f"playground.benchmark.{name}" for name in ("golden", "report", "gate")}
 
 

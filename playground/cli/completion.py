@@ -1,4 +1,4 @@
-"""`playground completion bash|zsh|fish`: scripts for shells, and the candidates that the scripts ask for."""
+"""`playground completion bash|zsh|fish`: completion scripts for shells, and the candidates that they ask for."""
 
 import argparse
 import shlex
@@ -14,7 +14,7 @@ from playground.settings import Plain, Section
 
 PROGRAMS = ("playground", "playground-run")
 _FLAGS = ("-m", "--multirun", "--cfg", "--help", "--verbose", "--version", "--package")
-_OF_TASKS = ("task", "policy", "word", "path")  # positional arguments that a task can be
+_OF_TASKS = ("task", "policy", "word", "path")  # positional arguments that may be a task
 _SCRIPTS = {
   "bash": """\
 _playground() {
@@ -72,7 +72,7 @@ def candidates(line: str, parser: argparse.ArgumentParser) -> list[str]:
 
 
 def _split(line: str) -> list[str]:
-  """Words of a line, whose last quote may still be open."""
+  """Splits a line into words; its last quote may still be open."""
   try:
     return shlex.split(line)
   except ValueError:
@@ -85,7 +85,7 @@ def _commands(parser: argparse.ArgumentParser) -> Mapping[str, argparse.Argument
 
 
 def _of_command(parser: argparse.ArgumentParser, current: str, words: Sequence[str]) -> Iterator[str]:
-  """Options, values of the option before, tasks, and overrides where the command takes them."""
+  """Yields options, values of the previous option, tasks, and overrides where the command takes them."""
   options = {name: action for action in parser._actions for name in action.option_strings}
   before = options.get(words[-1]) if words else None
   if before is not None and before.nargs != 0:
@@ -110,7 +110,7 @@ def _of_command(parser: argparse.ArgumentParser, current: str, words: Sequence[s
 
 
 def _of_run(current: str, overrides: Sequence[str]) -> Iterator[str]:
-  """Flags, groups and keys with `=`, and the values of what stands before a `=`."""
+  """Yields flags, groups and keys with `=`, and the values of a key in front of a `=`."""
   key, equals, value = current.partition("=")
   roots = config_roots()
   if current.startswith("-"):
@@ -140,7 +140,7 @@ def _choices(key: str, overrides: Sequence[str]) -> Iterator[str]:
 
 
 def _resolved(overrides: Sequence[str]) -> Section:
-  """The configuration of what is typed so far, or the default one where that does not compose yet."""
+  """Returns the configuration of the words typed so far, or the default one if they do not compose yet."""
   try:
     return compose(overrides).resolved
   except PlaygroundError:

@@ -1,4 +1,4 @@
-"""`playground doctor`: what this machine has for training, what is missing, and how to get it."""
+"""`playground doctor`: checks this machine for training and says how to install what is missing."""
 
 import contextlib
 import importlib
@@ -40,7 +40,7 @@ _MARKS = {True: Text("âœ“", "green"), None: Text("!", "yellow"), False: Text("âœ
 
 @dataclass(frozen=True)
 class Finding:
-  """One row: `ok` is True (fine), None (works, but something is to be gained) or False (training cannot work)."""
+  """One row: `ok` is True (fine), None (works, but could be better) or False (training cannot work)."""
 
   name: str
   value: str
@@ -50,7 +50,7 @@ class Finding:
 
 def doctor(console: Console | None = None) -> int:
   """Prints the state of this machine; returns 0 if training works here at least on the CPU, else 1."""
-  # A look at the devices must not take the memory of a run that is training on them.
+  # Querying the devices must not take the memory of a run that trains on them.
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
   findings = [*_packages(), *_devices(), *_rendering(), *_caches(), *_machine(), *_tracking()]
   table = Table("", "what", "found", "to do")
@@ -84,7 +84,7 @@ def _packages() -> Iterator[Finding]:
 
 
 def _requirements() -> dict[str, Requirement]:
-  """Returns what this package asks of each distribution, from its metadata or, not installed, the checkout."""
+  """Returns the version requirement of each distribution, from our metadata or, if not installed, the checkout."""
   try:
     lines = metadata.requires("playground-run") or []
   except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""`playground eval <run>`: episodes of a trained policy, measured on this machine."""
+"""`playground eval <run>`: evaluates a trained policy on this machine."""
 
 from collections.abc import Mapping, Sequence
 
@@ -89,7 +89,7 @@ def evaluate_run(
 
 
 def _table(title: str, scores: Mapping[str, float], real: Sequence[Mapping[str, str]]) -> Table:
-  """Scores, beside what the paper measured on real robots (rows of benchmarks/paper/hardware.csv) where it did."""
+  """Builds a table of scores, beside the paper's on real robots where benchmarks/paper/hardware.csv has them."""
   table = Table(title=title)
   table.add_column("per episode")
   table.add_column("simulation, mean" if real else "mean", justify="right")

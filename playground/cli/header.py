@@ -1,4 +1,4 @@
-"""The first lines of a run: what is trained, with what, where it lies, and what differs from the defaults."""
+"""The first lines of a run: task, algorithm, folder, and what differs from the defaults."""
 
 from collections.abc import Iterator
 

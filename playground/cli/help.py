@@ -21,7 +21,7 @@ _EXAMPLES = {
   "playground-run resume=results/go1_joystick/<date_time>": "continue a run",
   "playground-run -m env=CartpoleBalance,WalkerWalk 'seed=range(3)'": "a sweep: six runs",
 }
-# Groups of the page and what an option of each chooses.
+# Groups of the page, and what each chooses.
 _GROUPS = {
   "env": "the task; `playground list` shows all",
   "experiment": "a task with what it is trained with",
@@ -35,7 +35,7 @@ _GROUPS = {
   "launcher": "where a sweep's jobs run",
   "search": "how a sweep chooses values",
 }
-_MANY = 20  # options, of which only the number is shown
+_MANY = 20  # groups of which only the number of options is shown
 _RUN_KEYS = ("seed", "run_dir", "resume", "init_from")
 _FLAGS = {
   "-m, --multirun": "run a sweep: `key=a,b`, `seed=range(3)`, sweep=<file of sweeps/>",
@@ -72,7 +72,7 @@ def _parts() -> Iterator[tuple[str, list[tuple[str, ...]]]]:
 
 
 def _options(group: str) -> str:
-  """The options to choose from; for many, how many there are and a few of them."""
+  """Lists the options of a group; of many, the number and a few examples."""
   names = [name for name in listed_options(group, config_roots()) if "/" not in name and not name.startswith("_")]
   if len(names) <= _MANY:
     return ", ".join(names)

@@ -1,4 +1,4 @@
-"""`playground keys <prefix>`: value, allowed values and meaning of every key below a dotted prefix."""
+"""`playground keys <prefix>`: prints value, allowed values and meaning of every key below a dotted prefix."""
 
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,8 +17,8 @@ from playground.mdp.options import OPTIONS
 from playground.settings import Plain, Section, Setting
 from playground.text import join
 
-_WIDE = 160  # columns, where no terminal says how many there are
-_SECTIONS = {"robot": "env.robot", "randomization": "env.events"}  # of groups that set a part of env
+_WIDE = 160  # columns, without a terminal
+_SECTIONS = {"robot": "env.robot", "randomization": "env.events"}  # of groups that set a section of env
 _FILES = ("env", "robot", "curriculum")  # groups whose files explain keys in comments
 
 
@@ -56,7 +56,7 @@ def show_keys(prefix: str, overrides: Sequence[str]) -> int:
 
 
 def _at(prefix: str, values: Section) -> Plain:
-  """The part of the configuration at a dotted key; raises UnknownNameError if there is none."""
+  """Returns the value or section at a dotted key; raises UnknownNameError if there is none."""
   node: Plain = values
   for part in prefix.split("."):
     if not isinstance(node, Mapping) or part not in node:
@@ -99,7 +99,7 @@ def _is_term(key: str, value: Plain) -> bool:
 
 
 def _term(key: str, entry: Section) -> tuple[str, str]:
-  """The fields of a term, and the first line of its function's docstring."""
+  """Returns the fields of a term, and the first line of its function's docstring."""
   from playground.mdp.terms import bind_one  # imports JAX, which keys other than terms do without
 
   term = bind_one(key.split(".")[1], key, key.split(".")[-1], entry)
@@ -109,7 +109,7 @@ def _term(key: str, entry: Section) -> tuple[str, str]:
 
 
 def _print_terms_help(prefix: str, console: Console) -> None:
-  """Prints what fields a term has, for a prefix such as env.rewards."""
+  """Prints the fields of a term, for a prefix such as env.rewards."""
   kind = prefix.removeprefix("env.")
   if prefix != kind and kind in OPTIONS:
     console.print(Text(inspect.getdoc(OPTIONS[kind]) or ""))
@@ -124,7 +124,7 @@ def _allowed(setting: Setting | None) -> str:
 
 
 def _comments(config: RunConfig) -> dict[str, str]:
-  """Comments of the chosen files by dotted key; those of a file that another is built on come last."""
+  """Returns the comments of the chosen files by dotted key; a file wins over the file that it is built on."""
   roots, found = config_roots(), {}
   for group in _FILES:
     option = config.choices.get(group)

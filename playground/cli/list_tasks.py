@@ -1,4 +1,4 @@
-"""`playground list`: a table of tasks, filtered, or JSON. Imports no JAX."""
+"""`playground list`: prints a filtered table of tasks, or JSON. Imports no JAX."""
 
 import dataclasses
 import json
@@ -16,7 +16,7 @@ FILTERS = ("suite", "robot", "status", "backend")
 
 
 def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json: bool) -> int:
-  """Prints the tasks of these names that match.
+  """Prints the tasks that match the filters.
 
   Args:
     names: tasks to list; one of another package has only its name.
@@ -41,7 +41,7 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
     print(json.dumps(rows, indent=1))
     return 0
   console = Console()
-  if not console.is_terminal:  # one line a task, whatever its length
+  if not console.is_terminal:  # one line a task, however long
     console = Console(width=200)
   console.print(_table(rows))
   console.print(f"{len(rows)} tasks. Train one with playground train experiment=<experiment>.", soft_wrap=True)

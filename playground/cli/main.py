@@ -14,7 +14,7 @@ from playground.rendering.gl import withhold_gl
 from playground.runs.wandb_artifacts import local_path
 from playground.trust import trust
 
-# Of all commands' options.
+# Limits of the options of all commands.
 _NUMBERS = {
   "seed": SEED,
   "episodes": count(1, 100_000),
@@ -36,7 +36,7 @@ Command = Callable[[argparse.Namespace], int]  # returns the exit code
 
 
 def main() -> None:
-  """Runs a command and exits with its code; 2 for what the user can act on."""
+  """Runs a command and exits with its code; 2 for errors that the user can act on."""
   if len(sys.argv) > 1 and sys.argv[1] in _PROGRAMS:
     importlib.import_module(_PROGRAMS[sys.argv.pop(1)][0]).main()
   withhold_gl()
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-  """What the command line says; overrides may stand after options, too."""
+  """Parses the command line; overrides may also follow options."""
   parser = _parser()
   args, rest = parser.parse_known_args()
   unknown = [text for text in rest if text.startswith("-") or "=" not in text or "overrides" not in args]
@@ -206,7 +206,7 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _run_path(name: str) -> str:
-  """The path of a run that a command line names: a path, a pretrained policy or one on W&B."""
+  """Returns the path of a run that a command line names: a path, a pretrained policy or a run on W&B."""
   return working_copy(local_path(name), registry.names())
 
 

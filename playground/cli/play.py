@@ -1,4 +1,4 @@
-"""`playground play <run|policy.onnx>`: the exported policy in plain C MuJoCo, measured, filmed or watched."""
+"""`playground play <run|policy.onnx>`: measures, films or shows the exported policy in plain C MuJoCo."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ from playground.runs.callbacks import episodes_of
 from playground.runs.loaded_policy import LoadedPolicy
 from playground.text import first_line
 
-_BACKENDS = {"jax": "MJX ", "warp": "MJX-Warp "}  # by the manifest's `impl`; a policy exported long ago tells none
+_BACKENDS = {"jax": "MJX ", "warp": "MJX-Warp "}  # by the manifest's `impl`; older exports have none
 
 
 def play(
@@ -49,7 +49,7 @@ def play(
   port: int = 8080,
   console: Console | None = None,
 ) -> int:
-  """Runs a policy, in ONNX Runtime, in C MuJoCo: at its rate, with its noise, pushes and delays, the model as it is.
+  """Runs a policy with ONNX Runtime in C MuJoCo, with the task's rate, noise, pushes, delays and nominal model.
 
   Args:
     path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it; with `agent` a
@@ -58,14 +58,14 @@ def play(
     overrides: with `agent`: as for playground-run.
     randomize: with `agent`: whether the task's startup events change the model once.
     interval_events: with `agent`: whether pushes and other interval events act.
-    episodes: how many to measure.
+    episodes: number of episodes to measure.
     seed: of the episodes.
     video: where to render the first episode to (.mp4).
     camera: the video's, see `render_video`.
     viewer: whether to show the policy in MuJoCo's viewer instead of measuring it.
     web: whether to show it in the browser instead.
     host: the address that the browser's page is served at.
-    port: its port.
+    port: the port that the browser's page is served at.
     console: for the output.
 
   Returns:
@@ -140,7 +140,7 @@ class Opened:
   Attributes:
     exported: the policy, or a script.
     env: its task on C MuJoCo.
-    folder: where results go; None keeps them nowhere.
+    folder: where results go; None writes no results.
     trained: the checkpoint, if it came from a run.
   """
 
@@ -167,16 +167,16 @@ def open_policy(path: str) -> Opened:
 
 
 def _task_of(exported: ExportedPolicy, path: str) -> Env:
-  """The task that a policy's contract describes, on C MuJoCo, traced so that whatever cannot be comes out here.
+  """Builds the task of a policy's contract on C MuJoCo, and traces it so that invalid values raise here.
 
   Raises:
-    PlaygroundError: a value that cannot be, or a task that the policy does not fit.
+    PlaygroundError: an invalid value, or a task that the policy does not fit.
   """
   contract = exported.contract
   task, config, facts = contract["task"], contract["env"], contract["policy"]
-  if task in registry.names():  # another has no defaults without its robot
+  if task in registry.names():  # another task has no defaults without its robot
     default = registry.config(task).to_dict()
-    default.pop("robot", None)  # another robot's description may hold other types
+    default.pop("robot", None)  # another robot's section may hold other types
     config = configs.saved_section("env", config, default)
   try:
     env = load_on_c_physics(task, config)
@@ -192,20 +192,20 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
     jax.eval_shape(make_evaluator(env, exported.act, 1, make_mesh(1)), {}, jax.random.PRNGKey(0), {}, {})
   except PlaygroundError:
     raise
-  except Exception as error:  # of any kind: the file may say anything
+  except Exception as error:  # of any type: the file may hold anything
     reason = f"{type(error).__name__}: {first_line(error)}"
     raise CheckpointError(f"{path}: the `env` of its contract makes no task ({reason}).") from error
   return env
 
 
 def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
-  """The checkpoints of the run that `given` is, or is in; of all stages, if it is a chain."""
+  """Returns the checkpoints of the run at or above `given`; of a chain, those of all stages."""
   run = trained.run_dir.path
   return Menu(given if given == run.parent else run, trained, lambda said: console.print(said, soft_wrap=True))
 
 
 def _table(contract: Contract, episodes: int, scores: Mapping[str, float]) -> Table:
-  """Scores, beside those of the last evaluation in training."""
+  """Builds a table of scores, beside those of the last evaluation in training."""
   origin = contract["origin"]
   trained = origin["evaluation"]
   title = f"{contract['task']}, {origin['steps']:,} steps trained"

@@ -1,4 +1,4 @@
-"""`playground pretrained`: the policies that come with the package, and how one is added."""
+"""`playground pretrained`: lists the policies that come with the package, or adds one."""
 
 import math
 
@@ -47,8 +47,8 @@ def add_policy(path: str, note: str = "") -> int:
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run, or a policy that cannot be exported.
-    ConfigError: it has no evaluation at its newest checkpoint.
+    PlaygroundError: no such run, or a policy that has no export.
+    ConfigError: the run has no evaluation at its newest checkpoint.
   """
   run = RunDirectory.open(path)
   export_run(path)

@@ -1,4 +1,4 @@
-"""`playground replay <dump>`: takes the step again that went NaN, infinite or absurd, and says where."""
+"""`playground replay <dump>`: repeats a step that was NaN, infinite or too large, and shows where."""
 
 import jax
 from rich.console import Console
@@ -10,13 +10,13 @@ from playground.runs.nonfinite import Dump, nonfinite_fields
 
 
 def replay(file: str) -> int:
-  """Prints what was NaN, infinite or absurd in the dumped step and in its replay on this machine.
+  """Prints the values that were NaN, infinite or too large in the dumped step and in its replay here.
 
   Args:
     file: a run's `nan_dump/step_*.npz`.
 
   Returns:
-    0 if the replay is not finite either, 1 if this machine cannot reproduce it.
+    0 if the replay is not finite either, 1 if this machine does not reproduce it.
   """
   console = Console()
   dump = Dump(file)

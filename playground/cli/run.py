@@ -1,8 +1,8 @@
 """`playground-run`: composes a run's configuration, checks it, trains.
 
-The flags are Hydra's, but for `--help`, `--verbose` and `--version`. `--cfg job` and training take the one composition;
+The flags are Hydra's, except `--help`, `--verbose` and `--version`. `--cfg job` and training share one composition;
 `--hydra-help`, `--info`, `--shell-completion` and `hydra.` keys go to Hydra's app. `-m` is ours: a sweep of jobs, each
-a process of its own (`playground.sweep`).
+in a process of its own (`playground.sweep`).
 """
 
 import argparse
@@ -47,9 +47,9 @@ _COMPLETION = re.compile("(install|uninstall|query)=(bash|fish|zsh)")
 
 
 def main() -> None:
-  """Runs the command and exits: 0 done, 2 for what the user can act on, 130 or 143 when interrupted."""
+  """Runs the command and exits: 0 done, 2 for errors that the user can act on, 130 or 143 when interrupted."""
   withhold_gl()
-  os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is not a PlaygroundError is a bug: show all of it
+  os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # any other error is a bug: show the traceback
   try:
     code = _main(sys.argv[1:])
   except BrokenPipeError:  # `playground-run --help | head`
@@ -60,7 +60,7 @@ def main() -> None:
   except KeyboardInterrupt:  # before training listens for signals
     code = 128 + signal.SIGINT
   if any(thread.name.startswith(("compiler", "preflight")) for thread in threading.enumerate()):
-    # Interrupted while compiling, or other machines did not answer: a normal exit would wait for them, minutes perhaps.
+    # Interrupted while compiling, or other machines did not answer: a normal exit might wait for minutes.
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
@@ -104,9 +104,9 @@ def _main(argv: Sequence[str]) -> int:
 
 
 def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
-  """Trains runs in one program (`playground.runs.together`), their overrides with `--` between them.
+  """Trains several runs in one program (`playground.runs.together`); `--` separates their overrides.
 
-  `--exploit-every` and `--explore` before those of the first make them a population.
+  `--exploit-every` and `--explore` in front of the first make them a population.
   What holds for the whole command (`trust`, `hardware.cache_dir`) stands in the first.
   """
   parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -129,7 +129,7 @@ def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
 
 
 def _downloaded(override: str) -> str:
-  """The override with the local path of a policy on W&B, so that a configuration never names W&B."""
+  """Downloads a policy on W&B and returns the override with its path: a configuration never names W&B."""
   key, equals, value = override.partition("=")
   return f"{key}={local_path(value)}" if key == "init_from" and equals else override
 
@@ -149,14 +149,14 @@ def _help(keys: Sequence[str], overrides: Sequence[str]) -> int:
 def _hydra_app(
   flags: Sequence[str], overrides: Sequence[str], config: RunConfig | None = None, verbose: bool = False
 ) -> int:
-  """Lets Hydra show what only it has, such as its own configuration, or train with settings of its own."""
+  """Runs Hydra's app: shows its own configuration, or trains with settings of its own."""
   codes = []
 
   def job(_: object) -> None:
     assert config is not None, "composed unless Hydra only shows something"
     try:
       codes.append(_train(config, verbose))
-    except PlaygroundError as error:  # Hydra would say a line of its own about it
+    except PlaygroundError as error:  # Hydra would print a line of its own
       codes.append(_report(error))
 
   register_options()
@@ -167,7 +167,7 @@ def _hydra_app(
 
 
 def _shown(config: RunConfig, package: str | None) -> str:
-  """The configuration as YAML, or what it has at a dotted key."""
+  """Returns the configuration, or its section at a dotted key, as YAML."""
   if package is None:
     return to_yaml(config)
   section: Plain = config.resolved
@@ -183,7 +183,7 @@ def _refuse(message: str) -> NoReturn:
 
 
 def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
-  """Raises ConfigError for flags of Hydra's that do nothing here, or not by themselves."""
+  """Raises ConfigError for flags of Hydra that have no effect here, or none on their own."""
   for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
     if getattr(args, name) is not None:
       _refuse(f"--{name.replace('_', '-')} is no option")
@@ -210,7 +210,7 @@ def _train(config: RunConfig, verbose: bool) -> int:
 
 
 def _trusted(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
-  """The overrides without `trust=<package>` or `trust=[<package>, ...]`, and the packages that those name."""
+  """Splits off `trust=<package>` and `trust=[<package>, ...]`: returns the other overrides, and the packages."""
   others, packages = [], []
   for text in overrides:
     override = parse_with_hydra(text)

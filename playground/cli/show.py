@@ -1,4 +1,4 @@
-"""`playground show <task>`: observations, rewards, terminations, commands, events and hyperparameters, as tables."""
+"""`playground show <task>`: prints observations, rewards, terminations, commands, events, hyperparameters."""
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,24 +20,24 @@ if TYPE_CHECKING:
   from playground.envs.base import Env
   from playground.mdp.terms import Term
 
-_WIDE = 180  # columns, where no terminal says how many there are
+_WIDE = 180  # columns, without a terminal
 Row = Section
 
 
 def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_views: int = 16) -> int:
-  """Prints tables about a task, or writes what its camera sees.
+  """Prints tables about a task, or writes images of its camera.
 
   Args:
-    task: a task, or `randomization=<name>` alone for what that draws.
+    task: a task, or `randomization=<name>` alone for its events.
     overrides: as for playground-run.
-    views: instead of tables, the picture to write, of the camera's view on randomised models.
-    num_views: models in it.
+    views: instead of tables, the image file to write, of the camera's view on randomised models.
+    num_views: models in the image.
 
   Returns:
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such task, or one that cannot be built.
+    PlaygroundError: no such task, or an invalid one.
   """
   console = Console()
   console = console if console.is_terminal else Console(width=_WIDE)
@@ -60,13 +60,13 @@ def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_v
 
 
 def describe(config: RunConfig, env: "Env") -> Iterator[RenderableType]:
-  """Yields tables: facts, observations, rewards, terminations, commands, events, hyperparameters."""
+  """Yields tables: sizes and rates, observations, rewards, terminations, commands, events, hyperparameters."""
   import jax
 
   from playground.randomization import Randomizer
 
   section, choices = config.resolved["env"], config.choices
-  Randomizer(env.mj_model, config.env.get("events") or {})  # an event without a target is an error before any table
+  Randomizer(env.mj_model, config.env.get("events") or {})  # an event without a target raises before the first table
   metrics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
   yield _facts(choices["env"], _facts_of(env, section, choices))
   yield _table("observations", list(_observations(env)))
@@ -106,7 +106,7 @@ def _terms(env: "Env", kind: str) -> "list[Term]":
 
 
 def _row(term: "Term") -> dict[str, Plain]:
-  """Cells that terms of all kinds have."""
+  """Returns the cells that terms of all kinds share."""
   return {
     "name": term.name,
     "function": function_and_source(term.func, term.name),
@@ -116,7 +116,7 @@ def _row(term: "Term") -> dict[str, Plain]:
 
 
 def _rewards(env: "Env", metrics: Section) -> Iterator[Row]:
-  """Reward terms; those that a task computes itself have no weight."""
+  """Lists reward terms; those that a task computes itself have no weight."""
   terms = _terms(env, "rewards")
   own = [name.removeprefix("reward/") for name in metrics if name.startswith("reward/")]
   reward = getattr(type(env.unwrapped), "reward", None)
@@ -128,7 +128,7 @@ def _rewards(env: "Env", metrics: Section) -> Iterator[Row]:
 
 
 def _observations(env: "Env") -> Iterator[Row]:
-  """Observation terms by group, the whole group first."""
+  """Lists observation terms by group, the whole group first."""
   manager = getattr(env.unwrapped, "observations", None)
   parts = env.observation_parts or {"state": {}}
   sizes = env.observation_size
@@ -154,7 +154,7 @@ def _observation(term: "Term", group: str) -> dict[str, Plain]:
 
 
 def _events(events: Section | None) -> Iterator[Row]:
-  """Events in the order in which they apply, within a mode."""
+  """Lists events by mode, in the order in which they apply."""
   from playground.mdp.terms import bind_one
 
   for name, entry in (events or {}).items():
@@ -171,7 +171,7 @@ def _events(events: Section | None) -> Iterator[Row]:
 
 
 def function_and_source(func: Callable[..., object], known: str = "") -> str:
-  """A function's name unless it is `known`, and its file and line from the top of its package."""
+  """Returns a function's name unless it is `known`, and its file and line from the top of its package."""
   target = inspect.unwrap(func)
   path = Path(inspect.getsourcefile(target) or "?")
   depth = target.__module__.count(".") + (2 if path.stem == "__init__" else 1)
@@ -198,7 +198,7 @@ _COLUMNS = (
 
 
 def _table(title: str, rows: Sequence[Row]) -> RenderableType:
-  """A table of the columns that some row has; `none` without rows."""
+  """Builds a table of the columns that any row has; `none` without rows."""
   columns = [name for name in _COLUMNS if any(row.get(name) for row in rows)]
   table = Table(box=None, padding=(0, 2, 0, 0))
   for name in columns:
@@ -209,7 +209,7 @@ def _table(title: str, rows: Sequence[Row]) -> RenderableType:
 
 
 def _facts(title: str, rows: Iterable[tuple[str, Plain]]) -> RenderableType:
-  """A table of keys and values."""
+  """Builds a table of keys and values."""
   table = Table(show_header=False, box=None, padding=(0, 2))
   for key, value in rows:
     table.add_row(Text(key, style="cyan"), Text(format_value(value)))

@@ -1,4 +1,4 @@
-"""`playground sweep status|collect|retry|stop <folder>`: from the files alone, whatever became of who started it."""
+"""`playground sweep status|collect|retry|stop <folder>`: works on the files of a sweep alone."""
 
 from collections.abc import Sequence
 
@@ -21,17 +21,17 @@ def status(folder: str) -> int:
 
 
 def collect(folder: str) -> int:
-  """Writes sweep.csv, groups.csv, the curves and report.html from what is there."""
+  """Writes sweep.csv, groups.csv, the curves and report.html from the finished jobs."""
   write_result(SweepDirectory.open(folder))
   return 0
 
 
 def retry(folder: str, *overrides: str, trust: Sequence[str] = ()) -> int:
-  """Does what is missing, failed jobs included; returns how many failed again.
+  """Runs the missing jobs, failed ones included; returns how many failed again.
 
   Args:
-    folder: the sweep's.
-    overrides: how it is run, where that is to change; jobs' folder of compiled programs (`hardware.cache_dir`).
+    folder: the folder of the sweep.
+    overrides: changed settings of the launcher, and the jobs' folder of compiled programs (`hardware.cache_dir`).
     trust: packages whose tasks jobs may name.
   """
   sweep = SweepDirectory.open(folder)
@@ -41,7 +41,7 @@ def retry(folder: str, *overrides: str, trust: Sequence[str] = ()) -> int:
 
 
 def stop(folder: str) -> int:
-  """Asks the jobs that run to save and leave, wherever they are."""
+  """Asks all running jobs to save and exit, on any machine."""
   sweep = SweepDirectory.open(folder)
   sweep.stop_file.touch()
   print(f"Jobs of {sweep.path} are asked to stop; `playground sweep retry {sweep.path}` goes on.")

@@ -1,4 +1,4 @@
-"""`playground tune-buffers <task>`: what Warp's buffers must hold."""
+"""`playground tune-buffers <task>`: measures the sizes that Warp's buffers need."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,7 +13,7 @@ from playground.physics.warp_buffer_sizes import ROOM, Act, BufferSizes, measure
 from playground.runs.loaded_policy import load_policy
 from playground.runs.progress import Progress
 
-# By key of a task's config: what it bounds, and how much of that was needed.
+# By key of a task's config: what the buffer holds, and how much of it was used.
 _BUFFERS: dict[str, tuple[str, Callable[[BufferSizes], str]]] = {
   "njmax": ("constraint rows of one environment", lambda sizes: str(sizes.constraints)),
   "naconmax_per_env": ("contacts or candidate pairs, mean of the environments", lambda sizes: f"{sizes.contacts:.2f}"),
@@ -22,7 +22,7 @@ _BUFFERS: dict[str, tuple[str, Callable[[BufferSizes], str]]] = {
 
 
 def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: int, steps: int) -> int:
-  """Rolls a task out on Warp, prints the most that its steps needed and the sizes advised.
+  """Rolls a task out on Warp, and prints the largest use of each buffer and the advised size.
 
   Args:
     task: its name.
