@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class NonfiniteError(PlaygroundError):
-  """Too many environment steps went NaN, infinite or absurd for the run to go on."""
+  """Too many environment steps were NaN, infinite or too large: the run stops."""
 
 
 class RunCallbacks:
@@ -73,7 +73,7 @@ class RunCallbacks:
     self._evaluations = 0
     self._step = plan.step or 0
     self._return: float | None = None  # of the newest row
-    self._copied = False  # whether the policy since then is another agent's
+    self._copied = False  # whether the policy has been replaced by another agent's since then
     self._recording: Recording | None = None
     self._rates: list[float] = []  # steps per second, by row
     self._rejected = 0  # gradient steps
@@ -85,7 +85,7 @@ class RunCallbacks:
 
   @property
   def wall_clock_s(self) -> float:
-    """Time the run has taken, over all its starts, without compiling."""
+    """Returns the run's time over all its starts, without compilation, s."""
     return self._earlier_s + time.perf_counter() - self._began
 
   def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Recording | None) -> None:
@@ -124,7 +124,7 @@ class RunCallbacks:
     return self._interrupts.signum is not None
 
   def finish(self, loop: Loop, state: TrainState, completed: bool) -> None:
-    """Waits for what is being written, and writes the run's result."""
+    """Waits for pending writes, and writes the run's result."""
     self._progress.phase("saving")
     self._store.close()
     wanted = self._config.video.enable and self._config.video.at_end and not self.should_stop()
@@ -162,16 +162,16 @@ class RunCallbacks:
     )
 
   def close(self, status: str = "failed") -> None:
-    """Ends the trackers and the video thread, once; without a status the run did not get to its end."""
+    """Closes the trackers and the video thread, once; without a status the run did not finish."""
     if not self._closed:
       self._closed = True
-      if self._trace == "on":  # the run ended inside the stretch
+      if self._trace == "on":  # the run ended while it was traced
         jax.profiler.stop_trace()
       self._videos.shutdown(cancel_futures=True)
       self._trackers.close(status)
 
   def _scores(self) -> dict[str, float | None]:
-    """The result as metrics.csv has it: of the whole run, however often it was resumed."""
+    """Returns the result from metrics.csv, which covers all starts of the run."""
     table = read_metrics(self._run_dir.metrics_csv)
     column = lambda name: np.asarray(table[name] if name in table else np.full(len(table), np.nan), float)
     steps, returns, rate = (column(name) for name in ("step", RETURN, "time/steps_per_second"))
@@ -179,7 +179,7 @@ class RunCallbacks:
     chosen = "mode" if self._trainer.config.deterministic_eval else "sampled"
     own = np.isfinite(returns) & ~np.isfinite(column(PARENT))
     scores = [(float(value), int(step)) for value, step in zip(returns[own], steps[own], strict=True)]
-    # As `checkpoints/best` has it: of several the last, and never a policy that is not saved, as the untrained one.
+    # As for `checkpoints/best`: the last of equal ones, and never a policy without a checkpoint, as the untrained one.
     best_return, best_step = max((score for score in scores if score[1] > 0), default=(None, None))
     trained = np.isfinite(rate)
     taken = np.diff(steps, prepend=0)[trained]
@@ -195,11 +195,11 @@ class RunCallbacks:
     }
 
   def _from_start(self, at: float | None) -> float | None:
-    """Seconds from the start of the process, or of the chain's stage, to a time of `time.perf_counter`."""
+    """Returns the seconds from the start of the process or stage to a time of `time.perf_counter`."""
     return None if at is None else process_age_s() - self._process_began_s - (time.perf_counter() - at)
 
   def _start_video(self, step: int, recording: Recording) -> None:
-    """Renders the first recorded episodes in a child process while training goes on."""
+    """Renders the first recorded episodes in a child process while training continues."""
     view = self._config.video
     self._video = self._videos.submit(
       render_video,
@@ -214,7 +214,7 @@ class RunCallbacks:
     )
 
   def _advance_trace(self, metrics: Metrics) -> None:
-    """With `profile.enable`, traces the stretch between the first two rows that trained."""
+    """With `profile.enable`, traces training between the first two trained rows."""
     if self._trace == "on":
       jax.profiler.stop_trace()
       self._trace = "off"
@@ -224,7 +224,7 @@ class RunCallbacks:
       self._progress.print(f"tracing into {self._profile}")
 
   def _check_buffers(self, taken: int, metrics: Metrics) -> None:
-    """Says, once, that Warp's buffers are too small for the task."""
+    """Warns once if Warp's buffers are too small for the task."""
     overflows = metrics.get("training/overflows", 0.0)
     if overflows and not self._warned_of_buffers:
       self._warned_of_buffers = True
@@ -265,7 +265,7 @@ class NonMainCallbacks:
     check_updates(metrics, self._allowed, step)
 
   def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
-    """Process 0 saves."""
+    """Does nothing: process 0 saves."""
 
   def should_stop(self) -> bool:
     return self._interrupts.signum is not None
@@ -281,10 +281,10 @@ def check_fraction(fraction: float, allowed: float, step: int, where: str = "") 
 
 
 def check_updates(metrics: Metrics, allowed: float, step: int) -> int:
-  """Counts a row's gradient steps that were left out because they were not finite.
+  """Counts a row's gradient steps that were skipped because they were not finite.
 
   Raises:
-    NonfiniteError: they are more than the allowed share.
+    NonfiniteError: their share is above the limit.
   """
   bad, taken = (round(metrics.get(f"training/{name}", 0.0)) for name in ("nonfinite_updates", "gradient_steps"))
   if bad > allowed * taken:
@@ -296,7 +296,7 @@ def check_updates(metrics: Metrics, allowed: float, step: int) -> int:
 
 
 def episodes_of(recording: Recording, count: int) -> dict[str, PyTree]:
-  """The first `count` episodes of an evaluation's recording, one after the other: `qpos` [T, nq] and mocap poses."""
+  """Returns the first `count` recorded episodes, concatenated: `qpos` [T, nq] and mocap poses."""
   arrays = {name: local_shard(value, axis=1) for name, value in recording.items()}
   active = arrays.pop("active")[:, :count] > 0
   columns, rows = np.nonzero(active.T)

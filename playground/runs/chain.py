@@ -1,11 +1,11 @@
-"""A chain of runs (fine-tuning): each stage starts from the weights of the one before it, with a fresh optimiser.
+"""A chain of runs (fine-tuning): each stage starts from the previous stage's weights, with a new optimiser.
 
 Every stage is an ordinary run directory inside the chain's, `<chain>/<number>_<stage>/`. All of them are written, their
-configurations resolved, before the first is trained: what a chain still has to do lies on disk, and going on with it is
-resuming the first stage that is not finished, whether that has begun or not.
+configurations resolved, before the first is trained. So the remaining work is on disk, and a resumed chain resumes its
+first unfinished stage, whether that has started or not.
 
-The stages run one after another in this process. A child process for each would free its memory as surely, but would
-start JAX and the device again for every stage, and would need signals and terminals handed on.
+The stages run one after another in this process. A child process for each would free its memory, too, but would
+start JAX and the device again for every stage, and would have to forward signals and the terminal.
 """
 
 import contextlib
@@ -37,19 +37,19 @@ TrainRun = Callable[["RunConfig", Interrupts, float], int]
 
 
 def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun) -> int:
-  """Runs the stages of a new chain, or what is left of one that is resumed.
+  """Runs the stages of a new chain, or the unfinished stages of a resumed one.
 
   Args:
-    config: the chain's, with its stages.
-    interrupts: what the process has been told.
+    config: of the chain, with its stages.
+    interrupts: signals that the process received.
     train_run: trains one run: (its config, interrupts, age of the process) -> exit code.
 
   Returns:
     The exit code, as of a run.
 
   Raises:
-    PlaygroundError: what the user can act on, naming the stage; nothing has been trained or written if a stage cannot
-      work at all.
+    PlaygroundError: an error of a stage, which it names; an invalid stage raises before anything is trained or
+      written.
   """
   if config.resume is None:
     _check(config)
@@ -59,9 +59,9 @@ def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun
     if chain.status.get("status") == "finished":
       print(f"{chain.path} is finished: nothing to resume (init_from={chain.path} trains on from its weights).")
       return 0
-  setup(config.hardware)  # from here on a process knows whether it writes
+  setup(config.hardware)  # afterwards a process knows whether it writes
   folders = stage_folders(config.curriculum)
-  began_s, before = 0.0, None  # what the first stage starts from is in its config
+  began_s, before = 0.0, None  # the config of the first stage names its weights
   with chain.recorded() if is_main() else contextlib.nullcontext(), noting_loss(chain.note_loss):
     try:
       for stage, (name, folder) in zip(stages, folders.items(), strict=True):
@@ -74,7 +74,7 @@ def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun
             train_run(replace(stage, init_from=before), interrupts, began_s)
           interrupts.stop_saving()
           began_s = process_age_s()
-          gc.collect()  # what the stage held on the device goes now, not when Python comes round to it
+          gc.collect()  # frees the stage's device memory now, not at the next garbage collection
         if any_process(interrupts.signum is not None):
           break
         before = str(run_dir.path)
@@ -88,7 +88,7 @@ def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun
 
 
 def _check(config: "RunConfig") -> None:
-  """Builds every stage, so that what cannot work ends the chain before its first stage is trained.
+  """Builds every stage, so that an invalid stage ends the chain before any is trained.
 
   This traces each task's reset for the sizes of its observation: seconds, where a stage takes minutes.
   """
@@ -103,7 +103,7 @@ def _check(config: "RunConfig") -> None:
       need_camera(env.mj_model, stage.video.camera, "video.camera")
       Randomizer(env.mj_model, stage.env.events)
       trainer = Trainer(env, stage.agent, hardware.mesh, hardware.network_precision)
-      trainer.notices()  # raises for a replay buffer that the device cannot hold
+      trainer.notices()  # raises for a replay buffer larger than device memory
       size = env.observation_size
       facts: dict[str, object] = {"agent.name": stage.agent_name, "size of the action": env.action_size}
       facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
@@ -117,7 +117,7 @@ def _check(config: "RunConfig") -> None:
 
 
 def _compare(env: str, facts: dict[str, object], before: str, theirs: dict[str, object]) -> None:
-  """Raises ConfigError where a stage's networks are not those of the stage before it."""
+  """Raises ConfigError where a stage's networks differ from the previous stage's."""
   for key in {**facts, **theirs}:
     if facts.get(key) != theirs.get(key):
       here, there = (side.get(key, "not there") for side in (facts, theirs))
@@ -125,7 +125,7 @@ def _compare(env: str, facts: dict[str, object], before: str, theirs: dict[str, 
 
 
 def _lay_out(config: "RunConfig") -> "tuple[RunDirectory, list[RunConfig]]":
-  """Makes the chain's directory and those of its stages; returns the stages' configurations as of runs to resume.
+  """Makes the directories of the chain and its stages; returns the stages' configurations, as for resumed runs.
 
   Process 0 makes them, the others wait for that.
   """
@@ -145,13 +145,13 @@ def _lay_out(config: "RunConfig") -> "tuple[RunDirectory, list[RunConfig]]":
     stages.append(replace(stage, resolved=going_on, run_dir=path, resume=path, init_from=None))
     before = path
   if is_main():
-    chain.write_config(config.resolved, config.overrides)  # last: from here on it is a chain that can be resumed
+    chain.write_config(config.resolved, config.overrides)  # last: the chain can be resumed from here on
     share(str(chain.path.absolute()))
   return chain, stages
 
 
 def _say_where(chain: RunDirectory) -> None:
-  """The last lines of a chain: how its stages ended, and what lies where."""
+  """Prints how the stages of a chain ended, and the paths of its files."""
   summary = chain.summary
   print(f"\n{summary['status']}: {summary['steps']:,} steps in all")
   for stage in summary["stages"]:

@@ -1,4 +1,4 @@
-"""What a chain's directory says of all its stages: one metrics.csv, one curve, one summary."""
+"""Writes the result of a chain over all its stages: one metrics.csv, one curve, one summary."""
 
 from collections.abc import Mapping
 
@@ -14,7 +14,7 @@ _OF_A_RUN = (*_RESULT, "steps", "steps_per_second", "wall_clock_s")
 
 
 def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
-  """Writes metrics.csv, plots and summary.json of a chain from what its stages have so far.
+  """Writes metrics.csv, plots and summary.json of a chain from its stages' files.
 
   Args:
     chain: its directory.
@@ -33,7 +33,7 @@ def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
   chain.write_summary(
     {
       "status": status,
-      # Stages need not be paid the same way, so these are of the last one, and so is the step counted.
+      # Stages may have different rewards, so return and step are those of the last stage.
       **{key: last.get(key) for key in _RESULT},
       "steps": steps,
       "steps_per_second": steps / seconds if seconds else None,
@@ -44,13 +44,13 @@ def write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
 
 
 def _stage(name: str, run: RunDirectory) -> dict[str, Plain]:
-  """A stage's result; None where it has none yet."""
+  """Returns the result of a stage; None where it has none yet."""
   status, summary = run.status.get("status", "not begun"), run.summary
   return {"name": name, "folder": run.path.name, "status": status, **{key: summary.get(key) for key in _OF_A_RUN}}
 
 
 def _write_metrics(chain: RunDirectory, runs: Mapping[str, RunDirectory]) -> None:
-  """One table of all stages: steps and wall-clock time run on, `stage` says which it is."""
+  """Writes one table of all stages: steps and wall-clock time accumulate, column `stage` names the stage."""
   import pandas as pd
 
   tables, steps, seconds = [], 0, 0.0

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _STEP = re.compile(r"[0-9]{1,18}")
 STAGE = "stage"  # the one column of text, in a chain's metrics.csv
-RETURN = "eval/episode_reward"  # of actions as `agent.deterministic_eval` says
+RETURN = "eval/episode_reward"  # of the actions that `agent.deterministic_eval` chooses
 OTHER_RETURNS = {"mode": "eval/mode/episode_reward", "sampled": "eval/sampled/episode_reward"}  # of the other kind
 
 
@@ -22,10 +22,10 @@ class Table(NamedTuple):
   """The content of a metrics.csv.
 
   Attributes:
-    columns: their names, the first is `step`.
+    columns: names, the first is `step`.
     rows: by column; a value that is not a number is ''.
-    torn: whether the last line has no end, as a SIGKILL leaves it; it is not among the rows.
-    damage: what else is not as it was written, '' if nothing is.
+    torn: whether the last line is incomplete, as after a SIGKILL; it is not among the rows.
+    damage: description of any other damage, '' if there is none.
   """
 
   columns: list[str]
@@ -37,12 +37,12 @@ class Table(NamedTuple):
 class CsvTracker:
   """Appends rows to a CSV file whose first column is `step` and whose other columns grow as metrics appear.
 
-  A file that is already there is continued. What a SIGKILL left of a half-written last row is dropped; a file that is
-  damaged otherwise is kept aside, as `metrics_damaged.csv`, and what can be read of it is written anew.
+  An existing file is continued. A half-written last row (SIGKILL) is dropped. A file with other damage is renamed to
+  `metrics_damaged.csv`, and its readable rows are written to a new file.
 
   Args:
     path: the file.
-    columns: those that the file had at the checkpoint that the run continues from; its header may be damaged.
+    columns: names of the columns at the checkpoint that the run continues from; the header may be damaged.
     notify: takes one sentence about a damaged file.
   """
 
@@ -61,7 +61,7 @@ class CsvTracker:
 
   @property
   def columns(self) -> list[str]:
-    """Names of the columns so far."""
+    """Returns the names of the columns so far."""
     return list(self._columns)
 
   def log(self, step: int, metrics: dict[str, float]) -> None:
@@ -80,7 +80,7 @@ class CsvTracker:
     self._file.flush()
 
   def truncate_after(self, step: int) -> int:
-    """Drops, atomically, every row whose step is larger than `step`; returns the last step that is left, or -1."""
+    """Drops, atomically, every row whose step is larger than `step`; returns the last remaining step, or -1."""
     if not self._path.is_file():
       return -1
     rows = [row for row in self._rows() if int(row["step"]) <= step]
@@ -106,7 +106,7 @@ class CsvTracker:
 
 
 def read_metrics(path: Path) -> "pd.DataFrame":
-  """What can be read of a metrics.csv: `step` as integers, the other columns as numbers; empty without a file."""
+  """Reads a metrics.csv: `step` as integers, the other columns as numbers; empty without a file."""
   import pandas as pd
 
   table = read_table(path) if path.is_file() else Table(["step"], [], False, "")
@@ -116,13 +116,13 @@ def read_metrics(path: Path) -> "pd.DataFrame":
 
 
 def read_table(path: Path, known: Sequence[str] = ()) -> Table:
-  """Reads what can be read of a metrics.csv.
+  """Reads the undamaged rows of a metrics.csv.
 
-  Every row is a line of numbers of its own, so a stray quote spoils no more than its cell.
+  Every row is parsed as a line of numbers, so a stray quote damages only its cell.
 
   Args:
     path: the file.
-    known: its first columns, if they are known from elsewhere: they hold, whatever the header says.
+    known: names of its first columns, if known from elsewhere; they override the header.
   """
   content, newline, rest = path.read_bytes().decode("utf-8", errors="replace").rpartition("\n")
   if not newline:
@@ -138,7 +138,7 @@ def read_table(path: Path, known: Sequence[str] = ()) -> Table:
   rows = []
   for line in lines:
     cells = line.split(",")
-    if headless:  # columns that came after the known ones have lost their names
+    if headless:  # the names of columns after the known ones are lost
       cells = cells[: len(columns)]
     values = [text if name == STAGE else _number(text) for name, text in zip(columns, cells, strict=False)]
     if len(cells) == len(columns) and _STEP.fullmatch(values[0]):
@@ -151,7 +151,7 @@ def read_table(path: Path, known: Sequence[str] = ()) -> Table:
 
 
 def _number(text: str) -> str:
-  """A number as it is written, without quotes around it; '' if it is none."""
+  """Returns the text of a number without quotes; '' if it is none."""
   text = text.strip("\"' \r\ufeff")
   try:
     float(text)
@@ -174,5 +174,5 @@ def _joined(cells: Sequence[str]) -> str:
 
 
 def _unique(names: Sequence[str]) -> list[str]:
-  """The names, with a number behind one that is there already."""
+  """Returns the names; a repeated one gets a number."""
   return [name if name not in names[:i] else f"{name} ({i})" for i, name in enumerate(names)]

@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP: finish the work in flight, save, leave."""
+"""Handles SIGINT, SIGTERM and SIGHUP: finish the current step, save, exit."""
 
 import contextlib
 import os
@@ -11,7 +11,7 @@ from typing import Self
 
 
 class Interrupted(BaseException):
-  """The process was told to go while there was nothing to save yet (or was told twice)."""
+  """The process got a signal while it had nothing to save yet, or a second signal."""
 
   def __init__(self, signum: int):
     super().__init__(signal.Signals(signum).name)
@@ -20,7 +20,7 @@ class Interrupted(BaseException):
 
 @contextlib.contextmanager
 def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-  """While it lasts, `handle` gets SIGINT, SIGTERM and (unless `nohup` ignores it) SIGHUP; only for a main thread."""
+  """Context in which `handle` gets SIGINT, SIGTERM and (unless `nohup` ignores it) SIGHUP; main thread only."""
 
   def hang_up(signum: int, frame: FrameType | None) -> None:
     _leave_terminal()
@@ -39,7 +39,7 @@ def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[No
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[threading.Event]:
-  """An event that these signals set: for loops mostly in callbacks of C code, where exceptions get lost."""
+  """Context with an event that these signals set: for loops in callbacks of C code, which swallow exceptions."""
   told = threading.Event()
   with on_signals(lambda *_: told.set()):
     yield told
@@ -61,17 +61,17 @@ class Interrupts:
     self._handlers.close()
 
   def start_saving(self) -> None:
-    """From here on the first signal is a flag. Raises `Interrupted` if there was one already.
+    """Makes the first signal set a flag from now on. Raises `Interrupted` if there was a signal already.
 
-    An exception that a signal raises inside a destructor or a callback of C code is swallowed there: compiling is full
-    of both.
+    Destructors and callbacks of C code swallow the exception that a signal raises in them; compilation has many of
+    both.
     """
     self.saving = True
     if self.signum is not None:
       raise Interrupted(self.signum)
 
   def stop_saving(self) -> None:
-    """What there was is saved; a signal that was a flag until now stays one."""
+    """Ends saving; a flag that is set stays set."""
     self.saving = False
 
   def _handle(self, signum: int, frame: FrameType | None) -> None:
@@ -81,12 +81,12 @@ class Interrupts:
 
 
 def exit_code(signum: int) -> int:
-  """What a shell reports for a process that this signal ended: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
+  """Returns the exit code of a process that the signal ended: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
   return 128 + signum
 
 
 def _leave_terminal() -> None:
-  """Sends output that went to a terminal which is gone to nowhere: writing there is an error."""
+  """Discards output to a terminal that is gone: writing to it raises."""
   for stream in (1, 2):
     if stat.S_ISCHR(os.fstat(stream).st_mode) and not os.isatty(stream):
       nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -1,4 +1,4 @@
-"""A trained policy and all that it needs to act: read from a run, on this machine."""
+"""Loads a trained policy of a run, with its task and networks, on this machine."""
 
 import dataclasses
 from collections.abc import Callable
@@ -30,8 +30,8 @@ class LoadedPolicy:
   Attributes:
     run_dir: the run's directory.
     config: the run's configuration.
-    checkpoint: where the policy is from.
-    env: the task, as the run trained it, unless it was asked for otherwise.
+    checkpoint: of the policy.
+    env: the task as the run trained it, or as `load_task` made it.
     hardware: this machine's devices.
     trainer: of the algorithm, whose `act(policy, obs, key, deterministic)` gives actions.
     policy: networks and normaliser, on the devices.
@@ -50,14 +50,14 @@ class LoadedPolicy:
     return self.config.choices["env"]
 
   def act(self, obs: Observation, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
-    """Actions in [-1, 1], [..., action_size]."""
+    """Returns actions in [-1, 1], [..., action_size]."""
     return self.trainer.act(self.policy, obs, key, deterministic)
 
   def at(self, path: Path) -> "LoadedPolicy":
-    """The policy of another checkpoint of the run, or of a stage of its chain, with this one's task and configuration.
+    """Returns the policy of another checkpoint of the run or its chain, with this task and configuration.
 
     Raises:
-      CheckpointError: it is gone or damaged, or its arrays have other shapes.
+      CheckpointError: the checkpoint is missing or damaged, or its arrays have other shapes.
     """
     checkpoint = Checkpoint(path)
     policy = self.trainer.place_policy(checkpoint.restore("policy", self.trainer.policy_shape()))
@@ -75,8 +75,8 @@ def load_policy(
 
   Args:
     path: a run directory, one of its checkpoints, or `pretrained:<task>`.
-    load_task: makes the task of a name and a configuration; `registry.load` if None.
-    platform: what to compute on; the run's, as far as this machine has it, if None.
+    load_task: builds a task from a name and a configuration; `registry.load` if None.
+    platform: device type; if None the run's, if this machine has it.
     precision: of the networks' matrix products; the run's if None.
 
   Raises:

@@ -1,4 +1,4 @@
-"""The record of the first step that went NaN, infinite or absurd, and its replay."""
+"""Dumps the first step that was NaN, infinite or too large, and replays it."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ def write_dump(folder: Path, step: int, captured: Step | None, config: Section) 
   """Writes the captured step as `step_<step>.npz`, with the run's config inside so that it can travel alone.
 
   Args:
-    folder: where to; made if needed.
+    folder: of the dump; made if needed.
     step: control steps after which it was noticed.
     captured: what to write.
     config: the run's resolved config.
@@ -41,10 +41,10 @@ def write_dump(folder: Path, step: int, captured: Step | None, config: Section) 
 
 
 class Dump:
-  """A dumped step: the last good state, the action, the randomised model and what came out."""
+  """A dumped step: the last finite state, the action, the randomised model and the resulting state."""
 
   def __init__(self, path: str | Path):
-    """Reads it; raises CheckpointError if it is missing or no dump."""
+    """Reads a dump; raises CheckpointError if the file is missing or no dump."""
     try:
       with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
@@ -56,7 +56,7 @@ class Dump:
     self._state, self.model, self.after = part("state"), part("model/"), part("after/")
 
   def state(self, env: Env) -> State:
-    """The last good state, for the task it came from."""
+    """Returns the last finite state, for the task of the dump."""
     template = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     names = [name for name, _ in _named(template)]
     missing = [name for name in names if name not in self._state]
@@ -65,12 +65,12 @@ class Dump:
     return jax.tree.unflatten(jax.tree.structure(template), [self._state[name] for name in names])
 
   def replay(self, env: Env) -> State:
-    """Takes the step again, on this machine's backend."""
+    """Repeats the step on this machine's backend."""
     return env.jitted[1](self.state(env), self.action, self.model, {})
 
 
 def nonfinite_fields(tree: PyTree) -> list[str]:
-  """Names of the leaves that hold a NaN, infinity or value beyond the guard's limit, with how many."""
+  """Counts values that are NaN, infinite or beyond the guard's limit, by name of the leaf."""
   lines = []
   for name, leaf in _named(tree):
     values, limit = np.asarray(leaf), MAX_VELOCITY if "qvel" in name else MAX_VALUE

@@ -23,8 +23,8 @@ def plot_learning_curve(metrics_csv: str | Path, out_dir: str | Path) -> list[Pa
 
   Args:
     metrics_csv: needs columns `step` and `eval/episode_reward`; `eval/episode_reward_std` adds the band,
-      `eval/mode/episode_reward` or `eval/sampled/episode_reward` a line of the other way to act,
-      `time/wall_clock_s` (seconds) the second picture and `stage` (names) a line where each stage begins.
+      `eval/mode/episode_reward` or `eval/sampled/episode_reward` a line for the other kind of action,
+      `time/wall_clock_s` (seconds) the second figure and `stage` (names) a line where each stage begins.
     out_dir: made if needed.
 
   Returns:
@@ -61,7 +61,7 @@ def _draw(rows: "pd.DataFrame", column: str, label: str, path: Path) -> None:
   own = {"mode": "sampled", "sampled": "mode"}[next(iter(others))] if len(others) == 1 else ""
   names = rows["stage"].to_numpy(str) if "stage" in rows else np.full(len(rows), "")
   begins = [0, *np.flatnonzero(names[1:] != names[:-1]) + 1, len(rows)]
-  for begin, end in pairwise(begins):  # a line each, since stages need not be paid the same way
+  for begin, end in pairwise(begins):  # a line each, since stages may have different rewards
     part, first = slice(begin, end), begin == 0
     if std is not None:
       low, high = (mean - std)[part], (mean + std)[part]

@@ -1,4 +1,4 @@
-"""Whether runs can be a population, whose agents learn from each other (`playground.learning.population`)."""
+"""Checks whether runs can be a population, whose agents learn from each other (`playground.learning.population`)."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: Sequence[str]) -> Population | None:
-  """Returns the population that runs are, None where `exploit_every` is 0.
+  """Returns the population of the runs, None where `exploit_every` is 0.
 
   Raises:
     ConfigError: there is one run only, their programs differ, or their tasks do, so that returns do not compare.
-    UnknownNameError: `explore` names something else than a number of the agent that is an argument of the program.
+    UnknownNameError: `explore` names a key that is no number of the agent, or no argument of the program.
   """
   if not exploit_every:
     return None

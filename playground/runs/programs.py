@@ -1,4 +1,4 @@
-"""Which runs have the same compiled program: they can train together, and a later start loads what one compiled."""
+"""Identifies runs with the same compiled program: they can train together, and a later start loads it."""
 
 import json
 from collections.abc import Iterable
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def program_of(config: "RunConfig") -> str | None:
-  """What a run's compiled program depends on, as text: runs in which it is the same can train together.
+  """Returns all that a run's compiled program depends on, as text; runs with equal texts can train together.
 
   Returns:
     None for a run that trains alone: a chain, one that W&B tracks (it has one run a process), one that is profiled, and
@@ -34,14 +34,14 @@ def program_of(config: "RunConfig") -> str | None:
   names = [name for name in config.resolved if name not in ("seed", "run_dir", "resume", "init_from")]
   try:
     return _structure(config, names, config.init_from is not None)
-  except ConfigError:  # which the run itself says, and nobody else's does
+  except ConfigError:  # only the run's own configuration has it
     return None
 
 
 def stored_program(
   config: "RunConfig", trainer: Trainer, hardware: Hardware, from_policy: bool
 ) -> StoredProgram | None:
-  """Returns where a run's compiled functions are kept: in a file that is named by the hash of all that shapes them.
+  """Returns the file of a run's compiled functions, named by the hash of everything that determines them.
 
   These are the sections of the configuration that `train.prepare` builds from, without the numbers that are arguments;
   the task's values and arrays; the code, the versions and the machine (`fingerprint`).
@@ -53,7 +53,7 @@ def stored_program(
     from_policy: whether the initial state is made from a policy.
 
   Returns:
-    None where none are kept: without JAX's cache of compiled programs, on several machines, on Warp (its functions hold
+    None where none is stored: without JAX's compilation cache, on several machines, on Warp (its functions hold
     addresses of this process), and for a task from a notebook.
   """
   env, cache = trainer.env.unwrapped, hardware.facts["compilation_cache"]
@@ -77,7 +77,7 @@ def stored_program(
 
 
 def _structure(config: "RunConfig", sections: list[str], from_policy: bool) -> str:
-  """Sections of a run's configuration without the numbers that are no constants of the program, as text.
+  """Returns sections of a configuration as text, without the numbers that are arguments of the program.
 
   Raises:
     ConfigError: a term's number is invalid.
@@ -90,7 +90,7 @@ def _structure(config: "RunConfig", sections: list[str], from_policy: bool) -> s
 
 
 def without(values: dict[str, Plain], keys: Iterable[str]) -> dict[str, Plain]:
-  """Returns nested values without those at dotted keys."""
+  """Returns nested values without the given dotted keys."""
   heads: dict[str, list[str]] = {}
   for key in keys:
     head, _, rest = key.partition(".")
@@ -100,7 +100,7 @@ def without(values: dict[str, Plain], keys: Iterable[str]) -> dict[str, Plain]:
 
 
 def _startup_ranges(config: "RunConfig") -> list[str]:
-  """Keys of what randomised models are drawn from, which is done outside the program for each run."""
+  """Returns the keys of startup ranges: models are drawn outside the program, for each run."""
   events = {name: entry for name, entry in config.env.events.items() if entry is not None}
   drawn = [name for name, entry in events.items() if is_model_field(name, entry) and entry.get("mode") == "startup"]
   return [f"env.events.{name}.params.{key}" for name in drawn for key in ("range", "mean", "std")]

@@ -18,10 +18,10 @@ class Progress:
 
   Args:
     total_steps: the run's whole budget; a resumed run starts its bar where it continues.
-    enabled: False shows no progress at all; `print` still prints.
-    console: where to; standard output by default.
-    activity: what makes the steps, as the bar calls it.
-    name: what lines begin with, if it is one of several.
+    enabled: False shows no progress; `print` still prints.
+    console: for the output; standard output by default.
+    activity: label of the bar.
+    name: prefix of lines, if it is one of several runs.
   """
 
   def __init__(
@@ -65,20 +65,20 @@ class Progress:
       self._print_plain(self._line)
 
   def silent(self, name: str) -> "Progress":
-    """Returns one for another run beside this one: it only prints, above the same bar."""
+    """Returns a Progress for another run, which only prints above the same bar."""
     return Progress(self._total, enabled=False, console=self._console, name=name)
 
   def phase(self, text: str) -> None:
-    """Shows what is going on while no steps are made (building, compiling, rendering)."""
+    """Shows the current phase while no steps are made (building, compiling, rendering)."""
     if self._live:
-      # At once: the first thing a compile does may be to hold the lock that the refreshing thread needs.
+      # At once: compilation may hold the lock that the refreshing thread needs.
       self._bar.update(self._task, description=text, total=None, text="", refresh=True)
     elif self._enabled:
       self._print_plain(text)
     self._step = None  # the clock of steps/s must not count this phase
 
   def update(self, step: int, steps_per_second: float | None = None, last_return: float | None = None) -> None:
-    """Shows that `step` environment steps of the budget are done; what is not given is measured or kept."""
+    """Shows that `step` environment steps of the budget are done; missing values are measured or stay as they were."""
     now = time.monotonic()
     if steps_per_second is not None:
       self._steps_per_second = steps_per_second
@@ -114,7 +114,7 @@ class Progress:
 
 
 class _Terminal:
-  """A stream that ignores that its terminal is gone: the run is about to be told by SIGHUP, and saves."""
+  """A stream that ignores that its terminal is gone: SIGHUP follows, and the run saves."""
 
   def __init__(self, stream: TextIO):
     self._stream = stream

@@ -1,4 +1,4 @@
-"""What a run was made with: the commit of this checkout and the versions of the packages that decide numbers."""
+"""Records the commit of this checkout and the versions of the packages that affect results."""
 
 import os
 import platform
@@ -47,7 +47,7 @@ def package_versions() -> dict[str, str | None]:
 
 def git_state(root: Path = Path(__file__).parents[2]) -> GitState | None:
   """Returns {"commit", "dirty"} of the checkout that this package runs from, or None outside one."""
-  # A wheel in a venv inside somebody's own repository must not report that repository's commit as ours.
+  # A wheel in a venv inside another repository must not report that repository's commit as ours.
   toplevel = _git(root, "rev-parse", "--show-toplevel")
   commit = _git(root, "rev-parse", "HEAD")
   if not toplevel or not commit or Path(toplevel).resolve() != root.resolve():
@@ -56,7 +56,7 @@ def git_state(root: Path = Path(__file__).parents[2]) -> GitState | None:
 
 
 def process_age_s() -> float:
-  """Seconds since this process was started, interpreter and imports included; 0 where /proc does not say."""
+  """Returns seconds since this process started, interpreter and imports included; 0 without /proc."""
   try:
     started_ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
     uptime = float(Path("/proc/uptime").read_text().split()[0])

@@ -39,20 +39,20 @@ def weights_of(path: str | Path) -> Checkpoint:
 
 @dataclasses.dataclass
 class RestorePlan:
-  """What was found on disk before anything expensive began, and then what was restored from it.
+  """The files found on disk before anything expensive starts, and then the state restored from them.
 
   Attributes:
-    run_dir: the resumed run's, None for a new run.
+    run_dir: directory of the resumed run, None for a new run.
     checkpoints: the resumed run's, newest first.
-    weights: the checkpoint that a new run takes its weights from.
-    notices: sentences for the user, on what was restored and what was skipped.
+    weights: checkpoint of the weights of a new run.
+    notices: sentences for the user about restored and skipped checkpoints.
     state: the restored training state, on the devices.
     update: training steps done in it.
-    wall_clock_s: time the run had taken by then.
+    wall_clock_s: time of the run up to the checkpoint.
     policy: restored weights (host arrays) for a new run.
     columns: of metrics.csv at the restored checkpoint.
-    settings: those of the agent at the restored checkpoint, which population-based training may have changed.
-    began_s: age of the process when the run's turn came.
+    settings: the agent's at the restored checkpoint, which population-based training may have changed.
+    began_s: age of the process when the run started.
   """
 
   run_dir: RunDirectory | None = None
@@ -70,10 +70,10 @@ class RestorePlan:
 
   @classmethod
   def find(cls, config: "RunConfig", began_s: float = 0.0) -> Self:
-    """Looks up what `resume`, `init_from` and `run_dir` name.
+    """Finds the runs and checkpoints of `resume`, `init_from` and `run_dir`.
 
     Raises:
-      CheckpointError: nothing usable there, or `run_dir` holds a run already.
+      CheckpointError: no usable checkpoint, or `run_dir` holds a run already.
     """
     if config.resume is not None:
       run_dir = RunDirectory.open(config.resume)
@@ -81,14 +81,14 @@ class RestorePlan:
       try:
         plan.checkpoints = find_checkpoints(config.resume)
       except NoCheckpointError:
-        if run_dir.status:  # else a chain made it, and has only now come to it
+        if run_dir.status:  # else a chain made it, and starts it only now
           plan.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
-        # A resumed run's `config` says this only for a chain, which may have been moved.
+        # Only a chain sets this in the `config` of a resumed run; the chain may have been moved.
         weights = config.init_from or run_dir.config["init_from"]
         plan.weights = weights_of(weights) if weights else None
       return plan
     assert config.run_dir is not None, "composing names one"
-    if config.resolved["run_dir"] is not None:  # else the name is a proposal, which `create` numbers if it is taken
+    if config.resolved["run_dir"] is not None:  # else `create` numbers the name if it is taken
       RunDirectory(config.run_dir).must_be_new()
     if config.init_from is not None:
       return cls(weights=weights_of(config.init_from))
@@ -96,7 +96,7 @@ class RestorePlan:
 
   @contextlib.contextmanager
   def locked(self, config: "RunConfig") -> Iterator[Self]:
-    """Locks the resumed run, if any; yields what is there by then, as the last holder of the lock may have gone on.
+    """Locks the resumed run, if any; yields the plan of the current files, which the last holder may have changed.
 
     Raises:
       CheckpointError: another process writes the run.
@@ -109,16 +109,16 @@ class RestorePlan:
 
   @property
   def finished(self) -> bool:
-    """Whether the resumed run has nothing left to do."""
+    """Whether the resumed run has finished."""
     return self.run_dir is not None and self.run_dir.status.get("status") == "finished"
 
   def settings_over(self, own: Settings) -> dict[str, PyTree]:
-    """Returns a run's settings: those at the restored checkpoint where it notes any, else the config's."""
+    """Returns a run's settings: those of the restored checkpoint if it has any, else the config's."""
     noted = {key: np.asarray(value, np.float32) for key, value in self.settings.items() if key in own}
     return {**own, **noted}
 
   def restore(self, trainer: Trainer, name: str, draw: Draw) -> None:
-    """Reads what there is to restore, checked against the algorithm and its shapes, before anything is compiled.
+    """Restores the state or weights, checked against the algorithm and its shapes, before compilation.
 
     Raises:
       CheckpointError: no checkpoint is whole, or the newest whole one cannot be read now or does not fit.
@@ -148,7 +148,7 @@ class RestorePlan:
         continue
       self.update, self.step = checkpoint.meta["update"], checkpoint.step
       self.wall_clock_s = checkpoint.meta["wall_clock_s"]
-      self.columns = checkpoint.meta.get("columns", [])  # earlier versions did not note them
+      self.columns = checkpoint.meta.get("columns", [])  # checkpoints of earlier versions have none
       self.settings = checkpoint.meta.get("settings", {})
       self.notices.append(notice)
       return

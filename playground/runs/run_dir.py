@@ -50,11 +50,11 @@ class RunDirectory:
       path: the folder.
       config: the resolved configuration.
       overrides: the command line's.
-      numbered: take a new folder in any case, `<path>_2`, `_3`, ... if the name is taken: for names that nobody
-        chose, which several processes may come up with in the same second.
+      numbered: whether to take a new folder `<path>_2`, `_3`, ... if the name is taken: for generated names, which
+        several processes may choose in the same second.
 
     Raises:
-      CheckpointError: the folder already holds a run (unless numbered), or cannot be made.
+      CheckpointError: the folder already holds a run (unless numbered), or making it failed.
     """
     run = cls.claim(path, numbered)
     run.write_config(config, overrides)
@@ -73,11 +73,11 @@ class RunDirectory:
     return run
 
   def write_config(self, config: Section, overrides: Sequence[str] = ()) -> None:
-    """Writes the resolved `config` and the command line's `overrides`; raises CheckpointError if it cannot."""
+    """Writes the resolved `config` and the command line's `overrides`; raises CheckpointError if that fails."""
     with _writing(self.path):
       self.path.mkdir(parents=True, exist_ok=True)
       write_text(self.overrides_path, yaml.safe_dump(list(overrides), sort_keys=False))
-      # Last, because this file is what makes the folder a run: a creation cut short can simply be repeated.
+      # Last, because this file makes the folder a run: an interrupted creation can be repeated.
       write_text(self.config_path, yaml.safe_dump(plain(config), sort_keys=False))
 
   @classmethod
@@ -148,7 +148,7 @@ class RunDirectory:
     write_json(self.path / "manifest.json", _merged(self.manifest, fields))
 
   def set_status(self, status: RunStatus, reason: str = "") -> None:
-    """Records how the run stands, when it first started, and which process says so."""
+    """Records the run's status, its first start, and the process."""
     if status not in get_args(RunStatus):
       raise ValueError(f"status must be one of {get_args(RunStatus)}, not {status!r}")
     started = self.status.get("started", now())
@@ -156,8 +156,8 @@ class RunDirectory:
     write_json(self.path / "status.json", content)
 
   def note_loss(self, reason: str) -> None:
-    """Records that a run fails for the loss of one of its processes, which may be the one that writes here."""
-    if self.status.get("status") == "running":  # nothing where this machine does not see the folder
+    """Records that a run failed because one of its processes was lost, maybe the one that writes here."""
+    if self.status.get("status") == "running":  # this machine may not have the folder
       self.set_status("failed", f"{reason} resume={self.path} continues")
 
   @contextlib.contextmanager
@@ -165,7 +165,7 @@ class RunDirectory:
     """Makes this process the only one that writes the run while the block runs.
 
     Raises:
-      CheckpointError: another process is.
+      CheckpointError: another process writes it.
     """
     if self._locked:  # by a block around this one
       yield
@@ -202,7 +202,7 @@ class RunDirectory:
       except PlaygroundError as error:
         self._note_end("failed", str(error))
         raise
-      except OSError as error:  # a full disk, a folder that was removed: nothing that a traceback would help with
+      except OSError as error:  # a full disk or a removed folder: a traceback would not help
         reason = error.strerror or str(error)
         where = f" ({error.filename})" if error.filename else ""
         sentence = f"{self.path} cannot be written: {reason}{where}. resume={self.path} goes on from what is saved."
@@ -213,7 +213,7 @@ class RunDirectory:
         raise
 
   def _note_end(self, status: RunStatus, reason: str) -> None:
-    """Records how the run ended, if that can be written; the error that ended it matters more."""
+    """Records how the run ended; a failed write does not hide the error that ended the run."""
     with contextlib.suppress(OSError, CheckpointError):
       self.set_status(status, reason)
 
@@ -224,7 +224,7 @@ class RunDirectory:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
-  """Says in one sentence what the operating system has against a folder."""
+  """Turns an error of the operating system into a CheckpointError."""
   try:
     yield
   except OSError as error:
@@ -232,7 +232,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _make_new(path: Path) -> Path:
-  """Makes a folder that was not there before; making it is the claim, so no two processes get the same."""
+  """Makes a new folder; the operating system lets only one process make it."""
   path.parent.mkdir(parents=True, exist_ok=True)
   while True:
     folder = numbered(path)

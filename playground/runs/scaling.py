@@ -1,4 +1,4 @@
-"""`hardware.scale_envs`: as much work for each device as one device alone would have."""
+"""`hardware.scale_envs`: gives each device the work of a single-device run."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -14,13 +14,13 @@ SCALED = ("num_envs", "batch_size")
 
 
 def scale_envs(config: "RunConfig", devices: int) -> "tuple[RunConfig, str]":
-  """Multiplies environments and batch by the devices; a training step then collects that much more.
+  """Multiplies environments and batch by the number of devices, and so the steps of a training step.
 
-  What is returned, and saved with the run, holds the sizes that were meant and `scale_envs: false`, so that a run that
-  is resumed on other devices keeps them.
+  The result, which is saved with the run, has the scaled sizes and `scale_envs: false`, so that a run that is resumed
+  on other devices keeps them.
 
   Returns:
-    The configuration, its stages' included, and what was done, in a sentence.
+    The configuration, its stages' included, and a sentence about the change.
 
   Raises:
     ConfigError: the run is resumed, so its sizes are fixed.
@@ -35,14 +35,14 @@ def scale_envs(config: "RunConfig", devices: int) -> "tuple[RunConfig, str]":
 
 
 def describe_division(agent: AgentConfig, devices: int) -> str:
-  """How environments and batch divide, in a sentence."""
+  """Returns a sentence on how environments and batch divide over devices."""
   sizes = _sizes(agent, (*SCALED, "num_eval_envs"))
   shares = [f"{size // devices} of agent.{key}={size}" for key, size in sizes.items()]
   return f"On each of {devices} devices: {', '.join(shares)}."
 
 
 def _sizes(agent: AgentConfig, keys: Iterable[str]) -> dict[str, int]:
-  """Those of the keys that the algorithm has, with their values."""
+  """Returns the sizes that the algorithm has, by key."""
   return {key: getattr(agent, key) for key in keys if hasattr(agent, key)}
 
 

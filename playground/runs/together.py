@@ -1,4 +1,4 @@
-"""Several agents that train in one process and one compiled program, each a run of its own on disk."""
+"""Trains several agents in one process and one compiled program; each is a run of its own on disk."""
 
 import contextlib
 import sys
@@ -33,20 +33,20 @@ if TYPE_CHECKING:
 def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explore: Sequence[str] = ()) -> int:
   """Trains runs that have the same program, new or to resume.
 
-  A run that fails, be it for its numbers or its disk, ends alone. Runs that stand at different steps (an earlier start
-  was cut short between two of them) are trained in turn, those of the same step together; but a population goes on from
-  the newest step that all of them have.
+  A run that fails, for non-finite numbers or its disk, ends alone. Runs at different steps (an earlier start was
+  interrupted between two of them) are trained in turn, those of the same step together. A population continues from the
+  newest step that all of them have.
 
   Args:
     configs: of the runs.
     exploit_every: see `Population`; 0 is no population.
-    explore: keys of the settings that its agents copy and vary.
+    explore: keys of the settings that the agents of a population copy and perturb.
 
   Returns:
     The exit code: 0 when all are finished, 130 or 143 when interrupted (and saved), 2 where a run failed.
 
   Raises:
-    PlaygroundError: what keeps all of them from training.
+    PlaygroundError: an error that concerns all runs.
   """
   if len({program_of(config) for config in configs}) > 1 or program_of(configs[0]) is None:
     raise ConfigError("These runs cannot train together: they differ in more than seeds and numbers of agent and task.")
@@ -62,7 +62,7 @@ def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explo
 
 
 def _groups(configs: Sequence["RunConfig"], population: Population | None) -> "list[list[RunConfig]]":
-  """The runs that are not finished; those of a population together, else those at the same step."""
+  """Groups the unfinished runs: a population is one group, other runs are grouped by step."""
   groups: dict[str, list[RunConfig]] = {}
   for config in configs:
     plan = RestorePlan.find(config)
@@ -75,7 +75,7 @@ def _groups(configs: Sequence["RunConfig"], population: Population | None) -> "l
 def _train_group(
   configs: Sequence["RunConfig"], interrupts: Interrupts, hardware: Hardware, population: Population | None
 ) -> int:
-  """Trains runs that stand at the same step, or a population."""
+  """Trains runs at the same step, or a population."""
   with contextlib.ExitStack() as runs:
     plans = [runs.enter_context(RestorePlan.find(config).locked(config)) for config in configs]
     if population:
@@ -139,7 +139,7 @@ def memory_needed(program: CompiledFunctions, hardware: Hardware) -> str:
 
 
 class Member:
-  """One agent's run: the callbacks of the loop, which end with the first error while those of others go on.
+  """One agent's run: the callbacks of the loop, which end with the first error while other runs continue.
 
   Attributes:
     run_dir: of the run, locked while the context lasts.
@@ -165,7 +165,7 @@ class Member:
       self._record.__exit__(kind, error, trace)
 
   def begin(self, callbacks: RunCallbacks) -> None:
-    """Takes what does the work, and closes it in the end."""
+    """Starts the run with its callbacks, which are closed at the end."""
     self._callbacks = self._record.enter_context(contextlib.closing(callbacks))
 
   def on_metrics(

@@ -1,4 +1,4 @@
-"""Where a profiler trace spent its time: a table of operations by self time, from the trace's own file."""
+"""Reads a profiler trace: a table of operations by self time."""
 
 import csv
 import gzip
@@ -29,10 +29,10 @@ def write_top_ops(folder: Path) -> list[Op]:
   """Reads the newest trace below a folder and writes `top_ops.csv` there.
 
   Args:
-    folder: what `jax.profiler.start_trace` was given.
+    folder: the argument of `jax.profiler.start_trace`.
 
   Returns:
-    All operations, the longest first; none if the trace has none.
+    All operations, the longest first.
   """
   traces = sorted(folder.rglob("*.trace.json.gz"), key=lambda path: path.stat().st_mtime)
   ops = top_ops(traces[-1]) if traces else []
@@ -45,10 +45,10 @@ def write_top_ops(folder: Path) -> list[Op]:
 
 
 def top_ops(trace: Path) -> list[Op]:
-  """Operations of a Chrome trace (gzipped JSON), by self time: what they do less what runs inside them.
+  """Operations of a Chrome trace (gzipped JSON), by self time: their duration without the operations nested in them.
 
   On a GPU an operation is a kernel on one of the streams; on a CPU what XLA's threads report. The profiler keeps at
-  most a million events of a trace; what it left out is not in the table.
+  most a million events of a trace; others are missing in the table.
   """
   with gzip.open(trace, "rt", encoding="utf-8") as file:
     events: list[Event] = json.load(file)["traceEvents"]
@@ -64,13 +64,13 @@ def top_ops(trace: Path) -> list[Op]:
 
 
 def format_ops(ops: Sequence[Op], count: int = 15) -> list[str]:
-  """Lines for printing the first of them."""
+  """Formats the first operations as lines."""
   lines = [f"{op.share:6.1%} {op.self_s * 1e3:10.2f} ms {op.calls:8,} x  {op.name[:80]}" for op in ops[:count]]
   return ["  self         time      calls  operation", *lines]
 
 
 def _lanes(events: Iterable[Event]) -> list[list[Event]]:
-  """Events of each thread that runs operations: a GPU's streams, or else XLA's threads on the host."""
+  """Returns the events of each thread that runs operations: GPU streams, else XLA's threads on the host."""
   processes, threads = {}, {}
   lanes: dict[tuple[int, int], list[Event]] = defaultdict(list)
   for event in events:
@@ -89,12 +89,12 @@ def _lanes(events: Iterable[Event]) -> list[list[Event]]:
 
 
 def _is_operation(name: str) -> bool:
-  """On the host: not the runtime's own doings (`ThreadpoolListener::Record`) nor the marks where an operation ends."""
+  """Whether a host event is an operation, not one of the runtime (`ThreadpoolListener::Record`) or an end mark."""
   return "::" not in name and not name.startswith("end: ") and re.match(r"[a-z]", name) is not None and " " not in name
 
 
 def _self_times(lane: Sequence[Event]) -> Iterable[tuple[str, float]]:
-  """Name and self time (s) of each event of a thread, whose events lie inside one another or apart."""
+  """Returns name and self time (s) of each event of a thread; its events are nested or disjoint."""
   open_: list[tuple[str, float, float]] = []  # name, end, self time
   for event in sorted(lane, key=lambda event: (event["ts"], -event.get("dur", 0.0))):
     begin, length = event["ts"], event.get("dur", 0.0)

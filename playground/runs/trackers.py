@@ -1,4 +1,4 @@
-"""Where metrics go. A new tracker is one class with `log` and `close`, and one line in `make_trackers`."""
+"""Trackers of metrics. A new tracker is one class with `log` and `close`, and one line in `make_trackers`."""
 
 import math
 import time
@@ -27,8 +27,8 @@ class Tracker(Protocol):
 class TensorBoardTracker:
   """Scalars for `tensorboard --logdir <run>`; on resume, points after `resume_step` are hidden by TensorBoard.
 
-  Written here and now: tensorboardX's `SummaryWriter` has a thread of its own, whose end at the first error (a full
-  disk) makes the run wait for it for ever.
+  It writes synchronously: tensorboardX's `SummaryWriter` has a thread, which ends at the first error (a full disk), and
+  the run would wait for it forever.
   """
 
   def __init__(self, folder: Path, resume_step: int | None = None):
@@ -38,7 +38,7 @@ class TensorBoardTracker:
 
     self._event, self._summary = Event, Summary
     folder.mkdir(parents=True, exist_ok=True)
-    self._writer = EventsWriter(str(folder.absolute() / "events"))  # it takes `s3:/...` for a place on the network
+    self._writer = EventsWriter(str(folder.absolute() / "events"))  # it takes `s3:/...` for a network address
     self._flushed = time.monotonic()
     if resume_step is not None:
       session = SessionLog(status=SessionLog.START)  # pyright: ignore[reportAttributeAccessIssue]
@@ -87,12 +87,12 @@ def make_trackers(
   """Builds the trackers that `config["tracking"]` asks for; metrics.csv is always written.
 
   Args:
-    config: the whole resolved config (W&B stores all of it).
-    run_dir: where files go.
+    config: the whole resolved config, which W&B stores.
+    run_dir: folder of the files.
     resume_step: environment steps of the checkpoint that the run continues from; later records are dropped, since
-      they are about to be made again. Log the metrics of step S before saving checkpoint S, and none is ever lost.
+      the run will log them again. Metrics of step S must be logged before checkpoint S is saved.
     notify: takes one sentence when a tracker drops out, or a file is damaged.
-    columns: of metrics.csv at that checkpoint, if it knows them.
+    columns: of metrics.csv at that checkpoint, if known.
   """
   tracking = config["tracking"]
   csv = CsvTracker(run_dir.metrics_csv, columns, notify)

@@ -46,7 +46,7 @@ from playground.runs.scaling import describe_division, scale_envs
 if TYPE_CHECKING:
   from playground.config import RunConfig
 
-ROWS = 100  # rows of metrics.csv that a run aims at: a call to the device is about a hundredth of it
+ROWS = 100  # rows of metrics.csv in a run, about: one for each call to the device
 
 
 def train(config: "RunConfig") -> int:
@@ -56,7 +56,7 @@ def train(config: "RunConfig") -> int:
     The exit code: 0 when finished, 130 or 143 when interrupted (and saved).
 
   Raises:
-    PlaygroundError: what the user can act on; a run directory that exists by then says failed and why.
+    PlaygroundError: an error that the user can act on; the run directory, if made already, records it.
   """
   with ending_together(), Interrupts() as interrupts:
     try:
@@ -72,7 +72,7 @@ def train(config: "RunConfig") -> int:
 
 
 def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) -> int:
-  """One run; `began_s` is the age of the process by then, 0 for its first."""
+  """Trains one run; `began_s` is the age of the process at its start, 0 for the first run."""
   plan = RestorePlan.find(config, began_s)
   if not plan.finished:
     hardware = setup(config.hardware)
@@ -85,11 +85,11 @@ def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) ->
 
 @dataclasses.dataclass
 class Training:
-  """What a process trains: one run, or those of several agents that share a program.
+  """The training of a process: one run, or several runs that share a program.
 
   Attributes:
     env: the task.
-    drawn: the model that videos show.
+    drawn: the model in videos.
     trainer: of the task and the algorithm.
     events: the schedule.
     evaluate: see `evaluation.make_evaluator`.
@@ -106,17 +106,17 @@ class Training:
 
   @property
   def steps(self) -> int:
-    """Environment steps of each agent."""
+    """Returns the environment steps of each agent."""
     return self.events[-1].update * self.trainer.steps_per_update
 
   def compile(self, plans: Sequence[RestorePlan]) -> CompiledFunctions:
-    """Compiles what it needs; `plans` say what each agent starts from."""
+    """Compiles the functions; `plans` tell what each agent starts from."""
     resets = any(event.reset for event in self.events)
     return compile_program(self.trainer, self.evaluate, self.draw, self._policies(plans), self.stored, resets)
 
   def run(self, loop: Loop, plans: Sequence[RestorePlan], interrupts: Interrupts) -> tuple[TrainState, bool]:
-    """Trains from where the runs begin; returns the last state, and whether the schedule was completed."""
-    wait_for_all()  # a first exchange waits for half a minute on CPUs: not all compile equally fast
+    """Trains from the start of the plans; returns the last state, and whether the schedule was completed."""
+    wait_for_all()  # processes compile at different speeds, and a first exchange on CPUs waits for half a minute only
     interrupts.start_saving()
     if plans[0].state is None:
       return loop.run(loop.init(self._policies(plans)))
@@ -130,13 +130,13 @@ class Training:
 def prepare(
   configs: "Sequence[RunConfig]", plans: Sequence[RestorePlan], hardware: Hardware, together: bool = False
 ) -> Training:
-  """Builds what is trained and restores what there is, before anything is compiled.
+  """Builds task, trainer and schedule, and restores states, before compilation.
 
   Args:
     configs: of the run, or (`together`) of the runs of several agents.
-    plans: where each begins; what is restored goes there, with what the user should know.
+    plans: one for each run; restored states and notices go there.
     hardware: of the process.
-    together: whether there is an axis of agents, be it of length 1.
+    together: whether arrays have an axis of agents, even of length 1.
 
   Raises:
     PlaygroundError: a setting, a checkpoint or a size that does not fit.
@@ -162,7 +162,7 @@ def prepare(
   for each, theirs in zip(plans, configs, strict=True):
     each.restore(trainer, theirs.agent_name, draw)
   trainer.settings = trainer.join([each.settings_over(own) for each, own in zip(plans, settings, strict=True)])
-  preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # one may see it damaged
+  preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # one may find it damaged
 
   num_updates = math.ceil(agent.num_timesteps / trainer.steps_per_update)
   events = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
@@ -177,7 +177,7 @@ def prepare(
 def _train_locked(
   config: "RunConfig", interrupts: Interrupts, began_s: float, plan: RestorePlan, hardware: Hardware
 ) -> int:
-  """One run, new or to resume, that no other process writes."""
+  """Trains one run, new or resumed, whose lock this process holds."""
   training = prepare([config], [plan], hardware)
   if not is_main():
     with noting_loss(RunDirectory(share()).note_loss):
@@ -211,7 +211,7 @@ def _train_locked(
 
 
 def open_run(config: "RunConfig", plan: RestorePlan) -> RunDirectory:
-  """Returns the run's directory, made if the run is a new one."""
+  """Returns the run's directory; makes it for a new run."""
   return plan.run_dir or RunDirectory.create(
     str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
   )
@@ -226,10 +226,10 @@ def timings_of(program: CompiledFunctions, began_s: float) -> dict[str, float]:
 def cut_short(
   agent: AgentConfig, episode_length: int, events: Sequence[ScheduleEvent], steps_per_update: int
 ) -> list[str]:
-  """A sentence for the user where fresh starts of all environments leave no time for a whole episode.
+  """Warns in a sentence if full resets come before an episode can end.
 
-  They come closer with fewer steps to train: a trial of a tenth of the steps sees a tenth as much of an episode, and
-  what comes later (the next command, the second push) finds the policy unprepared.
+  Full resets come closer with a smaller budget: a trial of a tenth of the steps covers a tenth as much of an episode,
+  and the policy never trains on later events (the next command, the second push).
 
   Args:
     agent: the algorithm's settings.
@@ -249,14 +249,14 @@ def cut_short(
 def model_sampler(
   env: Env, config: "RunConfig", num_envs: int, num_eval_envs: int
 ) -> Callable[[int], tuple[ModelFields, ModelFields]]:
-  """What draws a run's randomised models.
+  """Returns the function that draws a run's randomised models.
 
   Returns:
     A function of the run's seed: model fields of the training environments, each [num_envs, ...], and of the evaluation
     environments; empty without terms.
 
   Raises:
-    PlaygroundError: a term that does not go with the model.
+    PlaygroundError: a term that does not fit the model.
   """
   randomizer = Randomizer(env.mj_model, config.env.events)
   sample = jax.jit(randomizer.sample_batch)
@@ -271,7 +271,7 @@ def model_sampler(
 
 
 def say_where(run_dir: RunDirectory) -> None:
-  """The last lines of a run: what lies where."""
+  """Prints the paths of a run's files."""
   summary = run_dir.summary
   print(f"{summary['status']}: return {format_return(summary['final_return'])}, {summary['steps']:,} steps")
   places: dict[str, object] = {

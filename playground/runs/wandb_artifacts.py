@@ -1,8 +1,8 @@
 """Policies on Weights & Biases: `wandb:<entity>/<project>/<run>` wherever a command line names a run.
 
 A run with `tracking.wandb.upload=true` uploads its newest policy when it ends: an artifact with configuration, metrics
-and checkpoint, but without what only resuming needs. Only a command line can name an artifact: a saved configuration
-holds the path of the download, so a file from somebody else connects to no machine.
+and checkpoint, but without the arrays that only resuming needs. Only a command line can name an artifact: a saved
+configuration holds the path of the download, so a file from another user connects to no machine.
 """
 
 import re
@@ -22,7 +22,7 @@ _DOWNLOADS = Path("results/wandb")
 
 
 def local_path(name: str) -> str:
-  """The path that a name stands for: an artifact is downloaded to `results/wandb/`, every other name is itself.
+  """Returns the path of a name: artifacts are downloaded to `results/wandb/`, other names are paths.
 
   Args:
     name: `wandb:<entity>/<project>/<run>` for the newest policy of a run, by its id or its display name;
@@ -57,7 +57,7 @@ def local_path(name: str) -> str:
 
 
 def _newest(api: "wandb.Api", path: str) -> "wandb.Artifact":
-  """The newest policy that a run logged."""
+  """Returns the newest policy that a run logged."""
   import wandb
 
   project, _, name = path.rpartition("/")
@@ -74,7 +74,7 @@ def _newest(api: "wandb.Api", path: str) -> "wandb.Artifact":
 
 
 def _download(artifact: "wandb.Artifact", folder: Path) -> None:
-  """Downloads an artifact whole or not at all; wandb compares the files' checksums."""
+  """Downloads a complete artifact or none; wandb compares the files' checksums."""
   folder.parent.mkdir(parents=True, exist_ok=True)
   with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
     part = Path(scratch) / "run"

@@ -1,4 +1,4 @@
-"""Weights & Biases: online if the user is logged in, offline otherwise, and never a reason for a run to stop."""
+"""Weights & Biases: online if the user is logged in, offline otherwise; its failures never stop a run."""
 
 import contextlib
 import netrc
@@ -56,7 +56,7 @@ class WandbTracker:
     options: `tracking.wandb` (project, entity, group, name, tags, mode).
     folder: the run directory.
     config: the whole resolved config.
-    notify: takes one sentence when W&B fails; the run then goes on without it.
+    notify: takes one sentence when W&B fails; the run then continues without it.
   """
 
   def __init__(self, options: Section, folder: Path, config: Section, notify: Callable[[str], None] = print):
@@ -116,13 +116,13 @@ class WandbTracker:
   def _guard(self, call: Callable[[], object]) -> None:
     try:
       call()
-    except Exception as error:  # whatever a third-party service throws, training is worth more
+    except Exception as error:  # training continues whatever a third-party service raises
       self._run = None
       self._notify(f"W&B tracking is off for the rest of this run ({reason(error)}); metrics.csv goes on.")
 
 
 def reason(error: Exception) -> str:
-  """The first line of an error's message."""
+  """Returns the first line of an error's message."""
   return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")
 
 
