@@ -1,17 +1,17 @@
-"""From command line to configuration: finds configs/, composes them with Hydra, checks them, hands out typed sections.
+"""From command line to configuration: finds configs/, composes it with Hydra, checks it, returns typed sections.
 
-The only place that knows OmegaConf. Nothing here needs JAX, so that a mistake is reported at once.
+Only this package uses OmegaConf. Nothing here imports JAX, so that mistakes are reported at once.
 
-How a value is chosen, later wins: the settings classes and the chosen option of every group; the tuned set of the pair
-agent and env; the experiment; debug; the command line. Classes and options alone are also the schema: what they do not
-have does not exist, and what they have fixes each value's type, wherever that value is set.
+Values come from, in rising precedence: the settings classes and the chosen option of every group; the tuned set of the
+pair agent and env; the experiment; debug; the command line. Classes and options alone are also the schema: they define
+which keys exist, and the type of each value, wherever it is set.
 
-  definitions  the settings classes: type, default, limit and help of each key that no task owns
-  files        where configs/ lies, which groups and options it has
+  definitions  the settings classes: type, default, limit and help of each key
+  files        the folder configs/, its groups and options
   overrides    the command line, one `key=value` at a time
   sweeps       a command line that stands for many runs
   chains       a curriculum's stages, each a run of its own
-  composition  all of it together, for a new run and for one that goes on
+  composition  the whole configuration of a new or resumed run
   schema       keys that exist and the types of their values
   limits       checks of choices, ranges and sizes that must divide
   run_config   the result, and how it is saved, read and shown

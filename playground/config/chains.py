@@ -1,4 +1,4 @@
-"""Chains of runs: what each stage of a `curriculum` is composed from.
+"""Chains of runs: composes each stage of a `curriculum`.
 
 ```yaml
 stages:
@@ -26,12 +26,12 @@ from playground.settings import Section, defaults
 from playground.text import format_value
 
 _FIELDS = ("num_timesteps", "overrides")
-_SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # by a stage: groups and sections
+_SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # groups and sections that a stage may set
 SINGLE_RUN = defaults(CurriculumConfig)  # curriculum=none
 
 
 def stage_folders(curriculum: CurriculumConfig) -> dict[str, str]:
-  """The stages that a chain runs, from `start_at` on, and each one's folder in the chain's.
+  """Returns the stages that a chain runs, from `start_at` on, with their folders in the chain's.
 
   Raises:
     UnknownNameError: `start_at` is no stage.
@@ -51,10 +51,10 @@ def _need_stage(start_at: str | None, names: list[str]) -> None:
 
 
 def check_chain(resolved: Section, parsed: Sequence[Override], roots: Sequence[Path]) -> None:
-  """Checks what a configuration says of its chain's stages, and what the command line says of the chain.
+  """Checks the stages of a configuration's chain, and the keys of the command line that concern the chain.
 
   Raises:
-    ConfigError: a field of a stage that cannot be, or a key that does not go with the chain.
+    ConfigError: an invalid field of a stage, or a key that does not fit the chain.
     UnknownNameError: no such stage or field.
   """
   curriculum = resolved["curriculum"]
@@ -83,7 +83,7 @@ def check_chain(resolved: Section, parsed: Sequence[Override], roots: Sequence[P
 def stage_overrides(
   curriculum: CurriculumConfig, parsed: Sequence[Override], roots: Sequence[Path]
 ) -> Iterator[tuple[str, list[Override]]]:
-  """Yields the name of each stage that the chain runs, and what it is composed from.
+  """Yields the name and the overrides of each stage that the chain runs.
 
   Args:
     curriculum: the chain's section, checked.
@@ -104,18 +104,18 @@ def stage_overrides(
 
 
 def budget(curriculum: CurriculumConfig, stage: str, default: int) -> int:
-  """A stage's `agent.num_timesteps`: its own or, without one or with a scale of 0, the task's; times the scale."""
+  """Returns a stage's `agent.num_timesteps`: its own or the task's, times the scale; with a scale of 0 the task's."""
   own, scale = curriculum.stages[stage]["num_timesteps"], curriculum.scale
   return max(1, round(scale * (default if own is None else own))) if scale else default
 
 
 def fresh_starts(curriculum: CurriculumConfig, parsed: Sequence[Override], default: int) -> int:
-  """A stage's `agent.num_resets_per_eval`: fewer in a shortened chain, so that as much of an episode is seen as in it.
+  """Returns `agent.num_resets_per_eval` of a stage: fewer in a shortened chain, to cover as much of an episode.
 
   Args:
     curriculum: the chain's section.
-    parsed: what the stage is composed from; what it sets stays.
-    default: the task's.
+    parsed: the overrides of the stage, which win.
+    default: the value of the task.
   """
   scale = curriculum.scale
   if not 0 < scale < 1 or any(override.key == "agent.num_resets_per_eval" for override in parsed):
@@ -125,7 +125,7 @@ def fresh_starts(curriculum: CurriculumConfig, parsed: Sequence[Override], defau
 
 @contextlib.contextmanager
 def in_stage(name: str) -> Iterator[None]:
-  """Names the stage in an error that the user can act on."""
+  """Adds the name of the stage to a PlaygroundError."""
   try:
     yield
   except PlaygroundError as error:
@@ -153,7 +153,7 @@ def _check_stage(key: str, name: str, stage: object) -> None:
 
 
 def _parse(text: str, roots: Sequence[Path]) -> Override:
-  """One override of a stage."""
+  """Parses an override of a stage."""
   override = parse(text, roots)
   if override.key.split(".")[0] not in _SETTABLE:
     raise ConfigError(f"{text} cannot be set by a stage, which takes only {', '.join(_SETTABLE)}.")

@@ -27,7 +27,7 @@ def meaning(setting: Setting | None, comment: str) -> str:
 
 
 def flow(value: object) -> str:
-  """A value on one line, as it could stand on a command line."""
+  """Formats a value on one line, as on a command line."""
   text = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False).strip()
   return text.removesuffix("...").strip()
 
@@ -49,14 +49,14 @@ def _keys(node: yaml.Node | None, lines: list[str], prefix: str = "") -> Iterato
 
 
 def _above(lines: list[str], key: yaml.Mark) -> list[str]:
-  """The lines of comment directly above a key, which are indented as it is."""
+  """Returns the comment lines directly above a key, with its indentation."""
   begin = " " * key.column + "#"
   above = list(itertools.takewhile(lambda line: line.startswith(begin), reversed(lines[: key.line])))
   return [line[len(begin) :].strip() for line in reversed(above)]
 
 
 def _beside(lines: list[str], end: yaml.Mark) -> list[str]:
-  """The comment behind a place in a line, with the lines below that continue it."""
+  """Returns the comment after a position in a line, with its continuation lines."""
   before, mark, comment = lines[end.line][end.column :].partition("#")
   if not mark or before.strip(" :"):
     return []

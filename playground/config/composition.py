@@ -1,4 +1,4 @@
-"""All of it together: Hydra composes the files, the command line is set on top, the whole is checked."""
+"""Composes a configuration: Hydra composes the files, the command line wins over them, everything is checked."""
 
 import copy
 import dataclasses
@@ -67,8 +67,8 @@ from playground.pretrained import locate
 from playground.settings import Plain, Section, build, defaults
 from playground.text import first_line, join
 
-_RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ when a run goes on
-_DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that say which keys a run has, in this order
+_RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ in a resumed run
+_DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that define the keys, in this order
 _CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
@@ -81,7 +81,7 @@ def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> Ru
     config_dir: the folder that holds config.yaml, by default the one we ship.
 
   Raises:
-    ConfigError: whatever cannot work, in one sentence.
+    ConfigError: an invalid value, in one sentence.
     UnknownNameError: a group, option or key that does not exist.
   """
   return compose_all([overrides], config_dir)[0]
@@ -91,7 +91,7 @@ def compose_all(runs: Iterable[Sequence[str]], config_dir: Path | None = None) -
   """Composes many runs as `compose` does one; files that several of them choose are composed once.
 
   Raises:
-    ConfigError: as `compose`, for the first run that cannot work; of several runs the message names it.
+    ConfigError: as `compose`, for the first invalid run; of several runs the message names it.
   """
   roots, runs = config_roots(config_dir), list(runs)
   files = functools.cache(functools.partial(_compose_files, roots))
@@ -105,7 +105,7 @@ def compose_all(runs: Iterable[Sequence[str]], config_dir: Path | None = None) -
 
 
 def compose_settings(overrides: Sequence[str]) -> SweepSettings:
-  """Composes what a sweep is told of itself: `sweep_dir`, `on_error`, and the sections `launcher` and `search`.
+  """Composes the settings of a sweep: `sweep_dir`, `on_error`, and the sections `launcher` and `search`.
 
   Raises:
     ConfigError: as `compose`.
@@ -160,11 +160,11 @@ def override_section(section: str, default: Section | ConfigDict, overrides: Sec
 def from_saved(resolved: Section) -> RunConfig:
   """Rebuilds the configuration of a run that an earlier version may have saved: keys it lacks get today's defaults.
 
-  What a task chooses by name (reward terms, observations, noise) stays what it was. What only a command line can say
-  of the machine is today's default.
+  Terms of the task (rewards, observations, noise) stay as saved. Settings of the machine that only a command line can
+  set get today's defaults.
 
   Raises:
-    ConfigError: a part is missing, has another type than its default or cannot work.
+    ConfigError: a section is missing, or a value is invalid or has another type than its default.
   """
   saved = from_dict(resolved)
   roots = config_roots()
@@ -178,17 +178,17 @@ def from_saved(resolved: Section) -> RunConfig:
     section: _fit_saved(saved.resolved[section], today[section], section, chosen_names(today)) for section in SECTIONS
   }
   check_limits(filled)
-  hardware = filled["hardware"]  # what only a command line says, see `is_of_command`
+  hardware = filled["hardware"]  # keys that only a command line sets, see `is_of_command`
   hardware["cache_dir"] = today["hardware"]["cache_dir"]
   hardware["distributed"] = {**hardware["distributed"], "coordinator": today["hardware"]["distributed"]["coordinator"]}
   return from_dict({**saved.resolved, **filled}, saved.overrides)
 
 
 def saved_section(section: str, saved: Section, default: Section) -> dict[str, Plain]:
-  """A section that a file has saved, e.g. env: keys that it lacks get today's defaults, those that it has are checked.
+  """Returns a saved section, e.g. env: missing keys get today's defaults, present keys are checked.
 
   Raises:
-    ConfigError: a value of another type than its default, or one that cannot work.
+    ConfigError: an invalid value, or one of another type than its default.
   """
   fitted = _fit_saved(saved, default, section, {})
   check_limits({section: fitted})
@@ -196,7 +196,7 @@ def saved_section(section: str, saved: Section, default: Section) -> dict[str, P
 
 
 def _fit_saved(saved: Plain, default: Plain, key: str, names: Mapping[str, object]) -> Plain:
-  """As `fit`, but keys that only the default has are taken from it, and keys that it lacks are left as they are."""
+  """As `fit`, but missing keys are taken from the default, and unknown keys stay as they are."""
   if not (isinstance(default, Mapping) and default and isinstance(saved, Mapping)) or is_terms(key):
     return fit(saved, default, names, key)
   fitted = {
@@ -207,12 +207,12 @@ def _fit_saved(saved: Plain, default: Plain, key: str, names: Mapping[str, objec
 
 
 class _Files(NamedTuple):
-  """What the files say for a choice of groups: the values, the option of each group, the keys that exist."""
+  """The result of the files for a choice of groups: values, option of each group, existing keys."""
 
   config: DictConfig
   choices: dict[str, str | None]
   schema: dict[str, Plain]
-  added: tuple[Override, ...]  # a choice of ours
+  added: tuple[Override, ...]  # our own choice
 
 
 def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
@@ -235,7 +235,7 @@ def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
 
 
 def _changes(groups: Iterable[str], choices: Mapping[str, str | None], roots: Sequence[Path]) -> Delta:
-  """What the chosen options of `DELTAS` change; of several options of one group (`debug=[a,b]`) that is unknown."""
+  """Returns the changes of the chosen options of `DELTAS`; unknown for several options of a group (`debug=[a,b]`)."""
   found = Delta(is_known=not any("=[" in text for text in groups))
   for group in DELTAS:
     if option := choices.get(group):
@@ -246,9 +246,9 @@ def _changes(groups: Iterable[str], choices: Mapping[str, str | None], roots: Se
 def _schema(
   config: DictConfig, choices: Mapping[str, str | None], changes: Delta, roots: Sequence[Path]
 ) -> dict[str, Plain]:
-  """The keys that exist, with the values that fix their types.
+  """Returns the existing keys, with values that fix their types.
 
-  Most sections have a class. The others are as composed, or where `DELTAS` change them, as composed without.
+  Most sections have a class. The others are as composed, but without the changes of `DELTAS`.
   """
   agent = str(config.agent.name)
   values = defaults(RunSettings) | {"agent": {"name": agent, **defaults(config_class(agent))}}
@@ -261,7 +261,7 @@ def _schema(
 
 
 def _compose_new(parsed: Sequence[Override], files: Callable[..., _Files], roots: Sequence[Path]) -> RunConfig:
-  """The configuration that a command line stands for."""
+  """Composes the configuration of a command line."""
   config, choices, schema, added = files(*group_overrides(parsed))
   resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], schema)
   check_limits(resolved)
@@ -277,7 +277,7 @@ def _compose_new(parsed: Sequence[Override], files: Callable[..., _Files], roots
 def _compose_stage(
   chain: RunConfig, name: str, parsed: Sequence[Override], files: Callable[..., _Files], roots: Sequence[Path]
 ) -> RunConfig:
-  """The configuration of a stage, a single run; where it lies and what it starts from is left open."""
+  """Composes the configuration of a stage, a single run without run_dir and init_from."""
   with in_stage(name):
     stage = _compose_new(parsed, files, roots)
   lengths = {
@@ -292,8 +292,8 @@ def _compose_stage(
 def _hydra(
   overrides: Sequence[str], roots: Sequence[Path], name: str = "config"
 ) -> tuple[DictConfig, dict[str, str | None]]:
-  """Hydra's composition of `<name>.yaml`, and what it chose for each group."""
-  outer = GlobalHydra.instance().hydra  # the app's, if this is called within it: Hydra allows one at a time
+  """Returns Hydra's composition of `<name>.yaml`, and the option of each group."""
+  outer = GlobalHydra.instance().hydra  # the app's instance, if this is called within it: Hydra allows one at a time
   GlobalHydra.instance().clear()
   register_options(roots)
   try:
@@ -311,7 +311,7 @@ def _hydra(
   if "observations" in (env := config.get("env") or {}):
     env.update({key: value for key, value in defaults(TermsConfig).items() if key not in env})
   choices = {group: chosen.get(group) for group in groups(roots)}
-  if choices.get("tuned") not in options("tuned", roots):  # it is optional, and this pair has none
+  if choices.get("tuned") not in options("tuned", roots):  # optional, and this pair has none
     choices["tuned"] = None
   return config, choices
 
@@ -336,12 +336,12 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Section) -
 
 
 def _plain(config: object) -> Plain:
-  """Plain dicts and lists, the interpolations of our files resolved."""
+  """Returns plain dicts and lists, with the interpolations of our files resolved."""
   return OmegaConf.to_container(config if isinstance(config, DictConfig) else _literal(config), resolve=True)
 
 
 def _literal(values: object) -> DictConfig:
-  """Values as they are: what a file has saved is resolved, and `${oc.env:HOME}` in it asks for nothing."""
+  """Returns values as they are: saved files are resolved, so `${oc.env:HOME}` in them is text."""
 
   def escape(node: Plain) -> Plain:
     if isinstance(node, Mapping):
@@ -355,7 +355,7 @@ def _literal(values: object) -> DictConfig:
 
 
 def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path]) -> RunConfig:
-  """The configuration of a run that goes on: its own, but for the sections that may differ."""
+  """Composes the configuration of a resumed run: the saved one, except for sections that may differ."""
   _check_resumable(run, parsed)
   whole = from_saved(load(run / "config.yaml").resolved)
   saved = whole.resolved
@@ -373,7 +373,7 @@ def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path
 
 
 def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:
-  """A resumed run ends as if it had never stopped, so nothing that changes its numbers may change."""
+  """Raises ConfigError for changes that affect numbers: a resumed run ends as if it had never stopped."""
   for override in parsed:
     if override.key == "init_from":
       what = "resume continues a run exactly, init_from starts a new one from its weights"
@@ -385,7 +385,7 @@ def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:
 
 
 def _resolve(value: object) -> Plain:
-  """A value with its interpolations resolved, such as ${oc.env:SCRATCH}, and those that are escaped as text."""
+  """Returns a value with interpolations such as ${oc.env:SCRATCH} resolved; escaped ones become text."""
   try:
     return OmegaConf.create({"value": value}).value
   except OmegaConfBaseException as error:
@@ -393,12 +393,12 @@ def _resolve(value: object) -> Plain:
 
 
 def _check_path(key: str, value: object) -> None:
-  """What `resume` and `init_from` name must be there."""
+  """Raises an error if a path of `resume` or `init_from` does not exist."""
   if key == "init_from":
     value = locate(str(value))
   path = Path(os.path.expanduser(str(value)))
   wanted, what = (path / "config.yaml", "run directory") if key == "resume" else (path, "run directory or checkpoint")
-  if not os.path.lexists(wanted):  # a link that points to nothing is for `find_checkpoints` to name
+  if not os.path.lexists(wanted):  # `find_checkpoints` reports a broken link
     siblings = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
     raise ConfigError(f"{key}={value} is no {what}: {wanted} does not exist.{nearest(path.name, siblings)}")
 
@@ -408,6 +408,6 @@ def _check_robot(choices: Mapping[str, str | None], roots: Sequence[Path]) -> No
   env, robot = choices["env"], choices.get("robot")
   if robot is not None:
     own, chosen = _hydra([f"env={env}", *_NO_DELTAS], roots)
-    # `in` would be false for a mandatory robot that nobody has set
+    # `in` would be false for a mandatory robot that is not set
     if not chosen.get("robot") and "robot" not in list(own.env):
       raise ConfigError(f"robot={robot}: env={env} takes no robot, leave robot= out.")

@@ -1,7 +1,7 @@
-"""The typed definition of each key: which settings class a section has, and what Hydra knows of those classes.
+"""The typed definition of each key: the settings class of each section, and their registration with Hydra.
 
-A section's class lies beside the component that reads it. What a class defines is no file: `hardware=auto`, `agent=ppo`
-and the other options below are registered with Hydra, and files hold what differs.
+A section's class lies beside the component that reads it. Options that a class defines have no file: `hardware=auto`,
+`agent=ppo` and the other options below are registered with Hydra, and files hold the differences.
 """
 
 import dataclasses
@@ -82,7 +82,7 @@ def register_sections() -> None:
 
 
 def register_experiments(tasks: Mapping[str, str]) -> None:
-  """Registers with Hydra the experiments that only choose a task: its name by theirs."""
+  """Registers with Hydra the experiments that only choose a task, given as {experiment: task}."""
   choose = lambda task: {"defaults": [{"override /env": task}]}
   _replace("experiment", {name: functools.partial(choose, tasks[name]) for name in tasks}, package="_global_")
 
@@ -93,7 +93,7 @@ def _node(group: str, name: str) -> dict[str, Plain]:
 
 
 def _replace(group: str, nodes: Mapping[str, Callable[[], Plain]], package: str) -> None:
-  """Makes these the options of a group; Hydra refuses an option that has a file, too."""
+  """Replaces the registered options of a group; Hydra refuses an option that also has a file."""
   store = ConfigStore.instance()
   if set(store.repo.get(group, {})) != {f"{name}.yaml" for name in nodes}:
     store.repo[group] = {}
@@ -102,11 +102,11 @@ def _replace(group: str, nodes: Mapping[str, Callable[[], Plain]], package: str)
 
 
 def definition(key: str, names: Mapping[str, object]) -> Setting | None:
-  """Returns the definition of a dotted key; None if it is a file's alone, such as a task's own.
+  """Returns the definition of a dotted key; None for a key of a file alone, as of another package's task.
 
   Args:
     key: such as agent.learning_rate.
-    names: `agent`, `launcher` and `search`: the name of the chosen one.
+    names: name of the chosen option of `agent`, `launcher` and `search`.
   """
   section, _, rest = key.partition(".")
   if section == "agent":

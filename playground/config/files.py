@@ -1,4 +1,4 @@
-"""Where the files of configs/ and sweeps/ lie, ours and those of outside packages, and which options they make."""
+"""Finds the files of configs/ and sweeps/, ours and those of outside packages, and the options that they define."""
 
 import functools
 import importlib.metadata
@@ -15,8 +15,8 @@ from playground.settings import Plain
 from playground.text import first_line
 from playground.trust import ENTRY_POINTS
 
-DELTAS = ("experiment", "tuned", "debug")  # groups that change what the others define, and define nothing
-_EXPERIMENTS = {  # short names, where the rule's is long
+DELTAS = ("experiment", "tuned", "debug")  # groups that change keys of others, and define none
+_EXPERIMENTS = {  # shorter names than the rule gives
   "AeroCubeRotateZAxis": "aero_rotate",
   "AlohaHandOver": "aloha_handover",
   "AlohaSinglePegInsertion": "aloha_peg_insertion",
@@ -27,24 +27,24 @@ _EXPERIMENTS = {  # short names, where the rule's is long
 
 
 def shipped(folder: str) -> Path:
-  """A folder that stands at the top of the checkout; in the wheel it lies inside the package."""
+  """Returns a folder at the top of the checkout; in the wheel it is inside the package."""
   package = Path(__file__).parents[1]
   inside = package / folder
   return (inside if inside.is_dir() else package.parent / folder).resolve()
 
 
 def config_roots(config_dir: Path | None = None) -> list[Path]:
-  """Folders that hold groups: ours, then outside packages'."""
+  """Returns the folders of groups: ours, then those of outside packages."""
   return [config_dir.resolve() if config_dir else shipped("configs"), *_outside_roots()]
 
 
 def groups(roots: Iterable[Path]) -> list[str]:
-  """Names of all groups, sorted."""
+  """Returns the names of all groups, sorted."""
   return sorted({folder.name for root in roots for folder in root.iterdir() if folder.is_dir()} | set(defined()))
 
 
 def options(group: str, roots: Iterable[Path] | None = None) -> list[str]:
-  """Names of a group's options, sorted: those that a class defines, files, and an experiment for each task.
+  """Returns a group's options, sorted: those of classes, files, and an experiment for each task.
 
   Files whose name begins with an underscore are parts that options share.
   """
@@ -68,7 +68,7 @@ def task_experiments(roots: Sequence[Path]) -> dict[str, str]:
 
 
 def lineage(group: str, option: str, roots: Iterable[Path]) -> list[str]:
-  """The option and the options its file is built on (the first of its defaults list, and so on), nearest first."""
+  """Returns the option and those that its file is built on (the first of each defaults list), nearest first."""
   defaults = _read(group, option, roots).get("defaults", [])
   named = [entry.removeprefix(f"/{group}/").partition("@")[0] for entry in defaults if isinstance(entry, str)]
   bases = [name for name in named if name != "_self_"]
@@ -76,9 +76,9 @@ def lineage(group: str, option: str, roots: Iterable[Path]) -> list[str]:
 
 
 class Delta(NamedTuple):
-  """What the file of an option changes: the sections whose keys it sets, and the groups that it overrides.
+  """The changes of an option's file: the sections whose keys it sets, and the groups that it overrides.
 
-  `is_known` is false for a file that cannot be judged without composing it.
+  `is_known` is false for a file whose changes are only known after composition.
   """
 
   sections: frozenset[str] = frozenset()
@@ -90,7 +90,7 @@ class Delta(NamedTuple):
 
 
 def delta(group: str, option: str, roots: Sequence[Path]) -> Delta:
-  """Returns what an option of a group of `DELTAS` changes, the options that its file is built on included."""
+  """Returns the changes of an option of a group in `DELTAS`, including the options that its file is built on."""
   file = find_file(group, option, roots)
   if file is None:
     return Delta(is_known=group == "experiment" and option in task_experiments(roots))
@@ -108,17 +108,17 @@ def delta(group: str, option: str, roots: Sequence[Path]) -> Delta:
 
 
 def task_names(roots: Iterable[Path] | None = None) -> list[str]:
-  """Options of env that are tasks, in CamelCase; the others need a robot to become one."""
+  """Returns the options of env that are tasks, in CamelCase; the others need a robot."""
   return [name for name in options("env", roots) if name[0].isupper()]
 
 
 def listed_options(group: str, roots: Iterable[Path]) -> list[str]:
-  """Options that one chooses from when nothing else is said: of env those that are tasks."""
+  """Returns the options to list for a group: of env only the tasks."""
   return task_names(roots) if group == "env" else options(group, roots)
 
 
 def search_path_override(roots: Sequence[Path]) -> list[str]:
-  """The override that makes Hydra look into outside packages' folders too."""
+  """Returns the override that adds outside packages' folders to Hydra's search path."""
   quoted = ", ".join("'" + f"file://{root}".replace("'", "\\'") + "'" for root in roots[1:])
   return [f"hydra.searchpath=[{quoted}]"] if quoted else []
 
@@ -129,14 +129,14 @@ def find_file(group: str, option: str, roots: Iterable[Path]) -> Path | None:
 
 
 def _read(group: str, option: str, roots: Iterable[Path]) -> dict[str, Plain]:
-  """The content of an option's file; empty for an option without one."""
+  """Returns the content of an option's file; empty for an option without one."""
   file = find_file(group, option, roots)
   return (yaml.safe_load(file.read_text()) if file else None) or {}
 
 
 @functools.cache
 def _outside_roots() -> tuple[Path, ...]:
-  """Folders of outside packages, by entry point; one that is broken is skipped with a warning, once."""
+  """Returns the folders of outside packages, by entry point; a broken one is skipped with one warning."""
   roots = []
   for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
     try:
@@ -147,6 +147,6 @@ def _outside_roots() -> tuple[Path, ...]:
       if not any(root.glob("*/**/*.yaml")):
         raise FileNotFoundError(f"{root} holds no file such as env/<TaskName>.yaml or robot/<name>.yaml")
       roots.append(root.resolve())
-    except Exception as error:  # whatever an outside package does wrong, ours go on working
+    except Exception as error:  # an error of an outside package must not break our options
       warnings.warn(f"Entry point {point.name!r} of {ENTRY_POINTS} is skipped: {first_line(error)}", stacklevel=2)
   return tuple(dict.fromkeys(roots))

@@ -1,4 +1,4 @@
-"""Checks values against their definitions (choices, texts, limits), and values that must go together."""
+"""Checks values against their definitions (choices, texts, limits), and values against each other."""
 
 import operator
 import re
@@ -17,10 +17,10 @@ _XLA_PLACES = ("dir", "path", "file", "dump", "load", "cache", "option", "overri
 
 
 def check_limits(resolved: Section) -> None:
-  """Checks the values that are there; a configuration may lack sections, and null is no value.
+  """Checks all values of a configuration, which may lack sections; null is not checked.
 
   Raises:
-    ConfigError: the first value that cannot work.
+    ConfigError: the first invalid value.
   """
   names = chosen_names(resolved)
   for key, value in _leaves(resolved):
@@ -47,7 +47,7 @@ def _check(key: str, value: object, names: Mapping[str, object]) -> None:
 
 
 def _check_order(node: Section, key: str) -> None:
-  """Raises ConfigError where a number is above the one whose name has `max` for its `min`, `upper` for `lower`."""
+  """Raises ConfigError where a key with `min` or `lower` is above that with `max` or `upper`."""
   for name, low in node.items():
     other = str(name).replace("min", "max").replace("lower", "upper")
     if isinstance(low, Mapping):
@@ -58,14 +58,14 @@ def _check_order(node: Section, key: str) -> None:
 
 
 def check_vision(said: Iterable[str], resolved: Section) -> None:
-  """Raises ConfigError where a command line says how a task sees (its keys are `said`) that sees nothing."""
+  """Raises ConfigError where a command line (its keys are `said`) sets `env.vision` of a task without vision."""
   unused = [key for key in said if key.startswith("env.vision.") and key != "env.vision.enable"]
   if unused and not sees(resolved["env"]):
     raise ConfigError(f"{unused[0]}: this task sees nothing. Add env.vision.enable=true env.vision.camera=<name>.")
 
 
 def _check_xla_flags(flags: object) -> None:
-  """Allows switches and numbers alone: some flags write to files, or name a folder of programs that XLA starts."""
+  """Allows only switches and numbers: other flags may write files, or name a folder of programs to start."""
   for flag in flags.split() if isinstance(flags, str) else []:
     if not _XLA_SWITCH.fullmatch(flag) or any(word in flag for word in _XLA_PLACES):
       what = "must be switches and numbers, such as --xla_gpu_deterministic_ops=true"
@@ -73,14 +73,14 @@ def _check_xla_flags(flags: object) -> None:
 
 
 def _numbers(value: object) -> list[float]:
-  """The numbers in a value, a number or a list."""
+  """Returns the numbers in a value, a number or a list."""
   if isinstance(value, list):
     return [number for entry in value for number in _numbers(entry)]
   return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
 def _leaves(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
-  """Dotted keys and values of everything that is no mapping, or an empty one."""
+  """Yields dotted keys and values of everything that is no mapping, or an empty one."""
   for name, value in node.items():
     if isinstance(value, Mapping) and value:
       yield from _leaves(value, join(prefix, name))

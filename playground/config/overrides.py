@@ -1,4 +1,4 @@
-"""The command line: one `key=value` at a time, and the groups among them."""
+"""Parses the command line, one `key=value` or `group=option` at a time."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -18,7 +18,7 @@ from playground.settings import Section
 from playground.text import format_value, quoted
 
 DEFAULT_EXPERIMENT = "quickstart"
-# Any of these on the command line, and it is not the default run that is meant.
+# With any of these on the command line, the default experiment is not added.
 _CHOOSES_A_RUN = {"experiment", "env", "agent", "robot", "curriculum", "resume"}
 _SHORT = {"terrain": "env.scene.terrain", "visuals": "video.visuals"}  # keys that may be written without their section
 
@@ -50,15 +50,15 @@ def is_hydras(text: str) -> bool:
 
 
 def is_of_sweep(key: str) -> bool:
-  """Whether a key or group says how a sweep is run, and nothing of its jobs."""
+  """Whether a key or group is a setting of the sweep, not of its jobs."""
   return key.split(".")[0] in _OF_SWEEPS
 
 
 def is_of_command(text: str) -> bool:
-  """Whether an override holds only for the command that it stands on: what a run or a sweep has saved cannot set it.
+  """Whether only a command line may set an override, not a saved run or sweep.
 
   These are Hydra's own keys, which name Python objects; packages to trust; the folder of compiled programs, which are
-  run as they are; and the machine to ask for the others of a training.
+  executed unchecked; and the address of the coordinator of a distributed training.
   """
   key = parse_with_hydra(text).key_or_group
   return is_hydras(text) or any(f"{key}.".startswith(f"{own}.") for own in _OF_COMMANDS)
@@ -67,7 +67,8 @@ def is_of_command(text: str) -> bool:
 def parse_with_hydra(text: str) -> HydraOverride:
   """Reads one override as Hydra does; raises ConfigError if it is none.
 
-  What names a folder is text, whatever characters it has: what Hydra cannot read, or takes for a list, is quoted first.
+  Values of folder keys are text, whatever characters they have: a value that Hydra does not parse as text is quoted
+  first.
   """
   key, _, value = text.partition("=")
   try:
@@ -109,16 +110,16 @@ def parse(text: str, roots: Sequence[Path]) -> Override:
 
 
 def group_overrides(overrides: Iterable[Override]) -> list[str]:
-  """The choices of groups for Hydra, which knows no group=null: switching a group off is removing it."""
+  """Returns the choices of groups for Hydra, which has no group=null: the group is removed instead."""
   return [f"~{o.key}" if o.value is None else f"{o.key}={format_value(o.value)}" for o in overrides if o.is_group]
 
 
 def canonical(overrides: Iterable[Override], resolved: Section) -> list[str]:
-  """Overrides for Hydra's own use: as typed, but with groups that are off and numbers in the form that it takes."""
+  """Returns overrides in Hydra's form, for disabled groups and for numbers."""
   config = OmegaConf.create(dict(resolved))
   lines = []
   for override in overrides:
-    adds = "++" if is_of_terms(override.key) else ""  # Hydra refuses a term that the files do not have
+    adds = "++" if is_of_terms(override.key) else ""  # Hydra refuses a term that no file has
     if override.is_group:
       lines += group_overrides([override])
     elif isinstance(override.value, int | float):

@@ -1,4 +1,4 @@
-"""A run's configuration as the rest of the program sees it, and how it is saved, read and shown."""
+"""A run's typed configuration, and functions that save, read and show it."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 if TYPE_CHECKING:
 
   class TaskConfig(EnvConfig, Mapping[str, Plain], ConfigDict):  # pyright: ignore[reportIncompatibleMethodOverride]
-    """The section of a task: the settings that every task has (`EnvConfig`), and those of its own class."""
+    """The section of a task: the settings of every task (`EnvConfig`), and those of its own class."""
 
     def __getattr__(self, name: str) -> Plain: ...
 else:
@@ -49,9 +49,9 @@ class RunConfig:
     run_dir: where the run lives; without `run_dir` or `resume` a name from the time of composing, which `resolved`
       leaves null, and which the run numbers (`_2`) if another has it by then.
     choices: the option of each group, None where none is chosen.
-    overrides: the command line in Hydra's form, numbers in their final type, the default experiment spelt out.
-    resolved: all of it as plain dicts, lists and scalars; what `config.yaml` in the run directory holds.
-    stages: of a chain, the runs it is made of, in order; empty for a single run.
+    overrides: the command line in Hydra's form, numbers in their final type, the default experiment included.
+    resolved: the whole configuration as plain dicts, lists and scalars; what `config.yaml` in the run directory holds.
+    stages: the runs of a chain, in order; empty for a single run.
   """
 
   name: str

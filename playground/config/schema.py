@@ -1,4 +1,4 @@
-"""Keys that exist and the types of their values. The schema is a nested dict of default values."""
+"""Checks which keys exist and the types of their values. The schema is a nested dict of default values."""
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,7 +15,7 @@ _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: 
 
 
 def check_key(key: str, schema: Section) -> None:
-  """Raises UnknownNameError, with what is there instead, if the schema has no such dotted key."""
+  """Raises UnknownNameError, with the keys that exist, if the schema has no such dotted key."""
   if is_open(key.split("."), schema):
     return
   node: Plain = schema
@@ -61,15 +61,15 @@ def fit(value: Plain, default: Plain, names: Mapping[str, object], key: str = ""
   """Returns a value in the type of its default, e.g. 1e6 as the whole number that the default is.
 
   Args:
-    value: of the configuration, or a part of it.
-    default: the same part of the schema; None and ??? (no default) take any single value or list, an empty mapping any
+    value: a value or section of the configuration.
+    default: the same key of the schema; None and ??? (no default) take any single value or list, an empty mapping any
       mapping.
     names: the chosen agent, launcher and search, as `definition` takes them.
-    key: where the part is, for errors.
+    key: dotted key, for errors.
 
   Raises:
-    ConfigError: it has another type.
-    UnknownNameError: it has a key that the default has not.
+    ConfigError: the value has another type.
+    UnknownNameError: the value has a key that the default has not.
   """
   if is_terms(key):
     return _fit_terms(value, key)
@@ -91,7 +91,7 @@ def fit(value: Plain, default: Plain, names: Mapping[str, object], key: str = ""
 
 
 def wrong_type(key: str, value: object, allowed: str) -> ConfigError:
-  """The error for a value of another type than is allowed."""
+  """Returns the error for a value of a wrong type."""
   return ConfigError(f"{key}={format_value(value)} has the wrong type: it must be {allowed}.")
 
 
@@ -106,7 +106,7 @@ def _fits(value: object, default: object) -> bool:
 
 
 def _fit_terms(value: object, key: str) -> Plain:
-  """A mapping of terms as it is: what its entries need, the task checks when it binds them."""
+  """Returns a mapping of terms unchanged; the task checks its entries when it binds them."""
   if not isinstance(value, Mapping):
     raise wrong_type(key, value, "a mapping of terms by name")
   for name, entry in value.items():
@@ -121,7 +121,7 @@ def _fit_terms(value: object, key: str) -> Plain:
 
 
 def _check_mappings(entry: Section, key: str) -> None:
-  """Raises ConfigError where a field of a term that holds keys is something else."""
+  """Raises ConfigError where `params`, `when` or `noise` of a term is no mapping."""
   for name in ("params", "when", "noise"):
     if entry.get(name) is not None and not isinstance(entry[name], Mapping):
       raise wrong_type(join(key, name), entry[name], "a mapping or null")
@@ -161,7 +161,7 @@ def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section)
 
 
 def _keys(node: Plain, prefix: str = "") -> Iterable[str]:
-  """Dotted names of everything in a nested mapping."""
+  """Yields the dotted names of everything in a nested mapping."""
   if isinstance(node, Mapping):
     for name, value in node.items():
       yield join(prefix, name)

@@ -91,7 +91,7 @@ class GridConfig:
 
 @dataclasses.dataclass(frozen=True)
 class OptunaConfig:
-  """Values drawn by Optuna from what the command line gives as interval(a, b), range(a, b) or a list.
+  """Values drawn by Optuna from interval(a, b), range(a, b) or a list on the command line.
 
   One trial is one job.
   """
@@ -126,7 +126,7 @@ class SweepConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SweepSettings(SweepConfig):
-  """All that a sweep is told of itself; `resolved` holds it as plain dicts, lists and scalars."""
+  """All settings of a sweep; `resolved` holds them as plain dicts, lists and scalars."""
 
   launcher: LauncherConfig
   search: GridConfig | OptunaConfig

@@ -1,6 +1,6 @@
-"""Many runs at once, `playground-run -m`: sweep files and globs, and the jobs that they stand for.
+"""Sweeps, `playground-run -m`: expands sweep files and globs into jobs.
 
-A file of sweeps/ says what varies, in the syntax of the command line; a list stands for its values one by one:
+A file of sweeps/ holds overrides in the syntax of the command line; a list is one job for each value:
 
 ```yaml
 params:
@@ -9,7 +9,7 @@ params:
   seed: range(5)
 ```
 
-It may list jobs that have more of their own, each a command line, which together with `params` is combined as well:
+It may also list jobs, each a command line that is combined with `params`:
 
 ```yaml
 params:
@@ -40,13 +40,13 @@ _HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper
 
 
 def expand(overrides: Sequence[str]) -> list[str]:
-  """Spells out what `-m` is given: `sweep=<name>` becomes what its file says, a glob the options it stands for.
+  """Expands the overrides of `-m`: `sweep=<name>` becomes the overrides of its file, a glob its options.
 
-  What the command line says of a key replaces what the file says of it.
+  The command line wins over the file.
 
   Raises:
-    ConfigError: a sweep file that is none, a value that cannot be.
-    UnknownNameError: no such sweep or option, or a glob that stands for none.
+    ConfigError: an invalid sweep file or value.
+    UnknownNameError: no such sweep or option, or a glob without a match.
   """
   roots = config_roots()
   given = [parse_with_hydra(text) for text in overrides if not is_hydras(text)]
@@ -60,10 +60,10 @@ def expand(overrides: Sequence[str]) -> list[str]:
 
 
 def listed_jobs(overrides: Sequence[str]) -> list[list[str]]:
-  """The `jobs` of the sweep file that `-m` is given, spelt out, without what the command line says otherwise.
+  """Returns the expanded `jobs` of the sweep file of `-m`, without keys that the command line sets.
 
   Raises:
-    ConfigError: a job that cannot be, or one that says something of the whole sweep.
+    ConfigError: an invalid job, or one that sets a key of the whole sweep.
     UnknownNameError: as `expand`.
   """
   given = [parse_with_hydra(text) for text in overrides if not is_hydras(text)]
@@ -80,7 +80,7 @@ def listed_jobs(overrides: Sequence[str]) -> list[list[str]]:
 
 
 def with_listed(lines: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[list[str]]:
-  """The lines of each listed job: what it says replaces what `lines` say of the same key. Without jobs, `lines`."""
+  """Returns the overrides of each listed job, which win over `lines`; without jobs, `lines` alone."""
   key = lambda line: parse_with_hydra(line).key_or_group
   together = []
   for job in jobs or [[]]:
@@ -90,10 +90,10 @@ def with_listed(lines: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[lis
 
 
 def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
-  """Divides what `expand` returns into what is said of the sweep itself and what is said of its jobs.
+  """Divides expanded overrides into those of the sweep itself and those of its jobs.
 
   Raises:
-    ConfigError: a key that a sweep's jobs cannot have.
+    ConfigError: a key that jobs of a sweep must not set.
   """
   settings, ours = [], []
   for line in lines:
@@ -108,7 +108,7 @@ def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
 
 
 def command_lines(overrides: Sequence[str]) -> list[str]:
-  """What `-m` is given that each job's command gets and the sweep's folder does not keep (`is_of_command`).
+  """Returns the overrides of `-m` that every job's command gets but no file of the sweep (`is_of_command`).
 
   Raises:
     ConfigError: as `expand`, and for several values.
@@ -121,10 +121,10 @@ def command_lines(overrides: Sequence[str]) -> list[str]:
 
 
 def check_saved_job(name: str, overrides: Iterable[str]) -> None:
-  """Checks a job that was read from a sweep's folder, which may be somebody else's, before it is run.
+  """Checks a job read from a sweep's folder, which another user may have written, before it runs.
 
   Raises:
-    ConfigError: an override that says where the job writes, or that only a command line can say.
+    ConfigError: an override of the folder that the job writes, or one that only a command line may set.
   """
   for text in overrides:
     if is_of_command(text) or split([text])[0]:
@@ -132,7 +132,7 @@ def check_saved_job(name: str, overrides: Iterable[str]) -> None:
 
 
 def combinations(*sets: Sequence[str]) -> list[list[str]]:
-  """The overrides of each job that a sweep's lines stand for: every combination of their values, of each set of lines.
+  """Returns the overrides of each job of a sweep: every combination of values, for each set of lines.
 
   Raises:
     ConfigError: an interval, which has no values to combine.
@@ -146,7 +146,7 @@ def combinations(*sets: Sequence[str]) -> list[list[str]]:
 
 
 def varying(*sets: Iterable[str]) -> list[str]:
-  """The keys and groups that have more than one value, in one set of lines or among several."""
+  """Returns the keys and groups with more than one value, in one set of lines or among several."""
   said = [{parse_with_hydra(line).key_or_group: tuple(_values(line)) for line in lines} for lines in sets]
   differs = lambda key: len({values.get(key) for values in said}) > 1
   listed = lambda key: any(len(values[key]) != 1 for values in said if key in values)
@@ -154,12 +154,12 @@ def varying(*sets: Iterable[str]) -> list[str]:
 
 
 def sweep_names() -> list[str]:
-  """Names of the sweeps we ship, sorted."""
+  """Returns the names of the sweeps we ship, sorted."""
   return sorted(path.stem for path in shipped("sweeps").glob("*.yaml"))
 
 
 def _values(text: str) -> list[str]:
-  """An override once for each of its values."""
+  """Returns an override for each of its values."""
   override = parse_with_hydra(text)
   if not override.is_sweep_override():
     return [text]
@@ -169,7 +169,7 @@ def _values(text: str) -> list[str]:
 
 
 def _checked(overrides: Iterable[HydraOverride], roots: Sequence[Path]) -> list[str]:
-  """The overrides as lines, their globs spelt out, every value of them one that can be."""
+  """Returns the overrides as lines, with globs expanded and every value checked."""
   lines = [_spell_out(override, roots) for override in overrides]
   for line in lines:
     for one in _values(line):
@@ -178,7 +178,7 @@ def _checked(overrides: Iterable[HydraOverride], roots: Sequence[Path]) -> list[
 
 
 def _spell_out(override: HydraOverride, roots: Sequence[Path]) -> str:
-  """The override as typed, its globs replaced: Hydra's also take files that are only parts of an option."""
+  """Returns the override with its globs expanded: Hydra's own would also match shared files (_name.yaml)."""
   text, group, value = str(override.input_line), override.key_or_group, override.value()
   entries = value.list if isinstance(value, ChoiceSweep) else [value]
   if not any(isinstance(entry, Glob) for entry in entries):
@@ -194,7 +194,7 @@ def _spell_out(override: HydraOverride, roots: Sequence[Path]) -> str:
 
 
 def _read(name: str) -> tuple[list[str], list[str]]:
-  """What a sweep file says: `params` as overrides, and `jobs`."""
+  """Reads a sweep file: `params` as overrides, and `jobs`."""
   known = sweep_names()
   if name not in known:
     raise UnknownNameError(f"sweep={name} does not exist: choose from {', '.join(known)}.{nearest(name, known)}")

@@ -1,9 +1,9 @@
-"""One training over several machines: its processes find each other, agree, and end together.
+"""Distributed training: its processes connect, compare their configurations, and end together.
 
 Every machine runs the same command; process 0 writes the run directory, the others only compute.
 
-A process that is lost must end all others, which wait for it in an exchange. JAX aborts them with a stack trace, or
-lets them wait, so a watch of ours comes before it (`_Watch`).
+If a process is lost, all others must end: they wait for it in a collective. JAX aborts them with a stack trace, or lets
+them wait, so our own watch acts first (`_Watch`).
 """
 
 import atexit
@@ -33,15 +33,15 @@ T = TypeVar("T")
 PREFLIGHT = "preflight"  # name of the threads that may hang
 _STORE = "playground"  # our folder in the coordinator's key-value store
 _WEEK_MS = 7 * 24 * 3600 * 1000  # longer than processes wait for each other; JAX wants a limit
-_PERIOD_S = 1.0  # between two signs of life
+_PERIOD_S = 1.0  # s between two heartbeats
 _WATCH = f"{_STORE}/watch"
 _FAILED = f"{_WATCH}/failed"  # why a process ends
-_LEFT = "left"  # the last sign of life of a process that ends well
+_LEFT = "left"  # the last heartbeat of a process that ends normally
 _numbers = itertools.count()  # of the barriers and shared texts: the same in all processes
 
 
 def is_main() -> bool:
-  """Whether this process is the one that writes."""
+  """Whether this is process 0, which writes the run."""
   return jax.process_index() == 0
 
 
@@ -61,14 +61,14 @@ def any_process(flag: bool) -> bool:
 
 
 def wait_for_all() -> None:
-  """Returns when every process has called it, however long that takes."""
+  """Blocks until every process has called it, without a time limit."""
   if _watch is not None:
     barrier, client = f"{_STORE}/{next(_numbers)}", _watch.client
     _within(lambda: client.wait_at_barrier(barrier, _WEEK_MS), None, "the other processes did not come")
 
 
 def share(text: str = "") -> str:
-  """Returns process 0's text in all processes. All of them must ask, in the same order."""
+  """Returns process 0's text in all processes; all must call it, in the same order."""
   if _watch is None:
     return text
   key, client = f"{_STORE}/shared/{next(_numbers)}", _watch.client
@@ -79,14 +79,14 @@ def share(text: str = "") -> str:
 
 
 def init_distributed(config: HardwareConfig) -> None:
-  """Joins the training's other processes, if `hardware.distributed` says that there are any.
+  """Joins the other processes of the training, if `hardware.distributed` is enabled.
 
-  They come from Slurm (or whatever else JAX knows), or from the keys coordinator, num_processes and process_id. Call it
-  before JAX touches a device; only the first call does anything.
+  Their addresses come from Slurm (or another launcher that JAX knows), or from the keys coordinator,
+  num_processes and process_id. Call it before JAX touches a device; only the first call has an effect.
 
   Raises:
-    ConfigError: too little is known to find them.
-    HardwareError: they do not come, or cannot be reached.
+    ConfigError: keys are missing.
+    HardwareError: the other processes do not connect, or are not reachable.
   """
   keys = ("coordinator", "num_processes", "process_id")
   settings = config.distributed
@@ -114,7 +114,7 @@ def init_distributed(config: HardwareConfig) -> None:
     _reach(coordinator, timeout)
   # Its handler of SIGTERM would replace ours, which saves.
   jax.config.update("jax_enable_preemption_service", False)
-  # CPUs only: two programs in flight would exchange in an order of their own in each process.
+  # CPUs only: two concurrent programs could run their collectives in a different order in each process.
   jax.config.update("jax_cpu_collectives_implementation", "gloo")
   jax.config.update("jax_cpu_enable_async_dispatch", False)
   watch = _Watch(index, count, coordinator, settings.lost_after)
@@ -135,16 +135,16 @@ def init_distributed(config: HardwareConfig) -> None:
 
 
 def preflight(config: HardwareConfig, fingerprint: object, what: str = "configuration") -> None:
-  """Checks in an exchange between all processes that they train the same.
+  """Checks in a collective that all processes train the same.
 
   Args:
     config: `hardware`.
-    fingerprint: what must be equal everywhere, such as the resolved configuration.
-    what: its name.
+    fingerprint: a value that must be equal in all processes, such as the resolved configuration.
+    what: name of the value.
 
   Raises:
-    HardwareError: it takes longer than `hardware.distributed.timeout`.
-    ConfigError: they differ.
+    HardwareError: the collective takes longer than `hardware.distributed.timeout`.
+    ConfigError: the values differ.
   """
   if not is_multiprocess():
     return
@@ -169,7 +169,7 @@ def preflight(config: HardwareConfig, fingerprint: object, what: str = "configur
 def ending_together() -> Iterator[None]:
   """Ends this process only when all processes of the training have ended the block, or at once if an error ends it.
 
-  The others wait in an exchange that this process will not come to, and a normal exit waits for them.
+  The others wait in a collective that this process will not join, and a normal exit would wait for them.
   """
   try:
     yield
@@ -183,7 +183,7 @@ def ending_together() -> Iterator[None]:
 
 
 def leave(code: int, why: str) -> None:
-  """Ends this process at once, and the others with a sentence that tells `why`; nothing if there are no others."""
+  """Ends this process at once, and the others with the sentence `why`; does nothing without others."""
   if _watch is not None:
     _watch.tell(f"process {jax.process_index()} on {socket.gethostname()} {why}")
     sys.stdout.flush()
@@ -202,7 +202,7 @@ def noting_loss(note: Callable[[str], None]) -> Iterator[None]:
   except Exception as error:
     if not any(word in str(error) for word in ("Gloo", "NCCL")):
       raise
-    time.sleep(_watch.lost_after + 5)  # the exchange broke before the watch knows why, and then the watch ends this
+    time.sleep(_watch.lost_after + 5)  # until the watch knows the reason and ends this process
     raise HardwareError(f"hardware=multi_node: an exchange failed, {first_line(error)}.") from error
   finally:
     _watch.notes.remove(note)
@@ -211,12 +211,12 @@ def noting_loss(note: Callable[[str], None]) -> Iterator[None]:
 class _Watch:
   """Ends this process in one sentence when another one of the training fails or is lost.
 
-  A process that fails says so in the coordinator's key-value store. One that is killed, or whose machine is gone, no
-  longer counts up its sign of life there. Process 0 is the coordinator: JAX's client aborts when its connection to it
-  closes, so the client's connection leads through a relay of ours, which sees that first.
+  A process that fails writes so to the coordinator's key-value store. A process that is killed, or whose machine is
+  lost, stops its heartbeat there. Process 0 is the coordinator: JAX's client aborts when its connection to it closes,
+  so that connection goes through our relay, which notices first.
 
   Attributes:
-    lost_after: seconds without a sign of life after which a process is lost.
+    lost_after: seconds without a heartbeat after which a process is lost.
     notes: called with the sentence before this process ends.
     client: the coordinator's, once JAX has connected.
   """
@@ -230,7 +230,7 @@ class _Watch:
     self._lock = threading.Lock()
 
   def start(self) -> None:
-    """Watches from here on, until the interpreter ends."""
+    """Starts the watch, which lasts until the interpreter ends."""
     global _watch
     from jax._src import distributed  # JAX has no public name for the store
 
@@ -239,7 +239,7 @@ class _Watch:
     self._thread = _start_thread(self._run)
 
   def relay(self) -> str:
-    """An address of this machine that leads to the coordinator; the coordinator's loss ends this process."""
+    """Returns a local address that forwards to the coordinator; the coordinator's loss ends this process."""
     listener = socket.create_server(("127.0.0.1", 0))
     host, _, port = self._coordinator.rpartition(":")
 
@@ -250,7 +250,7 @@ class _Watch:
           far = socket.create_connection((host, int(port)))
         except OSError:
           self._lost_coordinator()
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: a machine that is gone closes nothing
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: a lost machine closes no connection
           far.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * self.lost_after))
         _start_thread(lambda near=near, far=far: self._connect(near, far))
 
@@ -258,16 +258,16 @@ class _Watch:
     return f"127.0.0.1:{listener.getsockname()[1]}"
 
   def tell(self, sentence: str) -> None:
-    """Lets the others end with a sentence; this process ends by itself."""
+    """Ends the other processes with a sentence; this process ends by itself."""
     self._leaving.set()
     with contextlib.suppress(Exception):  # another one was first, or the store is lost with process 0
       self.client.key_value_set(_FAILED, sentence)
     if self._index == 0:
-      time.sleep(2 * _PERIOD_S)  # the store ends with this process: the others are to read it first
+      time.sleep(2 * _PERIOD_S)  # the store ends with this process: the others must read it first
 
   def _part(self) -> None:
     self._leaving.set()
-    self._thread.join()  # a thread that comes back from JAX while Python ends aborts the process
+    self._thread.join()  # a thread that returns from JAX while Python ends aborts the process
     with contextlib.suppress(Exception):  # process 0 may have gone
       self.client.key_value_set(_sign_of(self._index), _LEFT, allow_overwrite=True)
 
@@ -277,7 +277,7 @@ class _Watch:
     for beat in itertools.count():
       try:
         store = _within(lambda beat=beat: self._exchange(str(beat)), self.lost_after, "")
-      except HardwareError:  # process 0 does not answer: its sign of life is missing, too
+      except HardwareError:  # process 0 does not answer: its heartbeat is missing, too
         store = {}
       if _FAILED in store:
         self._lost(store[_FAILED])
@@ -291,12 +291,12 @@ class _Watch:
         return
 
   def _exchange(self, sign: str) -> dict[str, str]:
-    """Gives a sign of life, and returns what all processes have said."""
+    """Writes a heartbeat, and returns the entries of all processes."""
     self.client.key_value_set(_sign_of(self._index), sign, allow_overwrite=True)
     return dict(self.client.key_value_dir_get(_WATCH))
 
   def _connect(self, near: socket.socket, far: socket.socket) -> None:
-    """Passes on what goes between JAX's client and the coordinator."""
+    """Forwards data between JAX's client and the coordinator."""
     closed = threading.Event()
 
     def send() -> None:
@@ -343,13 +343,13 @@ _watch: _Watch | None = None  # this process's, once it has joined others
 
 
 def _within(call: Callable[[], T], seconds: float | None, otherwise: str) -> T:
-  """Result of a call that may hang, which a signal can interrupt; raises HardwareError if it hangs or fails."""
+  """Returns the result of a call that a signal can interrupt; raises HardwareError if it hangs or fails."""
   outcome: Future[T] = Future()
 
   def run() -> None:
     try:
       outcome.set_result(call())
-    except Exception as error:  # whatever the runtime throws
+    except Exception as error:  # any error of the runtime
       outcome.set_exception(error)
 
   _start_thread(run, PREFLIGHT).join(seconds)
@@ -370,7 +370,7 @@ def _start_thread(target: Callable[[], None], name: str = "watch") -> threading.
 
 
 def _receive(end: socket.socket) -> bytes:
-  """The next bytes; none when the connection is closed, or broken."""
+  """Returns the next bytes; none when the connection is closed or broken."""
   try:
     return end.recv(1 << 16)
   except OSError:
@@ -411,7 +411,7 @@ def _known_cluster() -> bool:
 
 
 def _topology(settings: DistributedConfig, timeout: int) -> tuple[str, int, int, list[int] | None]:
-  """The coordinator's address, how many processes there are, which one this is, and its devices if not all."""
+  """Returns the coordinator's address, number of processes, index of this one, and its devices if not all."""
   from jax._src import clusters  # as above
 
   given = settings.coordinator, settings.num_processes, settings.process_id
@@ -420,7 +420,7 @@ def _topology(settings: DistributedConfig, timeout: int) -> tuple[str, int, int,
 
 
 def _local_device_ids() -> list[int] | None:
-  """With one Slurm task on each node that task has all of its GPUs; JAX would give it the first one only."""
+  """Returns all GPUs of a node with one Slurm task; JAX would use the first one only."""
   nodes, tasks = os.environ.get("SLURM_STEP_NUM_NODES"), os.environ.get("SLURM_NTASKS")
   if nodes is None or nodes != tasks:
     return None

@@ -1,4 +1,4 @@
-"""GPUs of this machine, found without JAX: looking must not take their memory."""
+"""Finds the GPUs of this machine without JAX, which would take their memory."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 
 def visible_gpus(env: Mapping[str, str] = os.environ) -> list[str]:
-  """GPUs as CUDA_VISIBLE_DEVICES names them: its own entries, else all that the driver has."""
+  """Returns the GPUs in CUDA_VISIBLE_DEVICES, else all that the driver has."""
   if env.get("JAX_PLATFORMS") == "cpu":
     return []
   named = env.get("CUDA_VISIBLE_DEVICES")

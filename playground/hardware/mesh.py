@@ -1,7 +1,7 @@
 """Devices as a mesh of one axis, over which environments are divided (data parallel).
 
-A mesh for several agents has a second axis before it. What is jitted over such a mesh, and what is put on it, has an
-axis of agents before all others; functions are written for one agent all the same.
+A mesh for several agents has a second axis before it. Arrays on such a mesh have an axis of agents before all others;
+functions are written for one agent.
 """
 
 import math
@@ -17,37 +17,37 @@ from jax.stages import Wrapped
 
 from playground.pytree import PyTree
 
-AXIS = "data"  # the mesh's axis; inside a mapped function collectives name it
+AXIS = "data"  # the mesh's axis, which collectives name
 AGENTS = "agents"  # the axis over which agents are divided
 GROUP = "group"  # the axis of the agents that share a device, inside a mapped function
 
 
 def make_mesh(num_devices: int) -> Mesh:
-  """A mesh over the first `num_devices` visible devices of every process (mostly there is one process)."""
+  """Returns a mesh over the first `num_devices` visible devices of every process (mostly one process)."""
   devices = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
   mine = lambda index: [device for device in devices if device.process_index == index][:num_devices]
   return Mesh(np.array([device for i in range(jax.process_count()) for device in mine(i)]), (AXIS,))
 
 
 def for_agents(mesh: Mesh, count: int) -> Mesh:
-  """The same devices for several agents: these are divided over them first, then each agent's environments."""
+  """Returns a mesh of the same devices for several agents: divides agents first, then each one's environments."""
   return Mesh(mesh.devices.reshape(math.gcd(count, mesh.size), -1), (AGENTS, AXIS))
 
 
 def gather_on_mesh(function: Callable[..., PyTree], mesh: Mesh, spec: PyTree) -> Wrapped:
-  """Jits a function of one tree, divided as `spec` says, whose results are then whole on every device."""
+  """Jits a function of one tree, divided by `spec`, whose results are then whole on every device."""
   return jax.jit(function, in_shardings=(_shardings(mesh, spec),), out_shardings=NamedSharding(mesh, P()))
 
 
 def shard(tree: PyTree, mesh: Mesh) -> PyTree:
   """Divides arrays that every process has over the devices, by their leading axis."""
-  if jax.process_count() == 1:  # what is jitted over the mesh takes them as they are
+  if jax.process_count() == 1:  # functions jitted over the mesh take them unchanged
     return tree
   return put(tree, mesh, P(AXIS))
 
 
 def put(tree: PyTree, mesh: Mesh, spec: PyTree) -> PyTree:
-  """Puts host arrays, the same in every process, on the devices as `spec` (a tree prefix) says; shares no buffer."""
+  """Puts host arrays, the same in every process, on the devices by `spec` (a tree prefix); shares no buffer."""
   shardings = _shardings(mesh, spec)
   if jax.process_count() == 1:
     return jax.device_put(tree, shardings, may_alias=False)
@@ -68,13 +68,13 @@ def local_shard(array: jax.Array | np.ndarray, axis: int) -> np.ndarray:
 
 
 def _shardings(mesh: Mesh, specs: PyTree) -> PyTree:
-  """The shardings that specs for one agent come to."""
+  """Returns the shardings of specs for one agent."""
   agents = (AGENTS,) if AGENTS in mesh.axis_names else ()
   return jax.tree.map(lambda spec: NamedSharding(mesh, P(*agents, *spec)), specs)
 
 
 def take_agents(tree: PyTree, indices: np.ndarray, mesh: Mesh, spec: PyTree) -> PyTree:
-  """Returns the parts of these agents of a tree, divided as `spec` says of one agent's, in their order."""
+  """Returns the shards of these agents of a tree, in their order; `spec` is that of one agent."""
   return jax.jit(_take, out_shardings=_shardings(mesh, spec))(tree, indices)
 
 
@@ -83,7 +83,7 @@ def _take(tree: PyTree, indices: jax.Array) -> PyTree:
 
 
 def device_memory(mesh: Mesh) -> int | None:
-  """Bytes that a program may use on the smallest device, of a CPU its share of the host's; None if nobody says."""
+  """Returns the bytes available on the smallest device (on a CPU its share of host memory); None if unknown."""
   if mesh.devices.flat[0].platform == "cpu":
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // len(mesh.local_devices)
   limits = [(device.memory_stats() or {}).get("bytes_limit") for device in mesh.devices.flat]
@@ -97,7 +97,7 @@ def jit_on_mesh(
   """Jits `function` to run once on every device of the mesh, each on its share of the arguments.
 
   Args:
-    function: sees its device's share; collectives over "data" reach the other devices.
+    function: gets its device's share; collectives over "data" reach the other devices.
     mesh: the devices. If it is one for several agents, arguments and results have an axis of agents in front.
     in_specs: a PartitionSpec for each argument (or a tree prefix of them): P("data") divides the leading axis. None is
       an argument that is the same for all devices and all agents.
@@ -117,7 +117,7 @@ def jit_on_mesh(
 
 
 def _without_empty_arrays(function: Callable[..., PyTree], over_mesh: Callable[..., PyTree]) -> Callable[..., PyTree]:
-  """`over_mesh(function)`, but that arrays of no elements have some while they go in and out.
+  """`over_mesh(function)`, with empty arrays padded at its inputs and outputs.
 
   A mocap body's pose in a model without one is such an array. JAX 0.11.2 dies of a segmentation fault compiling
   a shard_map over several devices that takes and returns one (Shardy's ManualComputationUnusedInputsPattern).
@@ -139,18 +139,18 @@ def _without_empty_arrays(function: Callable[..., PyTree], over_mesh: Callable[.
 
 
 def _empty_axes(tree: PyTree) -> list[list[int]]:
-  """Of each leaf, the axes of length 0."""
+  """Returns the axes of length 0 of each leaf."""
   return [[axis for axis, size in enumerate(jnp.shape(x)) if size == 0] for x in jax.tree.leaves(tree)]
 
 
 def _fill(tree: PyTree) -> PyTree:
-  """The tree with axes of length 0 made 1 long."""
+  """Returns the tree with axes of length 0 padded to 1."""
   some = lambda x: jnp.zeros([size or 1 for size in x.shape], x.dtype) if 0 in jnp.shape(x) else x
   return jax.tree.map(some, tree)
 
 
 def _cut(tree: PyTree, axes: list[list[int]]) -> PyTree:
-  """The tree with these axes of its leaves made empty."""
+  """Returns the tree with these axes of its leaves cut to length 0."""
   leaves, structure = jax.tree.flatten(tree)
   for i, empty in enumerate(axes):
     for axis in empty:

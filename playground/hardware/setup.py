@@ -20,7 +20,7 @@ _REMOVED_FLAGS = {"--xla_cpu_use_fusion_emitters": (0, 11)}
 
 @dataclasses.dataclass(frozen=True)
 class Hardware:
-  """What a run trains on."""
+  """The devices that a run trains on."""
 
   mesh: Mesh
   network_precision: str | None
@@ -33,7 +33,7 @@ def setup(config: HardwareConfig) -> Hardware:
   Call it before JAX touches a device: platform, memory and flags cannot change afterwards.
 
   Raises:
-    HardwareError: devices this machine does not have, or other processes of the training that do not come.
+    HardwareError: this machine lacks the devices, or other processes of the training do not connect.
   """
   _environment(config)
   if config.platform == "cpu":
@@ -67,26 +67,26 @@ def setup(config: HardwareConfig) -> Hardware:
 
 
 def this_machine(hardware: HardwareConfig, platform: Platform | None = None) -> HardwareConfig:
-  """A run's `hardware` config for looking at it here: one device of whatever kind there is, or of a platform."""
+  """Returns a run's `hardware` config for one device of this machine, of any type or of a platform."""
   platform = platform or ("cpu" if hardware.platform == "cpu" else "auto")
   alone = dataclasses.replace(hardware.distributed, enable=False)
   return dataclasses.replace(hardware, devices=1, kind=None, xla_flags="", distributed=alone, platform=platform)
 
 
 def cache_dir(config: HardwareConfig) -> Path:
-  """Where compiled programs are kept between runs."""
+  """Returns the folder of compiled programs that runs share."""
   return Path(config.cache_dir or CACHE).expanduser()
 
 
 def _environment(config: HardwareConfig) -> None:
-  """Variables that the GPU runtime reads when it starts; what the user exported wins."""
+  """Sets variables that the GPU runtime reads at its start; exported ones win."""
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", str(bool(config.preallocate)).lower())
   if config.memory_fraction is not None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", str(config.memory_fraction))
   known = lambda flag: jax.__version_info__ < _REMOVED_FLAGS.get(flag.partition("=")[0], (math.inf,))
   exported = os.environ.get("XLA_FLAGS", "").split()
   added = [flag for flag in config.xla_flags.split() if known(flag) and flag not in exported]
-  if added:  # a chain comes here often
+  if added:  # a chain calls this often
     os.environ["XLA_FLAGS"] = " ".join([*exported, *added])
 
 
@@ -98,7 +98,7 @@ def _caches(config: HardwareConfig) -> str | None:
   os.environ.setdefault("WARP_CACHE_PATH", str(folder / "warp"))
   if not jax.config.jax_compilation_cache_dir:
     jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
-  least = min(0.5, jax.config.jax_persistent_cache_min_compile_time_secs)  # the environment may ask for less
+  least = min(0.5, jax.config.jax_persistent_cache_min_compile_time_secs)  # the environment may limit it further
   jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
   jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
   return jax.config.jax_compilation_cache_dir

@@ -1,20 +1,20 @@
-"""Many runs at once: `playground-run -m` and `playground sweep`.
+"""Sweeps of runs: `playground-run -m` and `playground sweep`.
 
-Everything about a sweep lies in files, so whatever runs it may die, and the same command again does what is missing:
+The state of a sweep is in files, so its process may die; the same command runs what is missing:
 
 ```
 <sweep_dir>/
-  sweep.yaml            what was asked for, and every job with its overrides
-  jobs/<job>/           a run directory, with job.json (how the job stands, by its worker) and job.log besides
+  sweep.yaml            the command, and every job with its overrides
+  jobs/<job>/           a run directory, with job.json (status, by its worker) and job.log
   sweep.csv  groups.csv  plots/  report.html      the result, by `collect` and at the end
 ```
 
   plan      command line -> jobs, composed and checked
   folder    those files
   worker    one job in one process: started by a launcher, on whatever machine
-  local, slurm, ray     launchers: where and when a worker starts
+  local, slurm, ray     launchers: start workers
   runner    the loop that hands jobs to a launcher and waits for them; measurements of `playground-bench` use it, too
   search    Optuna instead of every combination
-  view      the output meanwhile
+  view      the output of a running sweep
   report    tables, curves and the page
 """

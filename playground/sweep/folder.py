@@ -30,13 +30,13 @@ FAILED = ("failed", "timeout", "killed")
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-  """One process of a sweep or a benchmark.
+  """One process of a sweep or benchmark.
 
   Attributes:
     name: of its folder.
     overrides: its arguments, to which the worker adds its folder.
     varies: the values in which the sweep's jobs differ, by key.
-    needs: how many GPUs it takes on its machine; None is one if there is any.
+    needs: number of GPUs; None is one if there is any.
     steps: its budget of environment steps.
   """
 
@@ -48,19 +48,19 @@ class Job:
 
   @classmethod
   def of_run(cls, number: int, overrides: Sequence[str], varying: Sequence[str], config: RunConfig) -> "Job":
-    """A run as a job.
+    """Makes a job of a run.
 
     Args:
-      number: its place in the sweep.
-      overrides: its command line.
+      number: position in the sweep.
+      overrides: command line.
       varying: the keys in which jobs differ.
-      config: its configuration.
+      config: configuration.
 
     Raises:
-      ConfigError: it takes several machines.
+      ConfigError: the run needs several machines.
     """
     varies = {key: _value(config, key) for key in varying}
-    own = {text.partition("=")[0].lstrip("+~") for text in overrides}  # a listed job says less than others
+    own = {text.partition("=")[0].lstrip("+~") for text in overrides}  # listed jobs may lack a key that others set
     named = {key: value for key, value in varies.items() if key in own}
     short = lambda v: f"{v:.4g}" if isinstance(v, float) else str(v)
     words = [short(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={short(v)}" for k, v in named.items()]
@@ -75,7 +75,7 @@ class Job:
 
 
 def _value(config: RunConfig, key: str) -> Plain:
-  """A job's value of a key or group."""
+  """Returns a job's value of a key or group."""
   if key in config.choices:
     return config.choices[key]
   node: Plain = config.resolved
@@ -97,7 +97,7 @@ class JobState:
 
   @property
   def seconds(self) -> float | None:
-    """How long the last start took, or has taken so far."""
+    """Returns the duration of the last start so far, s."""
     if self.started is None:
       return None
     try:
@@ -117,7 +117,7 @@ class JobFolder:
 
   @property
   def begun(self) -> bool:
-    """Whether there is a run to resume."""
+    """Whether the job has a run to resume."""
     return (self.path / "config.yaml").is_file()
 
   @property
@@ -141,13 +141,13 @@ class JobFolder:
     self.write(status=status, attempt=self.record.get("attempt", 0))
 
   def state(self) -> JobState:
-    """The job's state, also if its worker was killed before it recorded one."""
+    """Returns the job's state, also if its worker was killed before it recorded one."""
     record = self.record
     fields = {f.name: record[f.name] for f in dataclasses.fields(JobState) if f.name in record}
     state = JobState(**fields)
     if state.status != "running" or self.locked():
       return state
-    if self.run.status.get("status") == "finished":  # it outlived its worker
+    if self.run.status.get("status") == "finished":  # the run outlived its worker
       return dataclasses.replace(state, status="finished")
     return dataclasses.replace(state, status="killed", reason="its process is gone without a word")
 
@@ -158,7 +158,7 @@ class JobFolder:
     Processes that inherit the descriptor hold the lock, too: a run that outlives its worker still counts as running.
     """
     self.path.mkdir(parents=True, exist_ok=True)
-    with locking(self.path / "job.lock", patience_s) as lock:  # `locked` holds it for a moment to see
+    with locking(self.path / "job.lock", patience_s) as lock:  # `locked` holds the lock for a moment
       yield lock
 
   def locked(self) -> bool:
@@ -166,7 +166,7 @@ class JobFolder:
     return is_locked(self.path / "job.lock")
 
   def progress(self) -> tuple[int | None, float | None]:
-    """Steps trained and the last evaluation's return, as its metrics.csv has them."""
+    """Returns trained steps and the last evaluation's return, from metrics.csv."""
     try:
       with (self.path / "metrics.csv").open("rb") as file:
         columns = file.readline().decode().strip().split(",")
@@ -189,9 +189,9 @@ class SweepDirectory:
     name: of the sweep.
     command: the command line, for people.
     settings: the overrides of the sweep itself.
-    lines: the overrides that its jobs are made of.
+    lines: the overrides of its jobs, with several values each.
     jobs: its jobs.
-    cwd: where it was started: relative paths in overrides are from there.
+    cwd: the folder it was started in: relative paths in overrides start there.
     created: when (ISO 8601).
   """
 
@@ -209,7 +209,7 @@ class SweepDirectory:
     cls, path: str | Path, name: str, command: Sequence[str], settings: Sequence[str], lines: Sequence[str],
     jobs: Sequence[Job],
   ) -> "SweepDirectory":  # fmt: skip
-    """Makes the folder and writes sweep.yaml; see the attributes. Raises CheckpointError where it cannot be written."""
+    """Makes the folder and writes sweep.yaml; see the attributes. Raises CheckpointError if that fails."""
     sweep = cls(Path(path), name, list(command), list(settings), list(lines), list(jobs), Path.cwd(), now())
     try:
       sweep.path.mkdir(parents=True, exist_ok=True)
@@ -241,7 +241,7 @@ class SweepDirectory:
 
   @property
   def stop_file(self) -> Path:
-    """While this file exists, workers stop their jobs, wherever they run."""
+    """Returns the stop file: while it exists, workers stop their jobs, on any machine."""
     return self.path / STOP_FILE
 
   def folder(self, job: Job) -> JobFolder:
@@ -274,7 +274,7 @@ class SweepDirectory:
 
 
 def _check(content: Plain) -> None:
-  """Raises KeyError, TypeError or ValueError where a sweep.yaml has not the form that `create` writes."""
+  """Raises KeyError, TypeError or ValueError for a sweep.yaml of another form than `create` writes."""
   texts = lambda key, value: _need(key, value, list) and [_need(key, text, str) for text in value]
   _need("it", content, dict)
   for key, kind in {"name": str, "cwd": str, "jobs": list}.items():

@@ -1,4 +1,4 @@
-"""Jobs as processes on this machine, each on slots of its GPUs and on its own cores."""
+"""Runs jobs as processes on this machine, each on GPU slots and CPU cores of its own."""
 
 import contextlib
 import dataclasses
@@ -21,7 +21,7 @@ MEMORY_FRACTION = 0.9  # of a GPU, shared among its slots; the rest is for Warp 
 
 @dataclasses.dataclass(frozen=True)
 class Slot:
-  """Room for one job: a share of a GPU (None without one, `ALL` those that this process sees) and CPU cores."""
+  """A slot for one job: a share of a GPU (None without one, `ALL` those visible here) and CPU cores."""
 
   number: int
   gpu: str | None
@@ -29,7 +29,7 @@ class Slot:
 
 
 def make_slots(gpus: Sequence[str], slots_per_gpu: int, cores: Sequence[int], cores_per_job: int) -> list[Slot]:
-  """Divides a machine: slots of the GPUs in turn, so that jobs spread before they share; cores evenly among slots."""
+  """Divides a machine: slots alternate between GPUs, so that jobs spread first; cores are divided evenly."""
   places = [gpu for _ in range(slots_per_gpu) for gpu in gpus] or [None] * max(1, len(cores) // cores_per_job)
   each = len(cores) // len(places)
   share = lambda i: tuple(cores[i * each : (i + 1) * each]) if each else tuple(cores)
@@ -37,7 +37,7 @@ def make_slots(gpus: Sequence[str], slots_per_gpu: int, cores: Sequence[int], co
 
 
 def pick(free: Sequence[Slot], needs: int | None) -> list[Slot] | None:
-  """Slots for a job that needs that many GPUs (None: one, if there is any), one on each; None if there are too few."""
+  """Returns slots for a job of `needs` GPUs (None: one, if there is any), one on each; None if too few are free."""
   needs = max(1, needs or 0)
   first: dict[str | None, Slot] = {}
   for slot in free:
@@ -53,7 +53,7 @@ class LocalLauncher:
   def __init__(
     self, sweep: SweepDirectory, config: LocalConfig, command: Sequence[str] = COMMAND, slots: Sequence[Slot] = ()
   ):
-    """See `runner.Launcher`; `slots` replace those that `config` makes of this machine."""
+    """See `runner.Launcher`; `slots` replace those of `config` on this machine."""
     self.check(config, sweep.jobs)
     self._mps = MultiProcessService(sweep.path) if config.mps else None
     cores = sorted(os.sched_getaffinity(0))
@@ -63,7 +63,7 @@ class LocalLauncher:
     self._command = tuple(command)
     self._workers: dict[str, subprocess.Popen[bytes]] = {}
     self._taken: dict[str, list[Slot]] = {}
-    for job in sweep.jobs:  # that outlived the process that started them
+    for job in sweep.jobs:  # jobs that outlived the process that started them
       folder = sweep.folder(job)
       if folder.locked():
         numbers = folder.record.get("slots", [])
@@ -89,9 +89,9 @@ class LocalLauncher:
     return self._start([job])
 
   def _start(self, jobs: Sequence[Job], options: Sequence[str] = ()) -> bool:
-    """Starts jobs that need the same devices in one process, or returns False because there is no room for it now.
+    """Starts jobs that need the same devices in one process, or returns False if no slot is free now.
 
-    `options` go to their command.
+    `options` are added to their command.
     """
     job = jobs[0]
     for name in [name for name in self._taken if not self._at_work(name)]:
@@ -118,7 +118,7 @@ class LocalLauncher:
         stdin=subprocess.DEVNULL,
         stdout=log,
         stderr=subprocess.STDOUT,
-        start_new_session=True,  # Ctrl-C is for us; jobs are asked to stop through the sweep's folder
+        start_new_session=True,  # Ctrl-C stops this process; jobs are stopped through the sweep's folder
       )
     self._workers |= {job.name: worker for job in jobs}
     self._taken[job.name] = slots
@@ -130,7 +130,7 @@ class LocalLauncher:
   def kill(self) -> None:
     for job in self._sweep.jobs:
       if self._at_work(job.name):
-        # Its worker sees it end; a worker of an earlier start is no child of ours, but its job is as good as dead, too.
+        # The worker sees its job end; a worker of an earlier start is no child of ours, but its job ends, too.
         pid = self._sweep.folder(job).record.get("job_pid")
         with contextlib.suppress(ProcessLookupError, PermissionError):
           os.killpg(pid, signal.SIGKILL) if pid else None
@@ -148,7 +148,7 @@ class LocalLauncher:
     return self._sweep.folder(next(job for job in self._sweep.jobs if job.name == name)).locked()
 
   def _environment(self, gpus: Sequence[str]) -> dict[str, str]:
-    """The environment of a job: the GPUs it sees, its share of their memory, the service."""
+    """Returns the environment of a job: visible GPUs, its share of their memory, MPS."""
     env = dict(os.environ) if ALL in gpus else os.environ | {"CUDA_VISIBLE_DEVICES": ",".join(gpus)}
     shared = self._config.slots_per_gpu
     if gpus and shared > 1:

@@ -1,4 +1,4 @@
-"""NVIDIA's Multi-Process Service: processes that share a GPU run side by side on it instead of by turns."""
+"""NVIDIA's Multi-Process Service: processes that share a GPU run concurrently on it instead of in turns."""
 
 import contextlib
 import hashlib
@@ -16,7 +16,7 @@ TIMEOUT_S = 60.0
 
 
 def control_program() -> str:
-  """The path of the service's control program; raises HardwareError if it is not installed."""
+  """Returns the path of the service's control program; raises HardwareError if it is not installed."""
   program = shutil.which(CONTROL)
   if program is None:
     raise HardwareError(
@@ -26,7 +26,7 @@ def control_program() -> str:
 
 
 def _make_own(folder: Path) -> None:
-  """Makes a folder in one that all users share; raises HardwareError if somebody else was there first."""
+  """Makes a folder in one that all users share; raises HardwareError if another user owns it."""
   with contextlib.suppress(FileExistsError):
     folder.mkdir(mode=0o700)
   found = folder.lstat()
@@ -39,21 +39,21 @@ def _make_own(folder: Path) -> None:
 class MultiProcessService:
   """The service for one sweep, of all GPUs that the driver has.
 
-  A sweep that is started again finds the one that its jobs of before still use.
+  A restarted sweep finds the service that its earlier jobs still use.
   """
 
   def __init__(self, sweep: Path):
-    """Starts it, unless it runs already.
+    """Starts the service, unless it runs already.
 
     Args:
-      sweep: the sweep's folder, which takes its logs.
+      sweep: the sweep's folder, for the logs.
 
     Raises:
-      HardwareError: it is not installed, or does not start.
+      HardwareError: the service is not installed, or does not start.
     """
     self._program = control_program()
     name = hashlib.sha256(str(sweep.resolve()).encode()).hexdigest()[:12]
-    pipes = Path(tempfile.gettempdir(), f"playground-mps-{os.getuid()}-{name}")  # its sockets' names must be short
+    pipes = Path(tempfile.gettempdir(), f"playground-mps-{os.getuid()}-{name}")  # names of sockets must be short
     logs = sweep / "mps"
     logs.mkdir(mode=0o700, exist_ok=True)
     _make_own(pipes)
@@ -65,15 +65,15 @@ class MultiProcessService:
       raise HardwareError(f"launcher.mps=true, but {CONTROL} does not start: {said or f'exit code {code}'}")
 
   def stop(self) -> None:
-    """Ends it once the processes that use it have ended."""
+    """Ends the service once the processes that use it have ended."""
     self._control(command="quit\n")
     shutil.rmtree(self.environment["CUDA_MPS_PIPE_DIRECTORY"], ignore_errors=True)
 
   def _control(self, *args: str, command: str = "") -> tuple[int, str]:
     """Runs the control program; returns its exit code and output."""
-    # All GPUs: a service that sees some of them numbers them anew for the jobs.
+    # All GPUs: a service that sees only some would renumber them for the jobs.
     env = {key: value for key, value in os.environ.items() if key != "CUDA_VISIBLE_DEVICES"} | self.environment
-    with tempfile.TemporaryFile("w+") as out:  # a file: the service goes on, and would hold a pipe open
+    with tempfile.TemporaryFile("w+") as out:  # a file: the service continues, and would hold a pipe open
       call = [self._program, *args]
       try:
         done = subprocess.run(

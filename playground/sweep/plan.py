@@ -1,4 +1,4 @@
-"""From a command line to a sweep on disk: its jobs, each composed and checked, or the sweep that they already are."""
+"""Plans a sweep from a command line: composes and checks its jobs, and writes or finds its folder."""
 
 import os
 import re
@@ -18,7 +18,7 @@ ROOT = Path("results/sweeps")
 
 
 def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
-  """The configurations of all jobs of a `-m` command line; of a search, that of its first job."""
+  """Composes the configurations of all jobs of `-m`; of a search, that of its first job."""
   _, chosen, sets = _lines(overrides)
   if not isinstance(chosen.search, GridConfig):
     from playground.sweep.search import first_values
@@ -28,7 +28,7 @@ def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
 
 
 def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
-  """Composes and checks every job, and writes the sweep to disk or finds it there.
+  """Composes and checks every job, and writes the sweep or finds it on disk.
 
   A `sweep_dir` that holds the same jobs is continued. Without `sweep_dir`, the newest unfinished sweep of the same name
   and jobs is continued.
@@ -60,7 +60,7 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
   if found is not None:
     return found, chosen
   launcher_class(chosen.launcher).check(chosen.launcher, jobs)
-  started = ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"  # maybe that of another sweep, too
+  started = ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"  # another sweep may have the same name
   path = chosen.sweep_dir or numbered(started)
   settings = [line for line in settings if not line.startswith("sweep_dir=")]
   return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen
@@ -92,7 +92,7 @@ def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
 
 
 def _find(path: str | None, name: str, lines: Sequence[str], jobs: Sequence[Job]) -> SweepDirectory | None:
-  """The earlier sweep of the same jobs, if there is one."""
+  """Finds an earlier sweep of the same jobs."""
   if path is not None:
     if not (Path(os.path.expanduser(path)) / "sweep.yaml").exists():
       return None
@@ -117,10 +117,10 @@ def _same(sweep: SweepDirectory, lines: Sequence[str], jobs: Sequence[Job]) -> b
 
 
 def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> SweepSettings:
-  """The settings that a sweep was started with, changed by `extra`.
+  """Returns the settings of a sweep, changed by `extra`.
 
   Raises:
-    ConfigError: a key that is none of a sweep, or an invalid value.
+    ConfigError: a key that sweeps do not have, or an invalid value.
   """
   for text in extra:
     if not configs.is_of_sweep(text.lstrip("+~").partition("=")[0]):

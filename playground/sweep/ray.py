@@ -1,4 +1,4 @@
-"""Jobs as tasks of a Ray cluster, whose nodes share the sweep's folder; a task whose node is lost goes on elsewhere."""
+"""Runs jobs as tasks of a Ray cluster, whose nodes share the sweep's folder; a lost node's task restarts elsewhere."""
 
 import contextlib
 import os
@@ -20,9 +20,9 @@ except ImportError:
   raise ConfigError(f"launcher=ray needs Ray: {install_command('ray')}.") from None
 
 
-_CORES = 4  # of a job, unless launcher.cores_per_job says otherwise
+_CORES = 4  # of a job, unless launcher.cores_per_job is set
 
-# Ray puts the current folder first on its workers' path, where somebody else's yaml.py would win: let it be this one.
+# Ray puts the current folder first on its workers' path, where a stray yaml.py would win: use this one.
 _PACKAGES = Path(__file__).parents[2]
 
 
@@ -30,7 +30,7 @@ class RayLauncher:
   """See `runner.Launcher`."""
 
   outlives = False
-  _owned = False  # whether the connection, of which a process has one, was made here
+  _owned = False  # whether this launcher made the process's connection
 
   def __init__(self, sweep: SweepDirectory, config: RayConfig, command: Sequence[str] = COMMAND):
     self.check(config, sweep.jobs)
@@ -42,7 +42,7 @@ class RayLauncher:
 
   @staticmethod
   def check(config: RayConfig, jobs: Sequence[Job]) -> None:
-    """See `runner.Launcher`; connects to the cluster, or starts one, until `close` or the end of the process."""
+    """See `runner.Launcher`; connects to the cluster or starts one, until `close` or the end of the process."""
     if not ray.is_initialized():
       address = config.address or os.environ.get("RAY_ADDRESS")
       try:
@@ -94,21 +94,21 @@ def _knock(address: str | None) -> None:
 
 
 def _gpus(config: RayConfig, job: Job) -> float:
-  """The GPUs of the cluster that a job takes."""
+  """Returns the number of GPUs that a job takes."""
   if config.gpus_per_job is not None:
     return 0 if job.needs == 0 else config.gpus_per_job
   return job.needs if job.needs is not None else min(1, ray.cluster_resources().get("GPU", 0))
 
 
 def _cores(config: RayConfig) -> float:
-  """The cores of a node that a job takes."""
+  """Returns the number of cores that a job takes."""
   if config.cores_per_job is not None:
     return config.cores_per_job
   return min(_CORES, max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]))
 
 
 def _run(folder: str, command: tuple[str, ...], timeout: float | None, grace: float, gpus: float) -> int:
-  """A task: a worker, on the GPUs that Ray gave it."""
+  """Runs a worker as a task, on the GPUs that Ray assigned."""
   if 0 < gpus < 1:
     os.environ["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION * gpus:.3f}"
   given = ",".join(map(str, ray.get_gpu_ids()))

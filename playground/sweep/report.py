@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 AVERAGED = ("final_return", "final_mode_return", "best_return", "steps_per_second", "wall_clock_s")
 FIGURES = (*AVERAGED, "final_sampled_return", "steps")  # of a run's summary.json
-SEED = "seed"  # jobs of one group differ in it
+SEED = "seed"  # jobs of a group differ in the seed
 PANEL = "env"  # returns of tasks are not comparable: each task has a panel of its own
 POINTS = 200  # of a mean curve
 AXES = {  # file -> (column, its unit in the drawing, label)
@@ -40,7 +40,7 @@ AXES = {  # file -> (column, its unit in the drawing, label)
 
 
 def write_result(sweep: SweepDirectory, notify: Callable[[str], None] = print) -> list[Path]:
-  """Writes sweep.csv, groups.csv, the curves and report.html from what jobs have left so far; returns the files."""
+  """Writes sweep.csv, groups.csv, curves and report.html from the jobs' files so far; returns the files."""
   jobs = collect(sweep)
   groups = group(jobs, group_keys(sweep))
   files = [sweep.path / "sweep.csv", sweep.path / "groups.csv"]
@@ -61,7 +61,7 @@ def write_result(sweep: SweepDirectory, notify: Callable[[str], None] = print) -
 
 
 def collect(sweep: SweepDirectory) -> "pd.DataFrame":
-  """A row for each job: its overrides, status, and the figures of its summary (empty where there is none)."""
+  """Returns a row for each job: overrides, status, and figures of its summary (empty without one)."""
   import pandas as pd
 
   rows = []
@@ -78,16 +78,16 @@ def collect(sweep: SweepDirectory) -> "pd.DataFrame":
 
 
 def group_keys(sweep: SweepDirectory) -> list[str]:
-  """The keys in which jobs differ, without the seed."""
+  """Returns the keys in which jobs differ, without the seed."""
   return [key for key in dict.fromkeys(k for job in sweep.jobs for k in job.varies) if key != SEED]
 
 
 def group(jobs: "pd.DataFrame", keys: Sequence[str]) -> "pd.DataFrame":
-  """A row for each group of finished jobs that differ in their seed only.
+  """Returns a row for each group of finished jobs that differ in the seed only.
 
   Args:
     jobs: from `collect`.
-    keys: the keys that tell groups apart; none is one group.
+    keys: the keys in which groups differ; none is one group.
 
   Returns:
     The keys, `jobs` (how many finished), and for each figure its mean and `<figure>_ci95`, half the width of the 95 %
@@ -110,7 +110,7 @@ def group(jobs: "pd.DataFrame", keys: Sequence[str]) -> "pd.DataFrame":
 
 
 def mean_curve(curves: "Sequence[tuple[np.ndarray, np.ndarray]]") -> "tuple[np.ndarray, np.ndarray, np.ndarray]":
-  """Mean and half-width of the confidence interval of several curves, over the stretch that all of them have.
+  """Returns mean and half-width of the confidence interval of several curves, over their common range.
 
   Args:
     curves: (x, y) of each, x ascending.
@@ -186,7 +186,7 @@ def _job_link(job: str) -> Link:
 
 
 def _group_rows(groups: "pd.DataFrame") -> tuple[list[str], list[list[str]]]:
-  """Header and rows of the groups: mean ± half the interval."""
+  """Returns header and rows of the groups: mean ± half the interval."""
   keys = list(groups.columns)[: list(groups.columns).index("jobs") + 1]
   rows = []
   for _, row in groups.iterrows():

@@ -1,7 +1,7 @@
-"""The loop over jobs: hands them to a launcher, waits for them, and shows how they stand.
+"""Runs jobs: starts them through a launcher, waits for them, and shows their states.
 
-Sweeps and benchmarks (`benchmark/jobs.py`) run on it. All it knows it reads from the jobs' folders. Killed and started
-again it does what is missing and waits for jobs that are still at work.
+Sweeps and benchmarks (`benchmark/jobs.py`) use it. It reads all states from the jobs' folders, so a restarted runner
+starts the missing jobs and waits for running ones.
 """
 
 import contextlib
@@ -46,31 +46,31 @@ _CLASSES = {
 
 
 class Launcher(Protocol):
-  """Starts workers. The result of a job is in its folder; a launcher only knows whether it may still change.
+  """Starts workers. A job's result is in its folder; the launcher only knows whether the job may still run.
 
   Attributes:
-    outlives: whether jobs go on when the process that started them ends.
+    outlives: whether jobs continue when the process that started them ends.
   """
 
   outlives: bool
 
   def start(self, job: Job) -> bool:
-    """Starts a job, or returns False because there is no room for it now."""
+    """Starts a job, or returns False if there is no free slot now."""
     ...
 
   def busy(self, job: Job) -> bool:
-    """Whether the job may still start or is at work, as far as this launcher can see."""
+    """Whether the job is queued or running, as far as this launcher knows."""
     ...
 
   def kill(self) -> None:
     """Ends all jobs at once, saved or not."""
 
   def close(self) -> None:
-    """Waits for the jobs that do not outlive this process, and frees what the launcher holds."""
+    """Waits for the jobs that do not outlive this process, and frees resources."""
 
 
 class LauncherClass(Protocol[ConfigT]):
-  """The class of a launcher with these settings."""
+  """The constructor of a launcher."""
 
   def __call__(self, sweep: SweepDirectory, config: ConfigT, command: Sequence[str] = COMMAND) -> Launcher:
     """Takes a sweep, settings, and the command that runs a job's overrides; raises as `check`."""
@@ -81,7 +81,7 @@ class LauncherClass(Protocol[ConfigT]):
 
 
 def launcher_class(config: ConfigT) -> LauncherClass[ConfigT]:
-  """The class that these settings are of; raises ConfigError where its package is not installed."""
+  """Returns the launcher class of the settings; raises ConfigError if its package is not installed."""
   module, _, name = _CLASSES[type(config)].partition(":")
   return getattr(importlib.import_module(f"playground.sweep.{module}"), name)
 
@@ -93,12 +93,12 @@ def run_sweep(
 
   Args:
     sweep: on disk.
-    settings: how it is run (`configs/sweep.yaml`).
-    command: takes the jobs' overrides.
-    console: takes the output.
+    settings: of the sweep (`configs/sweep.yaml`).
+    command: program that gets the jobs' overrides.
+    console: for the output.
 
   Returns:
-    How many jobs failed, 100 at most, or 130 or 143 when interrupted.
+    The number of failed jobs, 100 at most, or 130 or 143 when interrupted.
 
   Raises:
     PlaygroundError: the settings are invalid here, or another process runs the sweep.
@@ -134,8 +134,8 @@ class Runner:
     view: shows them.
     search: adds jobs while others run.
     stop_on_error: one failed job stops the others.
-    wait: if not, jobs are only started.
-    seconds: when jobs are asked to stop; None is never.
+    wait: whether to wait for the jobs after starting them.
+    seconds: time after which jobs are asked to stop; None is never.
     """
     self._sweep = sweep
     self._launcher = launcher
@@ -194,7 +194,7 @@ class Runner:
       self._launcher.kill()
 
   def _start_some(self) -> None:
-    """Starts as many jobs as there is room for."""
+    """Starts as many jobs as there are free slots."""
     while self._queue and not self._stopping and self._launcher.start(self._queue[0]):
       self._open.append(self._queue.popleft())
     while self._search and self._may_search() and not self._queue and (job := self._search.ask(len(self._open))):
@@ -202,10 +202,10 @@ class Runner:
       (self._open if self._launcher.start(job) else self._queue).append(job)
 
   def _look(self) -> None:
-    """Reads how the open jobs stand."""
+    """Reads the states of the open jobs."""
     for job in list(self._open):
       folder = self._sweep.folder(job)
-      busy = self._launcher.busy(job)  # before its state is read, since the last thing a worker does is to write it
+      busy = self._launcher.busy(job)  # before the state is read: a worker writes it last
       state = folder.state()
       if not busy and state.status not in ENDED and not folder.locked():
         state = JobState("killed", "it never came to start", state.attempt)
@@ -228,7 +228,7 @@ class Runner:
     return unfinished and (self._launcher.busy(job) or self._sweep.folder(job).locked())
 
   def _ended_now(self) -> list[JobState]:
-    """Jobs of this start that have ended: neither open nor queued any more."""
+    """Returns the jobs of this start that have ended: neither open nor queued."""
     waiting = {job.name for job in (*self._open, *self._queue)}
     return [state for name, state in self._states.items() if name not in waiting]
 
@@ -236,11 +236,11 @@ class Runner:
     return self._search is not None and not self._stopping and not self._search.done
 
   def _failed(self) -> int:
-    """How many jobs failed; if none did, how many did not finish."""
+    """Returns the number of failed jobs; if none failed, of unfinished ones."""
     states = self._states.values()
     return sum(s.status in FAILED for s in states) or sum(s.status != "finished" for s in states)
 
   def _interrupt(self, signum: int, frame: FrameType | None) -> None:
-    """SIGINT and SIGTERM ask for an end, a second one asks again."""
+    """Handles SIGINT and SIGTERM: asks jobs to stop; a second signal asks again."""
     self._kill = self._signum is not None
     self._signum = signum

@@ -1,6 +1,6 @@
 """Search instead of every combination: Optuna draws each job's values and learns from its result.
 
-The study lies in the sweep's folder (`study.log`), a trial is one of its jobs; both go on where they stopped.
+The study is a file in the sweep's folder (`study.log`), a trial is one of its jobs; both can be resumed.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ _SAMPLERS = {
 
 
 class Search:
-  """Asks Optuna for jobs and tells it how they ended."""
+  """Gets jobs from Optuna and reports their results."""
 
   def __init__(self, sweep: SweepDirectory, config: OptunaConfig, notify: Callable[[str], None] = print):
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -62,7 +62,7 @@ class Search:
 
   @property
   def trials(self) -> int:
-    """The number of trials in all."""
+    """Returns the total number of trials."""
     return self._config.trials
 
   @property
@@ -89,7 +89,7 @@ class Search:
     return job
 
   def tell(self, job: Job, folder: JobFolder) -> None:
-    """Records a job's result; a job that was only interrupted stays open."""
+    """Records a job's result; an interrupted job stays open."""
     state = folder.state().status
     if state == "preempted":
       return
@@ -97,14 +97,14 @@ class Search:
     (trial,) = [t for t in self._study.get_trials(deepcopy=False) if t.user_attrs.get("job") == job.name][-1:]
     if trial.state == TrialState.RUNNING:
       self._study.tell(trial.number, value, state=TrialState.FAIL if value is None else None)
-    elif value is not None:  # it failed first, and a second start made it
+    elif value is not None:  # it failed at first, and succeeded in a second start
       again = optuna.create_trial(
         params=trial.params, distributions=trial.distributions, value=value, user_attrs=trial.user_attrs
       )
       self._study.add_trial(again)
 
   def best(self) -> str:
-    """The best trial, in a sentence."""
+    """Returns a sentence about the best trial."""
     if not self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
       return "No trial has finished."
     trial = self._study.best_trial
@@ -113,10 +113,10 @@ class Search:
 
 
 def distribution(override: HydraOverride) -> CategoricalDistribution | FloatDistribution | IntDistribution:
-  """The distribution of an override; `tag(log, interval(a, b))` is drawn on a log scale.
+  """Returns the distribution of an override; `tag(log, interval(a, b))` is drawn on a log scale.
 
   Raises:
-    ConfigError: it cannot draw from that.
+    ConfigError: the override has no distribution.
   """
   value = override.value()
   if isinstance(value, IntervalSweep):
@@ -136,7 +136,7 @@ def distribution(override: HydraOverride) -> CategoricalDistribution | FloatDist
 
 
 def first_values(lines: Sequence[str]) -> list[str]:
-  """The overrides of one possible job: the first value of each list, the low end of each interval."""
+  """Returns the overrides of an example job: the first value of each list, the low end of each interval."""
   overrides, drawn = [], False
   for line in lines:
     override = parse_with_hydra(line)

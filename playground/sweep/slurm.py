@@ -1,6 +1,6 @@
-"""Jobs on a Slurm cluster, submitted through submitit; they go on when the process that submitted them ends.
+"""Runs jobs on a Slurm cluster, through submitit; they continue when the submitting process ends.
 
-What Slurm preempts, or ends at its time limit, is asked to save, queued again, and resumes from its checkpoint.
+A job that is preempted, or reaches its time limit, saves, is queued again, and resumes from its checkpoint.
 """
 
 import dataclasses
@@ -29,9 +29,9 @@ try:
 except ImportError:
   raise ConfigError(f"launcher=slurm needs submitit: {install_command('slurm')}.") from None
 
-SETTLED = tuple(status for status in ENDED if status not in ("preempted", "killed"))  # those Slurm may start again
-_SLURM_ID = re.compile(r"\d+(_\d+)?")  # no option of squeue or scancel
-QUEUE_S = 5.0  # how often Slurm is asked
+SETTLED = tuple(status for status in ENDED if status not in ("preempted", "killed"))  # Slurm may restart others
+_SLURM_ID = re.compile(r"\d+(_\d+)?")  # an id must not be an option of squeue or scancel
+QUEUE_S = 5.0  # s between queries of Slurm
 
 
 @dataclasses.dataclass
@@ -48,7 +48,7 @@ class SlurmJob:
     self._worker = Worker([self.folder], self.command, self.timeout, self.grace)
     code = self._worker.run(where=socket.gethostname())
     if self._taken():
-      signal.raise_signal(signal.SIGUSR2)  # submitit's: Slurm queues nothing again that left before it was killed
+      signal.raise_signal(signal.SIGUSR2)  # submitit's: Slurm requeues no job that exited before it was killed
     return code
 
   def checkpoint(self) -> submitit.helpers.DelayedSubmission:
@@ -58,7 +58,7 @@ class SlurmJob:
     return submitit.helpers.DelayedSubmission(dataclasses.replace(self))
 
   def _taken(self) -> bool:
-    """Whether the run, not submitit, got Slurm's preemption signal, and nobody cancelled the job."""
+    """Whether the run, not submitit, got Slurm's preemption signal, and the job was not cancelled."""
     if JobFolder(self.folder).state().status != "preempted" or (self.folder.parents[1] / STOP_FILE).exists():
       return False
     job_id = os.environ.get("SLURM_JOB_ID")
@@ -66,18 +66,18 @@ class SlurmJob:
 
 
 class Queue:
-  """The user's jobs in Slurm's queue, by squeue: it answers on every cluster, sacct on those that keep accounts."""
+  """The user's jobs in Slurm's queue, by squeue, which works on every cluster; sacct needs accounting."""
 
   def __init__(self) -> None:
     self._states: dict[str, str] | None = {}
     self.forget()
 
   def forget(self) -> None:
-    """Makes the next question go to Slurm."""
+    """Drops the cached answer of squeue."""
     self._asked = -math.inf
 
   def state(self, job_id: str) -> str | None:
-    """A job's state in Slurm's words, None if it has left; at most `QUEUE_S` old, UNKNOWN if Slurm does not answer."""
+    """Returns Slurm's state of a job, None if it left the queue; at most `QUEUE_S` old, UNKNOWN without an answer."""
     if time.monotonic() - self._asked > QUEUE_S:
       command = ["squeue", "--me", "--all", "--noheader", "--format=%i %T"]
       told = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
@@ -99,7 +99,7 @@ class SlurmLauncher:
     command: Sequence[str] = COMMAND,
     executor: submitit.Executor | None = None,
   ):
-    """See `runner.Launcher`; `executor` is submitit's for Slurm if not given."""
+    """See `runner.Launcher`; `executor` defaults to submitit's for Slurm."""
     self.check(config, sweep.jobs)
     self._folder = sweep.path.absolute() / "slurm"
     self._executor = executor or _executor(self._folder, config.requeues)
@@ -111,7 +111,7 @@ class SlurmLauncher:
 
   @staticmethod
   def check(config: SlurmConfig, jobs: Sequence[Job]) -> None:
-    """See `runner.Launcher`; whether the cluster can run a job, sbatch answers."""
+    """See `runner.Launcher`; sbatch checks whether the cluster can run a job."""
     if not config.wait and config.max_parallel is not None:
       raise ConfigError("launcher.wait=false submits all jobs at once: leave launcher.max_parallel out.")
     if config.minutes * 60 <= _notice_s(config):
@@ -152,7 +152,7 @@ class SlurmLauncher:
       return False
     if not isinstance(submitted, submitit.SlurmJob):
       return not submitted.done()
-    return self._queue.state(submitted.job_id) is not None  # whatever it returned: Slurm may have queued it again
+    return self._queue.state(submitted.job_id) is not None  # whatever it returned: Slurm may have requeued it
 
   def kill(self) -> None:
     for job in self._sweep.jobs:
@@ -160,10 +160,10 @@ class SlurmLauncher:
         self.submitted[job.name].cancel()
 
   def close(self) -> None:
-    """Jobs go on by themselves."""
+    """Does nothing: jobs outlive this process."""
 
   def _submitted(self, job: Job, folder: JobFolder) -> "submitit.Job[int] | None":
-    """Submitit's handle of a job, also of one that an earlier process submitted."""
+    """Returns submitit's handle of a job, also of one that an earlier process submitted."""
     known = folder.path / "slurm_id"
     if job.name not in self.submitted and known.is_file() and _SLURM_ID.fullmatch(job_id := known.read_text()):
       self.submitted[job.name] = self._executor.job_class(self._folder, job_id)
@@ -171,12 +171,12 @@ class SlurmLauncher:
 
 
 def _executor(folder: Path, requeues: int) -> submitit.SlurmExecutor:
-  """Submitit's, whose jobs start Python as `PYTHON` says."""
+  """Returns submitit's executor, whose jobs start Python with the command `PYTHON`."""
   return submitit.SlurmExecutor(folder, max_num_timeout=requeues, python=shlex.join(PYTHON))
 
 
 def slurm_parameters(config: SlurmConfig, job: Job) -> dict[str, Plain]:
-  """The parameters of sbatch for a job, by submitit's names."""
+  """Returns the sbatch parameters of a job, by submitit's names."""
   gpus = config.gpus_per_job if config.gpus_per_job is not None else 1 if job.needs is None else job.needs
   parameters = {
     "job_name": job.name,
@@ -194,5 +194,5 @@ def slurm_parameters(config: SlurmConfig, job: Job) -> dict[str, Plain]:
 
 
 def _notice_s(config: SlurmConfig) -> int:
-  """Seconds before its time limit at which a job is asked to save."""
+  """Returns the seconds before the time limit at which a job is asked to save."""
   return int(config.grace) + 30

@@ -1,4 +1,4 @@
-"""A launcher that trains jobs in one process and one compiled program where they differ only in numbers."""
+"""A launcher that trains jobs which differ only in numbers in one process and one compiled program."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from playground.text import quoted
 
 
 class TogetherLauncher(LocalLauncher):
-  """See `runner.Launcher`. Jobs that can share a program do (`program_of`); the others are processes of their own."""
+  """See `runner.Launcher`. Jobs with the same program share it (`program_of`); others get a process of their own."""
 
   def __init__(
     self, sweep: SweepDirectory, config: TogetherConfig, command: Sequence[str] = COMMAND, slots: Sequence[Slot] = ()

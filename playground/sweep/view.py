@@ -12,7 +12,7 @@ from rich.text import Text
 
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
 
-ROWS = 30  # of the table: what runs, what failed, and the newest of the rest
+ROWS = 30  # rows of the table: running, failed, and the newest other jobs
 _COLORS = {"finished": "green", "running": "cyan", "failed": "red", "timeout": "red", "killed": "red"}
 
 
@@ -25,7 +25,7 @@ class View:
     self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
     self._seen: dict[str, tuple[str, int]] = {}
     self._drawn_at = 0.0
-    self.again = f"the same command, or `playground sweep retry {sweep.path}`, goes on"  # how a stopped sweep goes on
+    self.again = f"the same command, or `playground sweep retry {sweep.path}`, goes on"  # after a stop
 
   def __enter__(self) -> Self:
     if self._live:
@@ -41,7 +41,7 @@ class View:
     self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
   def begin(self, states: Mapping[str, JobState], at_work: int, trials: int | None = None) -> None:
-    """Prints how the sweep stands; its jobs' first states are not printed later."""
+    """Prints the states of the sweep; initial states of jobs are not printed later."""
     self._seen = {name: (state.status, state.attempt) for name, state in states.items()}
     finished = sum(state.status == "finished" for state in states.values())
     already = f", {finished} finished already" if finished else ""
@@ -54,7 +54,7 @@ class View:
 
     Args:
       states: the state of every job, by name.
-      now: redraws the table at once, not when it is due.
+      now: whether to redraw the table at once.
     """
     if not self._live:
       self._lines(states)
@@ -78,7 +78,7 @@ class View:
 
 
 def status_table(sweep: SweepDirectory, states: Mapping[str, JobState], rows: int | None = ROWS) -> Table:
-  """A table of jobs.
+  """Builds a table of jobs.
 
   Args:
     sweep: of the jobs.
@@ -107,7 +107,7 @@ def status_table(sweep: SweepDirectory, states: Mapping[str, JobState], rows: in
 
 
 def _most_telling(jobs: Sequence[Job], states: Mapping[str, JobState], rows: int | None) -> list[Job]:
-  """Running, failed and long jobs before the others; in the sweep's order."""
+  """Chooses running, failed and long jobs before the others, in the sweep's order."""
   if rows is None or len(jobs) <= rows:
     return list(jobs)
 

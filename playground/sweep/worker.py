@@ -1,7 +1,7 @@
-"""The process of a job, or of several that train together: starts or resumes it, watches it, records how it ended.
+"""The process of a job, or of several that train together: starts or resumes it, watches it, records its end.
 
-Launchers start this wherever the job is to run; it needs no more than the sweep's folder. It holds the job's lock, so
-that no two of them run the same job.
+Launchers start it on any machine; it needs only the sweep's folder. It holds the job's lock, so that no other worker
+runs the same job.
 """
 
 import argparse
@@ -26,7 +26,7 @@ POLL_S = 0.2
 
 
 def job_command(trusted: Sequence[str] = (), lines: Sequence[str] = ()) -> tuple[str, ...]:
-  """The command of jobs, with trusted packages and the overrides that sweep.yaml never holds (`is_of_command`)."""
+  """Returns the command of jobs, with trusted packages and overrides that sweep.yaml never holds (`is_of_command`)."""
   return (*COMMAND, *([f"trust=[{','.join(trusted)}]"] if trusted else []), *lines)
 
 
@@ -42,7 +42,7 @@ class Worker:
   ):
     """Args:
     folders: of the jobs of one sweep, `<sweep>/jobs/<job>`.
-    command: what the jobs' overrides are handed to, with `--` between those of two jobs.
+    command: program that gets the jobs' overrides, with `--` between two jobs.
     timeout: seconds until the job is asked to stop.
     grace: seconds from then until it is killed.
     """
@@ -56,15 +56,15 @@ class Worker:
     self._records: dict[JobFolder, dict[str, object]] = {}  # of the jobs that this worker has claimed
 
   def stop(self) -> None:
-    """Asks the job to save and leave."""
+    """Asks the job to save and exit."""
     self._stopping = True
 
   def run(self, where: str = "", **facts: object) -> int:
-    """Runs the jobs to their end and returns the exit code; 0 if others run them or have finished them.
+    """Runs the jobs to their end and returns the exit code; 0 if other workers run or finished them.
 
     Args:
-      where: what they run on, for people.
-      **facts: what the launcher wants to find in job.json.
+      where: the machine or devices, for people.
+      **facts: entries that the launcher adds to job.json.
     """
     sweep = SweepDirectory.open(self._sweep_path)
     overrides = {job.name: job.overrides for job in sweep.jobs}
@@ -123,7 +123,7 @@ class Worker:
     for folder in others:
       with folder.log.open("a") as log:
         log.write(f"--- {now()}: trained together with {first.path.name}, which has the log\n")
-    # Some Slurms send submitit's signal to all processes of a job; one that does not know it dies of it.
+    # Some Slurms send submitit's signal to all processes of a job, which would end them.
     with first.log.open("ab") as log, _blocked(signal.SIGUSR2):
       start = self._records[first]["attempt"]
       log.write(f"--- start {start}, {now()}, {socket.gethostname()}: {' '.join(args)}\n".encode())
@@ -135,12 +135,12 @@ class Worker:
         stdin=subprocess.DEVNULL,
         stdout=log,
         stderr=subprocess.STDOUT,
-        start_new_session=True,  # so that nothing it starts is left when it is killed
+        start_new_session=True,  # so that killing it also kills its children
         pass_fds=locks,
       )
 
   def _watch(self, child: "subprocess.Popen[bytes]") -> tuple[int, str]:
-    """Waits for the job's end; returns its exit code and why it was asked to stop, '' if it was not."""
+    """Waits for the job's end; returns its exit code and the reason of a stop, '' without a stop."""
     stop_file = self._sweep_path / STOP_FILE
     began, asked_at, why = time.monotonic(), 0.0, ""
     while child.poll() is None:
@@ -154,11 +154,11 @@ class Worker:
           _signal(child, signal.SIGTERM, group=False)
       elif passed - asked_at > self._grace:
         _signal(child, signal.SIGKILL, group=True)
-    _signal(child, signal.SIGKILL, group=True)  # what it may have left behind
+    _signal(child, signal.SIGKILL, group=True)  # its children
     return child.returncode, why
 
   def _outcome(self, folder: JobFolder, code: int, why: str) -> tuple[str, str]:
-    """A job's status and its reason, in words."""
+    """Returns a job's status and its reason, in words."""
     run = folder.run.status
     if code == 0 or (len(self._records) > 1 and run.get("status") == "finished"):
       return "finished", ""
@@ -213,7 +213,7 @@ def _signal(child: "subprocess.Popen[bytes]", signum: int, group: bool) -> None:
 
 
 def _last_line(log: Path) -> str:
-  """The last line of a job's log, mostly its error."""
+  """Returns the last line of a job's log, mostly its error."""
   lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
   return (lines or ["it said nothing"])[-1][:300]
 
