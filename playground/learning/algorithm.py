@@ -26,7 +26,7 @@ Metrics = dict[str, jax.Array]
 
 
 class Policy(struct.PyTreeNode):
-  """Parameters and observation statistics: all that acting needs, and what another run can start from.
+  """Parameters and observation statistics: enough to act, and to start another run.
 
   Attributes:
     params: of all networks; the actor's are `params.policy`.
@@ -38,7 +38,7 @@ class Policy(struct.PyTreeNode):
 
 
 class AlgorithmState(struct.PyTreeNode):
-  """What an algorithm learns, the same on every device. A subclass may add fields.
+  """The learned state of an algorithm, the same on every device. A subclass may add fields.
 
   Attributes:
     params, normalizer: see `Policy`.
@@ -84,14 +84,14 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
     """Collects experience and learns from it, once.
 
     Args:
-      state: what was learned so far.
+      state: the learned state.
       envs: this device's share of the environments.
       key: of this device.
 
     Returns:
-      The state and the environments after it, and float32 scalars, the same on all devices: means of what is logged,
-      `gradient_steps`, and `nonfinite_updates`, those of them that were left out. Where `learned` is 0, the means are
-      left out: there was nothing to learn from yet.
+      The new state and environments, and float32 scalars, the same on all devices: means of the logged metrics,
+      `gradient_steps`, and `nonfinite_updates`, the number of skipped ones. Where `learned` is 0, the means are not
+      logged: there was nothing to learn from yet.
     """
 
   def with_settings(self, values: Mapping[str, jax.Array]) -> Self:
@@ -101,21 +101,21 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
     return other
 
   def new_policy(self, key: jax.Array) -> Policy:
-    """Returns fresh parameters, and statistics of no observations."""
+    """Returns new parameters, and statistics of no observations."""
     return Policy(self.networks.init(key), self.networks.init_normalizer())
 
   def policy(self, state: StateT) -> Policy:
-    """Returns what acting needs."""
+    """Returns the policy."""
     return Policy(state.params, state.normalizer)
 
   def act(self, policy: Policy, obs: Observation, key: jax.Array, deterministic: bool | None = None) -> jax.Array:
-    """Returns actions in [-1, 1], [..., action_size]; deterministic as `deterministic_eval` says if not given."""
+    """Returns actions in [-1, 1], [..., action_size]; `deterministic` defaults to `deterministic_eval`."""
     normalizer = policy.normalizer if self.config.normalize_observations else None
     deterministic = self.config.deterministic_eval if deterministic is None else deterministic
     return self.networks.act(policy.params.policy, normalizer, obs, key, deterministic)
 
   def other_acts(self) -> dict[str, Callable[..., jax.Array]]:
-    """The way to act that `deterministic_eval` does not choose, by its name in metrics.csv: `mode` or `sampled`."""
+    """Returns the act function that `deterministic_eval` does not choose, by name in metrics.csv (mode, sampled)."""
     mode = not self.config.deterministic_eval
     return {"mode" if mode else "sampled": functools.partial(self.act, deterministic=mode)} if self.samples else {}
 
@@ -124,10 +124,10 @@ AnyAlgorithm = Algorithm[AgentConfig, Actor, AlgorithmState]
 
 
 def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None) -> AnyAlgorithm:
-  """Imports and builds the algorithm that a config is of.
+  """Imports and builds the algorithm of a config.
 
   Raises:
-    ConfigError: sizes that do not go together, or networks that do not fit the task.
+    ConfigError: sizes that do not fit each other, or networks that do not fit the task.
   """
   module, _, name = config.algorithm.partition(":")
   make: Callable[..., AnyAlgorithm] = getattr(importlib.import_module(module), name)
@@ -137,9 +137,9 @@ def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None
 def gradient_step(
   optimizer: optax.GradientTransformation, grads: PyTree, params: jax.Array, opt_state: PyTree
 ) -> tuple[jax.Array, PyTree, jax.Array, jax.Array]:
-  """Applies gradients, averaged over the devices; one that is not finite is left out.
+  """Applies gradients, averaged over the devices; a non-finite one is skipped.
 
-  Parameters travel as one vector: an array each would cost a GPU a kernel or two each.
+  Parameters are one vector: separate arrays would cost one or two GPU kernels each.
 
   Args:
     optimizer: of `params`.

@@ -21,7 +21,7 @@ class Atoms:
     self.values = jnp.linspace(low, high, count)
 
   def mean(self, probabilities: jax.Array) -> jax.Array:
-    """Mean values, [...], of distributions [..., K]."""
+    """Returns mean values, [...], of distributions [..., K]."""
     return (probabilities * self.values).sum(axis=-1)
 
   def project(self, probabilities: jax.Array, reward: jax.Array, discount: jax.Array) -> jax.Array:
@@ -30,7 +30,7 @@ class Atoms:
     Args:
       probabilities: of the values, [..., K].
       reward: [...].
-      discount: of the values, 0 where there are none to come, [...].
+      discount: of the values, 0 at terminations, [...].
     """
     moved = jnp.clip(reward[..., None] + discount[..., None] * self.values, self.low, self.high)
     place = (moved - self.low) / self.step  # in atoms, [..., K]
@@ -46,7 +46,7 @@ class C51Networks(Actor):
     """Builds the networks; `agent` is the algorithm's name.
 
     Raises:
-      ConfigError: a task with pictures, an unknown activation, or an observation entry that the task does not have.
+      ConfigError: a task with images, an unknown activation, or an observation group that the task does not have.
     """
     sizes, network = env.observation_size, config.network
     refuse_pictures(sizes, agent)
@@ -95,7 +95,7 @@ def c51_loss(
     target_params: the target critics'.
     batch: B normalised transitions.
     next_action: on `next_obs`, [B, action_size].
-    next_bonus: what is added to the value of `next_obs`, [B] or 0.
+    next_bonus: added to the value of `next_obs`, [B] or 0.
     use_smaller_q: whether both learn from the distribution with the smaller mean; else each from its own.
     networks: the networks the parameters belong to.
     config: `discounting`, `reward_scaling`.

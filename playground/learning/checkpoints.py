@@ -1,14 +1,14 @@
 """Checkpoints: the whole training state, written atomically by Orbax and verified when read.
 
 A checkpoint has three items: `policy` (normaliser and networks: what evaluation, export and `init_from` need), `state`
-(the rest of what training goes on from) and `meta` (step, return, task, config, name and shape of every array, and
-checksums of all items, itself included). The newest may have a fourth, `replay`: experience, which is too large to keep
-more than once.
+(the rest of the training state) and `meta` (step, return, task, config, name and shape of every array, and
+checksums of all items, itself included). The newest may have a fourth, `replay`: the replay buffer, which is too large
+to keep more than once.
 
 Beside the newest, a run keeps the checkpoint with the highest return; `checkpoints/best` is a link to it.
 
-Reading deletes nothing. A checkpoint is damaged only if its bytes can be read and are not those that were saved: a
-resumed run moves it to `checkpoints/damaged_<step>`. Errors of the operating system are tried again and then raised.
+Reading deletes nothing. A checkpoint is damaged only if its bytes are readable but differ from the saved ones: a
+resumed run moves it to `checkpoints/damaged_<step>`. Reads that fail in the operating system are retried, then raise.
 """
 
 import contextlib
@@ -49,13 +49,13 @@ _META_TYPES: dict[str, type | tuple[type, ...]] = {
   "leaves": dict,
   "sha256": dict,
 }
-_ABOUT_FILES = (None, errno.ENOENT, errno.ENOTDIR, errno.EISDIR)  # errors that say how the files are; others may pass
+_ABOUT_FILES = (None, errno.ENOENT, errno.ENOTDIR, errno.EISDIR)  # errors about the files; others may be temporary
 _TRANSIENT = ("RESOURCE_EXHAUSTED", "UNAVAILABLE", "PERMISSION_DENIED", "DEADLINE_EXCEEDED", "ABORTED", "CANCELLED")
 _RETRY_AFTER_S = (0.1, 0.5, 2.0)
 _PLAIN_PATH = re.compile(r"[\w/.,+=@ -]*")
 _NO_BEST = (-math.inf, -1)  # return and step
-_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)  # what file systems say that have none
-logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax warns of its own defaults, and raises what are errors
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)  # errors of file systems without links
+logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax warns about its own defaults, and raises its errors
 Arrays = list[np.ndarray]
 Leaf = list[Plain]  # name, shape and dtype
 T = TypeVar("T")
@@ -67,12 +67,12 @@ class NoCheckpointError(CheckpointError):
 
 
 class DamagedCheckpointError(CheckpointError):
-  """A checkpoint whose bytes can be read and are not those that were saved, or that holds NaN or infinite values."""
+  """A checkpoint whose bytes differ from the saved ones, or that holds NaN or infinite values."""
 
 
 @contextlib.contextmanager
 def _quiet_threads() -> Iterator[None]:
-  """Lets Orbax's threads print nothing, since Orbax raises their first error, and end before that error is seen."""
+  """Silences Orbax's threads, whose first error Orbax raises, until they have ended."""
   before, hook = set(threading.enumerate()), threading.excepthook
   threading.excepthook = lambda args: hook(args) if args.thread in before else None
   try:
@@ -86,7 +86,7 @@ def _quiet_threads() -> Iterator[None]:
 
 
 def _ignore_late_results() -> None:
-  """Lets TensorStore's threads print nothing of reads that had not ended when another one failed, whenever that is."""
+  """Silences TensorStore's threads about reads that were pending when another one failed."""
   hook = sys.unraisablehook
   sys.unraisablehook = lambda args: None if str(args.exc_value) == "Event loop is closed" else hook(args)
 
@@ -95,28 +95,28 @@ _ignore_late_results()
 
 
 class CheckpointStore:
-  """The `checkpoints/` folder of one run. Saving happens on a thread of its own; one save at a time."""
+  """The `checkpoints/` folder of one run. One save runs at a time, on a thread of its own."""
 
   def __init__(self, folder: str | Path, keep: int = 3, continued: int | None = None):
     """Opens (and makes) the folder.
 
     Args:
-      folder: where to.
-      keep: how many are kept, the newest; the one with the highest return (of several, the newest) is kept besides.
-      continued: the step that the run goes on from. Checkpoints after it were found damaged, and the run is about to
-        make them again: they are moved to `damaged_<step>`.
+      folder: of the checkpoints.
+      keep: number of newest checkpoints to keep, beside the one with the highest return (of equal ones the newest).
+      continued: the step that the run continues from. Later checkpoints were found damaged, and the run will make
+        them again: they are moved to `damaged_<step>`.
 
     Raises:
-      CheckpointError: a checkpoint there cannot be read, though it is not damaged.
+      CheckpointError: reading a checkpoint failed, though it is not damaged.
     """
     self._folder, self._keep = Path(folder).absolute(), keep
-    self._folder.mkdir(parents=True, exist_ok=True)  # Orbax does not where it is told to work alone
-    self._handle = os.open(self._folder, os.O_RDONLY)  # the folder itself, whatever takes its name
+    self._folder.mkdir(parents=True, exist_ok=True)  # Orbax does not in single-process mode
+    self._handle = os.open(self._folder, os.O_RDONLY)  # the folder itself, even if it is replaced
     there = _by_step(self._folder)
     damaged = {step for step in there if continued is not None and step > continued}
     returns = {step: _return_of(path) for step, path in there.items() if step not in damaged}
     self._best = max(((value, step) for step, value in returns.items() if value is not None), default=_NO_BEST)
-    self._link_best()  # before others are moved: what it points to is always whole
+    self._link_best()  # before others are moved: it always points to a complete checkpoint
     for step in damaged:
       there[step].rename(numbered(there[step].with_name(f"damaged_{there[step].name}")))
     self._alias = _Alias(self._folder)
@@ -140,22 +140,22 @@ class CheckpointStore:
     replay: Fetch | None = None,
     episode_return: float | None = None,
   ) -> None:
-    """Starts saving. The trees' arrays must not be donated or deleted meanwhile; an earlier failure is raised here.
+    """Starts saving. The arrays must not be donated or deleted meanwhile. Raises an earlier failure.
 
     Args:
       step: control steps trained.
-      policy: the item of that name, and
-      state: so too.
-      meta: what else to note.
-      replay: fetches that item, if there is one, on the saving thread. Older checkpoints lose theirs.
-      episode_return: the policy's, if it has been evaluated; one that is not finite counts as none.
+      policy: the item of that name.
+      state: the item of that name.
+      meta: further entries of the item of that name.
+      replay: fetches that item on the saving thread, None without one. Older checkpoints lose theirs.
+      episode_return: of the policy, if it has been evaluated; a non-finite one counts as none.
     """
     self.wait()
     noted = episode_return if episode_return is not None and math.isfinite(episode_return) else None
     self._pending = self._thread.submit(self._write, step, policy, state, {**meta, "return": noted}, replay)
 
   def wait(self) -> None:
-    """Returns when what was saved lies on disk; raises what went wrong with it."""
+    """Blocks until the save is on disk; raises its error."""
     if self._pending is not None:
       pending, self._pending = self._pending, None
       pending.result()
@@ -179,13 +179,13 @@ class CheckpointStore:
       "sha256": {name: checksum(values) for name, values in arrays.items()},
     }
     if any(_first_nonfinite(meta["leaves"][name], values) is not None for name, values in arrays.items()):
-      meta["return"] = None  # it is never the best
+      meta["return"] = None  # a removed one is never the best
     meta["meta_sha256"] = _meta_checksum(meta)
     items = {name: ocp.args.StandardSave(_numbered(values)) for name, values in arrays.items()}  # pyright: ignore[reportCallIssue]
     try:
       self._save(step, ocp.args.Composite(**items, meta=ocp.args.JsonSave(meta)))  # pyright: ignore[reportCallIssue]
     except Exception as error:
-      for half in self._folder.glob(f"{step:012d}.*"):  # it has the space that the run's last words need
+      for half in self._folder.glob(f"{step:012d}.*"):  # frees the space that the final records need
         shutil.rmtree(half, ignore_errors=True)
       reason = _not_about_files(error) or (str(error) if isinstance(error, OSError) else "")
       if not reason:
@@ -193,7 +193,7 @@ class CheckpointStore:
       raise CheckpointError(f"{self._folder} cannot be written: {reason}.") from error
     if meta["return"] is not None:
       self._best = max(self._best, (meta["return"], step))
-    # Orbax's own policies would remove the old best before the link has gone over to the new one.
+    # Orbax's own policies would remove the old best before the link points to the new one.
     self._link_best()
     for old in sorted(self._manager.all_steps())[: -self._keep]:
       if old != self._best[1]:
@@ -209,7 +209,7 @@ class CheckpointStore:
     self._must_be_there()
 
   def _must_be_there(self) -> None:
-    """Raises FileNotFoundError if the folder was removed; Orbax makes it again, with nothing else in it."""
+    """Raises FileNotFoundError if the folder was removed; Orbax would make a new empty one."""
     with contextlib.suppress(OSError):
       if os.path.samestat(os.fstat(self._handle), os.stat(self._folder)):
         return
@@ -219,11 +219,11 @@ class CheckpointStore:
     raise FileNotFoundError("it was removed")
 
   def _link_best(self) -> None:
-    """Lets `best` point to the best checkpoint, in one go; without one, or without links, there is no `best`."""
+    """Atomically links `best` to the best checkpoint, if there is one and the file system has links."""
     link, temporary = self._folder / BEST, self._folder / f".{BEST}"
-    temporary.unlink(missing_ok=True)  # which a run killed on the next lines has left
+    temporary.unlink(missing_ok=True)  # left by a run that was killed on the next lines
     if link.is_dir() and not link.is_symlink():
-      shutil.rmtree(link)  # the checkpoint once more: the run was copied by something that follows links
+      shutil.rmtree(link)  # a copy of the checkpoint: the run was copied with links followed
     if self._best == _NO_BEST:
       link.unlink(missing_ok=True)
       return
@@ -237,14 +237,14 @@ class CheckpointStore:
 
 
 class Checkpoint:
-  """One checkpoint on disk, checked to be whole and ours."""
+  """One checkpoint on disk; its meta data are verified."""
 
   def __init__(self, folder: str | Path):
     """Reads and checks the meta data.
 
     Raises:
-      DamagedCheckpointError: they are not as they were saved.
-      CheckpointError: no checkpoint there, not one of ours, one of a newer version, or one that cannot be read now.
+      DamagedCheckpointError: they differ from the saved ones.
+      CheckpointError: no checkpoint, one of another program or a newer version, or reading it failed.
     """
     self.path = Path(folder).absolute()
     if not self.path.is_dir():
@@ -256,19 +256,19 @@ class Checkpoint:
     return self.meta["step"]
 
   def has(self, item: str) -> bool:
-    """Whether it holds an item."""
+    """Whether the checkpoint has an item."""
     return (self.path / item).is_dir()
 
   def restore(self, item: str, template: PyTree) -> PyTree:
     """Returns the tree of item 'policy', 'state' or 'replay' as host arrays.
 
     Args:
-      item: which one.
+      item: name of the item.
       template: a tree with the expected structure, shapes and dtypes (`jax.eval_shape`'s result will do).
 
     Raises:
-      DamagedCheckpointError: its bytes are not those that were saved, or hold NaN or infinite values.
-      CheckpointError: it cannot be read now, or was made for other shapes (another task, network or number of
+      DamagedCheckpointError: its bytes differ from the saved ones, or hold NaN or infinite values.
+      CheckpointError: reading it failed, or it was made for other shapes (another task, network or number of
         environments).
     """
     found = self.meta["leaves"].get(item)
@@ -286,7 +286,7 @@ class Checkpoint:
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
   def _read(self, item: str, read: Callable[[], T]) -> T:
-    """Result of reading an item; tells damage from an operating system that does not let us read."""
+    """Returns the result of reading an item; distinguishes damage from errors of the operating system."""
     for pause in (*_RETRY_AFTER_S, None):
       try:
         return read()
@@ -300,7 +300,7 @@ class Checkpoint:
     raise AssertionError("unreachable")
 
   def _unreadable(self, item: str) -> str | None:
-    """Why the files of an item cannot be read at all; None if all can be."""
+    """Returns the error of reading the files of an item; None if all are readable."""
     try:
       for folder, _, names in os.walk(self.path / item, onerror=_raise):
         for name in names:
@@ -326,7 +326,7 @@ class Checkpoint:
       alias.remove()
 
   def _read_meta(self) -> dict[str, Plain]:
-    # As Orbax writes it; read without Orbax, whose errors do not say whose fault they are.
+    # As Orbax writes it; read without Orbax, whose errors do not tell the cause.
     file = self.path / "meta" / "metadata"
     if not file.exists() and not any((self.path / item).is_dir() for item in ("meta", "policy", "state")):
       raise CheckpointError(f"{self.path} is not a checkpoint of playground-run.")
@@ -347,12 +347,12 @@ class Checkpoint:
 
 
 def find_checkpoints(path: str | Path) -> list[Path]:
-  """The checkpoints at `path`, newest first: those of a run directory, or the one that `path` itself is.
+  """Returns the checkpoints at `path`, newest first: those of a run directory, or `path` itself.
 
   Of a chain's directory they are those of the last stage that has any; of `checkpoints/best` the one it links to.
 
   Raises:
-    CheckpointError: there is none.
+    CheckpointError: there is no checkpoint.
   """
   path = Path(os.path.expanduser(path))
   if path.name == BEST and path.parent.name == "checkpoints" and path.parent.is_dir():
@@ -371,14 +371,14 @@ def find_checkpoints(path: str | Path) -> list[Path]:
 
 
 def find_stages(chain: Path) -> list[Path]:
-  """The stages in a chain's directory that have a checkpoint, the last one last."""
+  """Returns the stages in a chain's directory that have a checkpoint, in order."""
   number = lambda stage: stage.name.partition("_")[0]
   stages = [stage for stage in chain.glob("*_*/") if number(stage).isdecimal() and _by_step(stage / "checkpoints")]
   return sorted(stages, key=lambda stage: int(number(stage)))
 
 
 def _by_step(folder: Path) -> dict[int, Path]:
-  """The checkpoints in a folder, by step; raises CheckpointError if the folder cannot be listed."""
+  """Returns the checkpoints in a folder by step; raises CheckpointError if listing it fails."""
   try:
     return {int(path.name): path for path in folder.iterdir() if path.name.isdecimal() and path.is_dir()}
   except (FileNotFoundError, NotADirectoryError):
@@ -388,7 +388,7 @@ def _by_step(folder: Path) -> dict[int, Path]:
 
 
 def _linked(best: Path) -> Path:
-  """The checkpoint that a link points to; raises CheckpointError if there is none."""
+  """Returns the checkpoint that a link points to; raises CheckpointError if there is none."""
   if not best.is_symlink():
     raise CheckpointError(
       f"{best} is no link to a checkpoint: the run has not saved one with a return, or was copied without its links."
@@ -400,7 +400,7 @@ def _linked(best: Path) -> Path:
 
 
 def _return_of(folder: Path) -> float | None:
-  """The return of a checkpoint; one that is damaged has none."""
+  """Returns the return of a checkpoint; None of a damaged one."""
   try:
     return Checkpoint(folder).meta.get("return")
   except DamagedCheckpointError:
@@ -408,13 +408,13 @@ def _return_of(folder: Path) -> float | None:
 
 
 def describe(tree: PyTree) -> list[Leaf]:
-  """Name, shape and dtype of every leaf."""
+  """Returns name, shape and dtype of every leaf."""
   flat, _ = jax.tree_util.tree_flatten_with_path(tree)
   return [[jax.tree_util.keystr(path), list(np.shape(leaf)), str(np.dtype(leaf.dtype))] for path, leaf in flat]
 
 
 def checksum(leaves: Arrays) -> str:
-  """SHA-256 over the bytes of all arrays."""
+  """Returns the SHA-256 of the bytes of all arrays."""
   digest = hashlib.sha256()
   for leaf in leaves:
     digest.update(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8).data)
@@ -422,9 +422,9 @@ def checksum(leaves: Arrays) -> str:
 
 
 def _first_nonfinite(described: list[Leaf], leaves: Arrays) -> str | None:
-  """The name of the first leaf with a NaN or infinite value, of what learning and acting go on from.
+  """Returns the name of the first leaf of the learned state with a NaN or infinite value.
 
-  An environment may hold such values (`info["nonfinite_state"]`): the guard keeps them from what learns.
+  An environment may hold such values (`info["nonfinite_state"]`): the guard keeps them from the optimiser.
   """
   for (name, *_), leaf in zip(described, leaves, strict=True):
     floating = jax.numpy.issubdtype(leaf.dtype, np.floating)  # NumPy alone does not count bfloat16
@@ -434,13 +434,13 @@ def _first_nonfinite(described: list[Leaf], leaves: Arrays) -> str | None:
 
 
 def _meta_checksum(meta: Section) -> str:
-  """SHA-256 of the meta data as JSON holds them, but for this checksum itself."""
+  """Returns the SHA-256 of the meta data as JSON, without this checksum itself."""
   rest = {key: value for key, value in meta.items() if key != "meta_sha256"}
   return hashlib.sha256(json.dumps(json.loads(json.dumps(rest)), sort_keys=True).encode()).hexdigest()
 
 
 def _meta_damage(meta: Plain) -> str:
-  """What is wrong with meta data of our format, '' if nothing is. Earlier versions wrote no checksum of them."""
+  """Describes damage of meta data of our format, '' if there is none. Earlier versions wrote no checksum."""
   if not isinstance(meta, dict):
     return "are no mapping"
   for key, kind in _META_TYPES.items():
@@ -457,13 +457,13 @@ def _meta_damage(meta: Plain) -> str:
 
 
 def _version(written_as: object) -> int:
-  """The number of one of our formats, 0 for any other."""
+  """Returns the version number of our format, 0 for any other."""
   match = re.fullmatch(r"playground-run/(\d+)", str(written_as))
   return int(match[1]) if match else 0
 
 
 def _not_about_files(error: BaseException | None) -> str | None:
-  """What keeps us from reading (too many open files, no permission, a disk that fails); None if the files do."""
+  """Returns the error of the operating system (too many open files, permission, disk); None for other errors."""
   while error is not None:
     text = str(error)
     number = re.search(r"os_error_code='(\d+)'", text)  # of TensorStore, which raises ValueError for all
@@ -485,8 +485,8 @@ def _raise(error: OSError) -> None:
 class _Alias:
   """A path to a folder that Orbax can use.
 
-  Orbax and TensorStore take `[`, `*` and `?` in a folder's path for patterns, a backslash for `/` and `:/` for a
-  protocol. Where a path has such characters, they get a link to it in the system's temporary folder.
+  Orbax and TensorStore read `[`, `*` and `?` in a folder's path as patterns, a backslash as `/` and `:/` as a
+  protocol. For a path with such characters, they get a link to it in the system's temporary folder.
   """
 
   def __init__(self, folder: Path):
@@ -502,7 +502,7 @@ class _Alias:
 
 
 def _alone() -> ocp.options.MultiprocessingOptions:
-  """Orbax is to wait for no other process of this training: one writes, each reads for itself."""
+  """Makes Orbax wait for no other process of the training: one writes, each reads for itself."""
   if jax.process_count() == 1:
     return ocp.options.MultiprocessingOptions()
   index = jax.process_index()
@@ -510,7 +510,7 @@ def _alone() -> ocp.options.MultiprocessingOptions:
 
 
 def _numbered(leaves: Arrays) -> dict[str, np.ndarray]:
-  """Arrays by their place in the tree; Orbax refuses those without entries, which need no saving."""
+  """Returns arrays by their index in the tree, without empty ones, which Orbax refuses."""
   return {_number(i): leaf for i, leaf in enumerate(leaves) if leaf.size}
 
 

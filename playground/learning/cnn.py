@@ -1,4 +1,4 @@
-"""Convolutional networks for observations that are pictures."""
+"""Convolutional networks for image observations."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -13,8 +13,8 @@ from playground.learning.hyperparameters import CNNConfig
 
 Activation = Callable[[jax.Array], jax.Array]
 
-ESTIMATOR = "estimator"  # a layer beside those that act
-NORM_EPSILON = 1e-6 * 255**2  # added to the variance of a picture's channel
+ESTIMATOR = "estimator"  # a layer beside those of the actor
+NORM_EPSILON = 1e-6 * 255**2  # added to the variance of an image's channel
 
 _POOLS: dict[str, Activation] = {
   "none": lambda x: x.reshape(*x.shape[:-3], -1),
@@ -25,7 +25,7 @@ _POOLS: dict[str, Activation] = {
 
 
 def check_cnn(config: CNNConfig, activations: Mapping[str, Activation]) -> None:
-  """Raises ConfigError for layers that do not go together, and for names that do not exist."""
+  """Raises ConfigError for layers that do not fit each other, and for unknown names."""
   lengths = {len(config.channels), len(config.kernels), len(config.strides)}
   if len(lengths) != 1 or not lengths.isdisjoint({0}):
     raise ConfigError("agent.network.cnn.channels, kernels and strides must have one entry for each layer.")
@@ -37,7 +37,7 @@ def check_cnn(config: CNNConfig, activations: Mapping[str, Activation]) -> None:
 
 
 class CNN(linen.Module):
-  """Features, [..., F], of pictures [..., height, width, channels] uint8."""
+  """Features, [..., F], of images [..., height, width, channels] uint8."""
 
   config: CNNConfig
   activation: Activation
@@ -47,7 +47,7 @@ class CNN(linen.Module):
   def __call__(self, pixels: jax.Array) -> jax.Array:
     config = self.config
     x = pixels.astype(self.dtype)
-    if config.normalize_channels:  # of whole numbers, and not by the fast variance: pictures may have little contrast
+    if config.normalize_channels:  # of whole numbers, and not by the fast variance: images may have little contrast
       how = {"reduction_axes": (-3, -2), "feature_axes": -1, "epsilon": NORM_EPSILON, "use_fast_variance": False}
       x = linen.LayerNorm(use_scale=False, use_bias=False, **how)(x)
     else:
@@ -62,7 +62,7 @@ class CNN(linen.Module):
 
 
 class PixelNetwork(linen.Module):
-  """An MLP on the features of pictures, a CNN for each camera, and on a vector beside them if there is one.
+  """An MLP on the features of images, with a CNN for each camera, and optionally on a vector.
 
   Attributes:
     cnn: of each camera.
@@ -71,9 +71,9 @@ class PixelNetwork(linen.Module):
     activation: the MLP's.
     output_size: length of the result.
     output_init: of the last layer.
-    dtype: of what is computed on the way; parameters and result are float32.
-    estimate_size: length of what the first hidden layer estimates beside the result, 0 for nothing; it is sown among
-      Flax's intermediates as `estimate`, [..., estimate_size].
+    dtype: of intermediate activations; parameters and result are float32.
+    estimate_size: length of the auxiliary estimate of the first hidden layer, 0 for none; it is sown among Flax's
+      intermediates as `estimate`, [..., estimate_size].
   """
 
   cnn: CNNConfig
@@ -87,7 +87,7 @@ class PixelNetwork(linen.Module):
 
   @linen.compact
   def __call__(self, pictures: Mapping[str, jax.Array], vector: jax.Array | None) -> jax.Array:
-    """The result, [..., output_size], for pictures [..., H, W, C] by camera and a vector [..., D]."""
+    """Returns the output, [..., output_size], for images [..., H, W, C] by camera and a vector [..., D]."""
     make = lambda key: CNN(self.cnn, self.cnn_activation, self.dtype, name=cnn_name(key))
     features = [make(key)(pictures[key]) for key in sorted(pictures)]
     hidden = jnp.concatenate([*features, *([] if vector is None else [vector.astype(self.dtype)])], axis=-1)
@@ -101,21 +101,21 @@ class PixelNetwork(linen.Module):
 
 
 def cnn_name(entry: str) -> str:
-  """What the CNN for a camera's pictures is called among a network's parameters."""
+  """Returns the name of a camera's CNN among a network's parameters."""
   return entry.replace("/", "_")
 
 
 def pixel_places(height: int, width: int) -> jax.Array:
-  """Where a picture's pixels are, row by row: down and right in [-1, 1], [H * W, 2]."""
+  """Returns the positions of an image's pixels, row by row: down and right in [-1, 1], [H * W, 2]."""
   places = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
   return jnp.stack(places, axis=-1).reshape(-1, 2)
 
 
 def random_shift(obs: dict[str, jax.Array], shifts: jax.Array, pad: int) -> dict[str, jax.Array]:
-  """Moves pictures by whole pixels, repeating their edges (Yarats et al., 2021).
+  """Shifts images by whole pixels, repeating their edges (Yarats et al., 2021).
 
   Args:
-    obs: entries of an observation; pictures are [..., B, H, W, C].
+    obs: observation groups; images are [..., B, H, W, C].
     shifts: [B, 2] in 0 .. 2 * pad, rows and columns; `pad` is no shift.
     pad: the largest shift.
   """
@@ -132,7 +132,7 @@ def random_shift(obs: dict[str, jax.Array], shifts: jax.Array, pad: int) -> dict
 
 
 def _expected_places(x: jax.Array) -> jax.Array:
-  """Where each channel is strongest, in [-1, 1]: [..., 2 C] of [..., H, W, C] (Levine et al., 2016)."""
+  """Returns where each channel is strongest, in [-1, 1]: [..., 2 C] of [..., H, W, C] (Levine et al., 2016)."""
   height, width, channels = x.shape[-3:]
   weights = jax.nn.softmax(x.reshape(*x.shape[:-3], height * width, channels), axis=-2)
   expected = jnp.einsum("...pc,pd->...dc", weights, pixel_places(height, width))

@@ -1,4 +1,4 @@
-"""Evaluation: whole episodes of a batch of environments, each environment's first episode counted."""
+"""Evaluates policies: runs one whole episode in each environment of a batch."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -33,21 +33,21 @@ def make_evaluator(
 
   Args:
     env: the task.
-    act: the policy.
+    act: acts with the policy.
     num_envs: episodes, a multiple of the number of devices.
     mesh: devices, an axis named "data"; where it is one for several agents, all have an axis of agents in front.
     num_recorded: episodes on each device to record for a video.
-    others: other ways to act on the same parameters, by name. Each gets `num_envs` episodes of its own, which start
-      from the same states on the same models and run side by side with those of `act`.
+    others: other act functions for the same parameters, by name. Each gets `num_envs` episodes of its own, which start
+      from the same states on the same models and run in parallel with those of `act`.
 
   Returns:
     A function (policy, key, model fields [num_envs, ...], settings) -> (scalars, recording). The settings are those of
     `Trainer.settings`, {} for those that `env` was built with. The scalars: `episode_reward` and
-    `episode_length` with their deviation over episodes (`_std`), the mean over episodes of every metric
+    `episode_length` with their standard deviation over episodes (`_std`), the mean over episodes of every metric
     (`episode_<metric>`, see `wrappers.Episode`), and `nonfinite`, the number of episodes
-    that ended in NaN. Those of another way to act are `<name>/<scalar>`, without its reward terms.
-    The recording: `qpos`, `mocap_pos`, `mocap_quat`, `seen` (the newest picture, where there are any) and `active`
-    (1 until the episode ended) before each decision, [decisions, episodes, ...].
+    that ended in NaN. Those of `others` are `<name>/<scalar>`, without reward terms.
+    The recording: `qpos`, `mocap_pos`, `mocap_quat`, `seen` (the newest image, if there are any) and `active`
+    (1 until the episode ended) before each policy step, [steps, episodes, ...].
   """
   wrapped = wrap_for_evaluation(env)
   decisions = -(-env.episode_length // env.action_repeat)
@@ -56,7 +56,7 @@ def make_evaluator(
   repeat = lambda tree: jax.tree.map(lambda x: jnp.concatenate([x] * len(acts)) if others else x, tree)
 
   def act_all(policy: Policy, obs: Observation, key: jax.Array) -> jax.Array:
-    """Each way to act on its own environments, which lie one after the other."""
+    """Applies each act function to its own environments, which are concatenated."""
     share = lambda i: jax.tree.map(lambda x: x[i * per_device : (i + 1) * per_device], obs)
     return jnp.concatenate([each(policy, share(i), key) for i, each in enumerate(acts)])
 
@@ -68,7 +68,7 @@ def make_evaluator(
     reset_key, act_key = jax.random.split(key)
     model = repeat(model)
     state = episodes.reset(repeat(jax.random.split(reset_key, per_device)), model)
-    # Constants become of the type that may differ between devices, as in training: the task is traced once for both.
+    # Constants get the device-varying type, as in training, so that the task is traced once for both.
     always = jax.lax.axis_index(AXIS) >= 0
     state = jax.tree.map(lambda x: jax.lax.select(jax.lax.broadcast(always, x.shape), x, x), state)
     zeros = jnp.zeros_like(state.done)
@@ -85,7 +85,7 @@ def make_evaluator(
 
     def running(carry: tuple[PyTree, ...]) -> jax.Array:
       step, _, active, _, _ = carry
-      # Devices must leave the loop together: a policy may communicate between them.
+      # Devices must leave the loop together: a policy may use collectives.
       return (step < decisions) & (jax.lax.pmax(active.max(), AXIS) > 0)
 
     def step(carry: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
@@ -110,7 +110,7 @@ def make_evaluator(
 
 
 def _scores(totals: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-  """The scalars of episodes, from what each of them comes to, each [episodes]."""
+  """Returns the scalars over episodes, from values of each, [episodes]."""
   report = {f"episode_{k}": v.mean() for k, v in totals.items() if k != "nonfinite"}
   for name in ("reward", "length"):
     report[f"episode_{name}_std"] = totals[name].std()

@@ -1,7 +1,7 @@
 """FastSAC (arXiv 2512.01996) on batched environments: off-policy, a stochastic actor, large batches.
 
 Twin critics give distributions over soft returns (C51), each fitted to the projected distribution of its own target
-critic. The actor is a squashed Gaussian that starts at a mean of 0 and a small deviation; its own samples explore. The
+critic. The actor is a squashed Gaussian that starts at a mean of 0 and a small std; its samples explore. The
 temperature is tuned so that the policy keeps an entropy. One training step is one step of all environments and
 `grad_updates_per_step` gradient steps.
 
@@ -32,7 +32,7 @@ _BETA_2 = 0.95  # of AdamW
 
 
 class FastSACParams(struct.PyTreeNode):
-  """What is learned.
+  """The learned parameters.
 
   Attributes:
     policy: parameters of the actor.
@@ -46,7 +46,7 @@ class FastSACParams(struct.PyTreeNode):
 
 
 class BoundedNormalTanh(NormalTanhDistribution):
-  """A Gaussian, then tanh; the logarithm of the Gaussian's deviation is bounded by a tanh of its own."""
+  """A Gaussian, then tanh; a tanh also bounds the logarithm of the Gaussian's standard deviation."""
 
   def __init__(self, event_size: int, min_log_std: float, max_log_std: float):
     super().__init__(event_size)
@@ -75,7 +75,7 @@ class FastSACNetworks(C51Networks):
     return FastSACParams(self.init_policy(policy), self.init_q(q), log_alpha)
 
   def sample(self, policy: PyTree, obs: dict[str, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Actions, [..., action_size], and their log-probabilities, [...]; gradients flow through the actions."""
+    """Samples actions, [..., action_size], and their log-probabilities, [...]; gradients flow through the actions."""
     logits = self.logits(policy, obs)
     raw = self.distribution.sample_no_postprocessing(logits, key)
     return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
@@ -150,7 +150,7 @@ class FastSAC(OffPolicy[FastSACConfig, FastSACNetworks]):
     carry, log = jax.lax.scan(update, carry, (batches, jax.random.split(key, count), jnp.arange(count)))
     actor, critic, log_alpha, target, opt_state = carry
     learned = FastSACParams(unravel_actor(actor), unravel_critic(critic), log_alpha[0])
-    return (learned, unravel_critic(target), opt_state), log.mean(axis=0)  # of the actor's also where it rested
+    return (learned, unravel_critic(target), opt_state), log.mean(axis=0)  # also of steps without an actor update
 
 
 def critic_loss(

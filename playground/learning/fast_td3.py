@@ -25,7 +25,7 @@ from playground.pytree import PyTree
 
 
 class FastTD3Params(struct.PyTreeNode):
-  """What is learned: parameters of the actor, and of the twin critics, each array [2, ...]."""
+  """The learned parameters: of the actor, and of the twin critics, each array [2, ...]."""
 
   policy: PyTree
   q: PyTree
@@ -43,7 +43,7 @@ class FastTD3Networks(C51Networks):
     return FastTD3Params(self.init_policy(policy), self.init_q(q))
 
   def mode(self, policy: PyTree, obs: dict[str, jax.Array]) -> jax.Array:
-    """Actions in [-1, 1], [..., action_size], for normalised observations."""
+    """Returns actions in [-1, 1], [..., action_size], for normalised observations."""
     return self.distribution.mode(self.logits(policy, obs))
 
 
@@ -76,7 +76,7 @@ class FastTD3(OffPolicy[FastTD3Config, FastTD3Networks]):
     return jnp.clip(action + levels[:, None] * jax.random.normal(key, action.shape), -1, 1)
 
   def _noise_levels(self, step: jax.Array, count: int) -> jax.Array:
-    """Deviation of the noise of this device's environments, [count], which changes every `episode_length` steps."""
+    """Returns the noise std of this device's environments, [count], which changes every `episode_length` steps."""
     key = jax.random.fold_in(jax.random.PRNGKey(0), step // self._noise_for)
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
     return jax.random.uniform(key, (count,), minval=self.config.min_noise, maxval=self.config.max_noise)
@@ -114,7 +114,7 @@ class FastTD3(OffPolicy[FastTD3Config, FastTD3Networks]):
     carry, log = jax.lax.scan(update, carry, (batches, jax.random.split(key, count), jnp.arange(count)))
     actor, critic, target, opt_state = carry
     learned = FastTD3Params(unravel_actor(actor), unravel_critic(critic))
-    return (learned, unravel_critic(target), opt_state), log.mean(axis=0)  # of the actor's also where it rested
+    return (learned, unravel_critic(target), opt_state), log.mean(axis=0)  # also of steps without an actor update
 
 
 def critic_loss(

@@ -1,6 +1,6 @@
 """Hyperparameters of the algorithms: the `agent` section as dataclasses.
 
-Each number has its limit beside it, which composing checks (`playground.config.limits`): so nothing here needs JAX.
+Each number has its limit beside it, which composition checks (`playground.config.limits`). Nothing here needs JAX.
 
 Other packages add algorithms through an entry point of the group `playground.agents`. It names the dataclass, in a
 module that imports no JAX; the dataclass names the algorithm (docs/add-an-algorithm.md).
@@ -28,11 +28,11 @@ ValueObsKey = Annotated[str, "observation group that the critic reads; privilege
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AgentConfig:
-  """Hyperparameters that every algorithm has, for the trainer reads them. Subclasses are frozen dataclasses, too.
+  """Hyperparameters of every algorithm, which the trainer reads. Subclasses are frozen dataclasses, too.
 
   Attributes:
     algorithm: the class of the algorithm, `module:name`.
-    traced: numbers that are arguments of the compiled program, no constants of it: another value compiles nothing, and
+    traced: numbers that are arguments of the compiled program, not constants: another value needs no compilation, and
       agents of one program may differ in them. No Python branch may depend on one.
   """
 
@@ -55,12 +55,12 @@ class AgentConfig:
 
   @property
   def steps_per_update(self) -> int:
-    """Policy steps of one training step, over all environments and devices."""
+    """Returns the policy steps of one training step, over all environments and devices."""
     return self.num_envs
 
   @property
   def prefill_updates(self) -> int:
-    """Training steps at the beginning that only collect."""
+    """Returns the number of first training steps that only collect."""
     return 0
 
   @property
@@ -69,7 +69,7 @@ class AgentConfig:
     return False
 
   def check(self, num_devices: int) -> None:
-    """Raises ConfigError for sizes that do not go together, or do not divide evenly over the devices."""
+    """Raises ConfigError for sizes that do not fit each other, or do not divide evenly over the devices."""
     for name in ("num_envs", "num_eval_envs", "batch_size"):
       size = getattr(self, name, 0)
       if size % num_devices:
@@ -78,7 +78,7 @@ class AgentConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OnPolicyConfig(AgentConfig):
-  """Hyperparameters of algorithms that learn from what the policy has just collected."""
+  """Hyperparameters of on-policy algorithms."""
 
   unroll_length: Annotated[int, count(1, 100_000), "policy steps of one trajectory"] = 20
   num_minibatches: Annotated[int, count(1, 100_000), "minibatches of an epoch"] = 32
@@ -137,7 +137,7 @@ class OffPolicyConfig(AgentConfig):
 
 @dataclasses.dataclass(frozen=True)
 class CNNConfig:
-  """Layers of a CNN, and what is done before and after them (paper, appendix C.6; Mnih et al., 2015)."""
+  """Layers of a CNN, with the processing before and after them (paper, appendix C.6; Mnih et al., 2015)."""
 
   channels: Annotated[Sequence[int], SIZES, "of each layer"] = (16, 32)
   kernels: Annotated[Sequence[int], SIZES, "pixels, square, of each layer"] = (5, 3)
@@ -458,7 +458,7 @@ def config_class(name: str) -> type[AgentConfig]:
     raise UnknownNameError(f"agent.name={name} does not exist: choose from {known}.{near}")
   try:
     found = points[name].load()
-  except Exception as error:  # whatever the outside package does wrong
+  except Exception as error:  # any error of an outside package
     what = f"{type(error).__name__}: {error}"
     raise ConfigError(f"agent={name}: entry point {name!r} of {ENTRY_POINTS} cannot be loaded, {what}.") from error
   if not (isinstance(found, type) and issubclass(found, AgentConfig)):
@@ -467,7 +467,7 @@ def config_class(name: str) -> type[AgentConfig]:
 
 
 def read_config(agent: Mapping[str, object]) -> AgentConfig:
-  """Builds the dataclass that an `agent` section (a mapping with `name`) is of.
+  """Builds the dataclass of an `agent` section (a mapping with `name`).
 
   Raises:
     UnknownNameError: no such algorithm, or a key that it does not have, such as one that another version has saved.
@@ -477,7 +477,7 @@ def read_config(agent: Mapping[str, object]) -> AgentConfig:
 
 
 def agent_names() -> list[str]:
-  """Every `agent.name`: ours, then those of other packages."""
+  """Returns every `agent.name`: ours, then those of other packages."""
   return [*_BUILT_IN, *(name for name in _entry_points() if name not in _BUILT_IN)]
 
 

@@ -1,6 +1,6 @@
 """The host's side of training, the same for every algorithm: when to train, evaluate, reset, save and stop.
 
-The device is not kept waiting: a thread of its own logs and saves what was done while the next stretch runs.
+The device never waits: a thread logs and saves results while the next segment runs.
 """
 
 import contextlib
@@ -33,13 +33,13 @@ from playground.text import first_line
 
 Metrics = dict[str, float]
 Draw = Callable[[], tuple[ModelFields, ModelFields]]  # randomised models, of the training and of the evaluation
-SAVE_EVERY_S = 300.0  # a state is kept at every evaluation, and at events when this long has passed since the last
+SAVE_EVERY_S = 300.0  # s: a state is saved at every evaluation, and at events when this long has passed since the last
 COMPILER = "compiler"  # name of the threads that compile
 
 
 @dataclasses.dataclass(frozen=True)
 class ScheduleEvent:
-  """A point of the schedule: what happens once `update` training steps are done."""
+  """A point of the schedule: actions after `update` training steps."""
 
   update: int
   evaluate: bool = False
@@ -49,8 +49,8 @@ class ScheduleEvent:
 def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_updates: int) -> list[ScheduleEvent]:
   """Divides a run of `num_updates` training steps into calls of at most `max_updates`.
 
-  Evaluations lie evenly, the first before training and the last at its end (a single one at the end). Resets of all
-  environments lie evenly too, `num_resets_per_eval` to each stretch between two evaluations, none at the very end.
+  Evaluations are evenly spaced, the first before training and the last at its end (a single one at the end). Resets
+  of all environments are evenly spaced, too: `num_resets_per_eval` between two evaluations, none at the very end.
   """
   stretches = max(num_evals - 1, 1)
   evals = {round(i * num_updates / stretches) for i in range(stretches + 1)}
@@ -66,13 +66,13 @@ def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_upd
 
 
 def longest_stretch(events: Sequence[ScheduleEvent]) -> int:
-  """The most training steps from one reset of all environments to the next, or to the end of the run."""
+  """Returns the most training steps between resets of all environments, or to the end of the run."""
   starts = [0, *(event.update for event in events if event.reset), events[-1].update]
   return max(after - before for before, after in itertools.pairwise(starts))
 
 
 class Callbacks(Protocol):
-  """What the run of one agent does with what happens; called on a thread of its own while the device works on."""
+  """Callbacks of the run of one agent, called on a thread while the device continues."""
 
   def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Recording | None) -> None:
     """A row of the log.
@@ -81,31 +81,31 @@ class Callbacks(Protocol):
       step: control steps trained.
       metrics: its columns.
       captured: the run's first non-finite step (on the host) if the row counts any, else None.
-      recording: what the row's evaluation recorded, None for a row without one.
+      recording: of the row's evaluation, None without one.
     """
     ...
 
   def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
-    """A state to keep; its buffers stay valid. After the final one there is nothing left to train."""
+    """Saves a state, whose buffers stay valid; `final` marks the end of training."""
     ...
 
   def should_stop(self) -> bool:
-    """Whether to save and leave at the next event."""
+    """Whether to save and exit at the next event."""
     ...
 
 
 @dataclasses.dataclass
 class CompiledFunctions:
-  """What one run executes, and on which models.
+  """The compiled functions of a run, and its models.
 
   Attributes:
     train, init, reset, copy: see `Trainer`.
     evaluate: see `evaluation.make_evaluator`.
     model: randomised model fields of the training environments, each [num_envs, ...].
     eval_model: of the evaluation environments.
-    trace_s: how long tracing took, 0 where an earlier start had stored the functions.
-    compile_s: how long the compilers took from then.
-    notice: a sentence on what went wrong with it, or None.
+    trace_s: duration of tracing, s; 0 if an earlier start stored the functions.
+    compile_s: duration of compilation after that, s.
+    notice: a sentence about a problem, or None.
   """
 
   train: Callable[..., tuple[TrainState, dict[str, jax.Array]]]
@@ -128,7 +128,7 @@ def compile_program(
   stored: StoredProgram | None = None,
   resets: bool = True,
 ) -> CompiledFunctions:
-  """Compiles all functions side by side, Warp's kernels too, ahead of the first step.
+  """Compiles all functions and Warp's kernels in parallel, before the first step.
 
   Each is traced once, unless an earlier start has stored them.
 
@@ -136,8 +136,8 @@ def compile_program(
     trainer: of the run.
     evaluate: (policy, key, model fields, settings) -> scores, jitted.
     draw: randomised model fields of the training and of the evaluation environments.
-    policy: what a new run starts from, if it has any weights to start from.
-    stored: where the lowered functions are kept, None where they are not.
+    policy: weights that a new run starts from, or None.
+    stored: file of the lowered functions, None without one.
     resets: whether the schedule resets all environments; without, `reset` is compiled if it is called at all.
   """
   start, notices = time.perf_counter(), []
@@ -160,7 +160,7 @@ def compile_program(
   finally:
     if kernels is not None:
       kernels.stop()
-    pool.shutdown(wait=False, cancel_futures=True)  # an interrupted run does not wait for its compiler
+    pool.shutdown(wait=False, cancel_futures=True)  # an interrupted run does not wait for compilation
   compile_s = time.perf_counter() - start - trace_s
   lowered = {name: function for name, (_, function) in results.items() if function is not None}
   if stored is not None and len(lowered) == len(results):
@@ -178,7 +178,7 @@ def compile_program(
 def _compile_stored(
   trainer: Trainer, draw: Draw, stored: StoredProgram, pool: ThreadPoolExecutor
 ) -> CompiledFunctions | None:
-  """Compiles what is stored, None if nothing is; raises UnusableProgramError."""
+  """Compiles stored functions, None without any; raises UnusableProgramError."""
   start = time.perf_counter()
   functions = stored.load()
   if functions is None:
@@ -187,7 +187,7 @@ def _compile_stored(
   model, eval_model = shard(draw(), trainer.mesh)
   try:
     compiled = {"reset": trainer.reset} | {name: future.result() for name, future in futures.items()}
-  except Exception as error:  # of any kind: JAX and XLA read a file
+  except Exception as error:  # any error: JAX and XLA read a file
     raise stored.discard(error) from error
   compile_s = time.perf_counter() - start
   return CompiledFunctions(
@@ -204,13 +204,13 @@ def _trace(
   resets: bool,
   pool: ThreadPoolExecutor,
 ) -> dict[str, Future[tuple[Compiled, LoweredFunction | None]]]:
-  """Traces all functions and has the pool compile them: name to the function and what can be stored of it."""
+  """Traces all functions and compiles them in the pool; returns each by name with its storable form."""
   agents = (trainer.num_agents,) if trainer.num_agents else ()
   key, count = jax.ShapeDtypeStruct((*agents, 2), jnp.uint32), jax.ShapeDtypeStruct((), jnp.int32)
 
   def compile_traced(function: Wrapped, traced: Traced, *args: PyTree) -> tuple[Compiled, LoweredFunction | None]:
     if stored is not None:
-      with contextlib.suppress(ValueError, NotImplementedError):  # it calls what cannot be stored
+      with contextlib.suppress(ValueError, NotImplementedError):  # it calls code that JAX does not serialise
         lowered = LoweredFunction.of(function, traced, *args)
         return lowered.compile(trainer.mesh), lowered
     return traced.lower().compile(), None
@@ -221,7 +221,7 @@ def _trace(
   model, eval_model = jax.eval_shape(draw)
   state = trainer.init.trace(key, model, policy, trainer.settings).out_info
   futures = {
-    "train": submit(trainer.train, state, model, count),  # first, for it takes XLA longest
+    "train": submit(trainer.train, state, model, count),  # first, because it takes XLA longest
     "init": submit(trainer.init, key, model, policy, trainer.settings),
     "evaluate": submit(evaluate, trainer.policy(state), key, eval_model, state.settings),
     "copy": submit(trainer.copy, state),
@@ -231,7 +231,7 @@ def _trace(
 
 @dataclasses.dataclass
 class SegmentResult:
-  """What was done up to one event, on the device."""
+  """The results of training up to one event, on the device."""
 
   event: ScheduleEvent
   steps: int
@@ -246,7 +246,7 @@ class SegmentResult:
 
 @dataclasses.dataclass
 class Loop:
-  """One run, or those of several agents: from a state at some event of the schedule to its end.
+  """Runs the schedule of one agent or several, from a state at one of its events to the end.
 
   Attributes:
     trainer: of the run.
@@ -254,8 +254,8 @@ class Loop:
     events: the schedule.
     seeds: of each agent; evaluations and resets draw from it and the event they belong to, so they do not depend on
       where the run was interrupted.
-    callbacks: of each agent, called with rows, states to keep and for whether to stop, which it does if all say so.
-    population: lets agents learn from each other; None does not.
+    callbacks: of each agent; training stops if all ask for it.
+    population: exchanges between agents, or None.
     train_s: device time of training alone.
     first_update_s: device time of one training step, the mean over the first training call.
     first_update_at: when the first training step was done, on the clock of `time.perf_counter`: when the first training
@@ -283,11 +283,11 @@ class Loop:
     return self.functions.init(key, self.functions.model, placed, settings)
 
   def run(self, state: TrainState, update: int | None = None) -> tuple[TrainState, bool]:
-    """Runs to the end of the schedule, or until the callbacks say stop.
+    """Runs to the end of the schedule, or until the callbacks ask to stop.
 
     Args:
-      state: the state to go on from; its buffers are taken over.
-      update: the number of training steps after which it was saved, None for a new run.
+      state: the state to continue from; its buffers are donated.
+      update: its number of training steps, None for a new run.
 
     Returns:
       The last state, and whether the schedule was completed.
@@ -305,7 +305,7 @@ class Loop:
         if initial:
           results, initial = [self._evaluate_initial(*initial), done], None
         if reported:
-          reported.result()  # one row is in flight; what went wrong with it stops the run here
+          reported.result()  # one row is in flight; its error is raised here
         stop = any_process(all(each.should_stop() for each in self.callbacks)) and event is not events[-1]
         if stop:
           done.snapshot = self.functions.copy(state) if is_multiprocess() else state
@@ -317,7 +317,7 @@ class Loop:
     return state, at == self.events[-1].update
 
   def _work(self, state: TrainState, event: ScheduleEvent, num_updates: int) -> tuple[TrainState, SegmentResult]:
-    """Trains up to an event and does what it asks for; waits for the numbers, not for resets and copies."""
+    """Trains up to an event and performs its actions; waits for metrics, not for resets and copies."""
     done = SegmentResult(event, num_updates * self.trainer.steps_per_update)
     if num_updates:
       start = time.perf_counter()
@@ -343,7 +343,7 @@ class Loop:
     late = any_process(time.perf_counter() - self._last_save > SAVE_EVERY_S)
     due = late or event.evaluate or event is self.events[-1]
     if due:
-      # A copy, because the next training call takes the state's buffers over while this one is written to disk.
+      # A copy, because the next training call donates the state's buffers while this one is written to disk.
       done.snapshot = self.functions.copy(state)
       self._last_save = time.perf_counter()
     return state, done
@@ -368,7 +368,7 @@ class Loop:
   def _exchange(
     self, state: TrainState, event: ScheduleEvent, returns: jax.Array, population: Population
   ) -> tuple[TrainState, tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Lets agents learn from each other, where it is time for that; the end of the run is not."""
+    """Exchanges between the agents of a population if it is due, never at the end of the run."""
     settings = jax.device_get(state.settings)
     count = sum(each.evaluate and 0 < each.update <= event.update for each in self.events)
     if event is self.events[-1] or count % population.exploit_every:
@@ -377,12 +377,12 @@ class Loop:
     return self.trainer.inherit(state, *lineage), lineage
 
   def _report(self, done: SegmentResult) -> None:
-    """Hands finished work to the callbacks, to each its agent's part."""
+    """Passes results to the callbacks of each agent."""
     step = done.event.update * self.trainer.steps_per_update
     trained, (scores, recording), snapshot = done.trained, done.evaluated or (None, None), done.snapshot
     trained, scores = jax.device_get((trained, scores))
     if self.trainer.num_agents:
-      recording, snapshot = jax.device_get((recording, snapshot))  # in one go; an agent's part is a view
+      recording, snapshot = jax.device_get((recording, snapshot))  # one transfer; the part of an agent is a view
     for i, callbacks in enumerate(self.callbacks):
       row: Metrics = {}
       if trained is not None:

@@ -32,14 +32,14 @@ ObservationSize = int | Mapping[str, tuple[int, ...]]
 
 
 class Actor:
-  """A tanh-squashed Gaussian actor, and what it shares with its critics: observation entries, normaliser, precision.
+  """A tanh-squashed Gaussian actor; its observation groups, normaliser and precision are also the critics'.
 
-  Observations are dicts of arrays with any leading axes; a task's flat observation counts as {"state": obs}. Pictures
-  among them (`pixels/...`, [..., H, W, C] uint8) are read by actor and critic alike, by CNNs of their own.
+  Observations are dicts of arrays with any leading axes; a task's flat observation counts as {"state": obs}. Actor
+  and critic both read images (`pixels/...`, [..., H, W, C] uint8), with separate CNNs.
 
   Attributes:
-    cnn: the layers that pictures go through; None without pictures.
-    obs_limit: what vectors are clipped to before actor and critic read them; None without a limit.
+    cnn: layers for images; None without images.
+    obs_limit: clip range of normalised vectors; None without a limit.
   """
 
   def __init__(
@@ -63,7 +63,7 @@ class Actor:
       layer_norm: whether the actor's hidden layers are normalised.
 
     Raises:
-      ConfigError: unknown activation, or an observation entry the task does not have.
+      ConfigError: unknown activation, or an observation group that the task does not have.
     """
     if config.activation not in ACTIVATIONS:
       allowed = ", ".join(ACTIVATIONS) + "." + nearest(config.activation, ACTIVATIONS)
@@ -123,16 +123,16 @@ class Actor:
     return state.replace(count=count, std_eps=jnp.asarray(state.std_eps, jnp.float32))
 
   def select(self, obs: Observation) -> dict[str, jax.Array]:
-    """The entries of an observation that actor or critic reads."""
+    """Returns the groups of an observation that actor or critic reads."""
     entries = obs if isinstance(obs, Mapping) else {"state": obs}
     return {key: entries[key] for key in (*self.obs_keys, *self.pixel_sizes)}
 
   def vectors(self, obs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
-    """The entries of a selected observation that are no pictures: those that are normalised."""
+    """Returns the vectors of a selected observation, which are normalised, without images."""
     return {key: obs[key] for key in self.obs_keys}
 
   def logits(self, policy_params: PyTree, obs: Mapping[str, jax.Array]) -> jax.Array:
-    """Parameters of the action distribution, [..., 2 * action_size], for normalised observations."""
+    """Returns parameters of the action distribution, [..., 2 * action_size], for normalised observations."""
     with self.at_precision():
       if self.pixel_sizes:
         return self._actor.apply(policy_params, *self._seen(obs, self.policy_obs_key))  # pyright: ignore[reportReturnType]
@@ -141,7 +141,7 @@ class Actor:
   def logits_and_estimate(
     self, policy_params: PyTree, obs: Mapping[str, jax.Array]
   ) -> tuple[jax.Array, jax.Array | None]:
-    """`logits`, and what the actor takes `estimated_obs_key` to be, normalised, [..., D]; None where that is empty."""
+    """Returns `logits`, and the actor's estimate of `estimated_obs_key`, normalised, [..., D]; None without one."""
     if not self.estimated_obs_key:
       return self.logits(policy_params, obs), None
     with self.at_precision():
@@ -152,7 +152,7 @@ class Actor:
   def act(
     self, policy: PyTree, normalizer: Normalizer | None, obs: Observation, key: jax.Array, deterministic: bool = False
   ) -> jax.Array:
-    """Actions in [-1, 1], [..., action_size], sampled or (deterministic) the mode."""
+    """Returns actions in [-1, 1], [..., action_size], sampled or (deterministic) the mode."""
     logits = self.logits(policy, normalize(self.select(obs), normalizer))
     return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
 
@@ -165,7 +165,7 @@ class Actor:
   def mlp(
     self, policy: PyTree, normalizer: Normalizer | None
   ) -> tuple[Mapping[str, PyTree], tuple[np.ndarray, np.ndarray] | None]:
-    """Layers as Flax has them, mean and deviation of the vector (None without one, or as it is), all on the host."""
+    """Returns Flax layers, mean and std of the vector (None without one or unnormalised), on the host."""
     key = self.policy_obs_key
     statistics: PyTree = normalizer
     layers = {name: layer for name, layer in policy["params"].items() if name != ESTIMATOR}
@@ -173,7 +173,7 @@ class Actor:
 
   @property
   def policy_inputs(self) -> dict[str, tuple[int, ...]]:
-    """Shapes of the entries that the actor reads: pictures, then the vector, in the order of its features."""
+    """Returns the shapes of the actor's inputs: images, then the vector, in the order of its features."""
     key = self.policy_obs_key
     return self.pixel_sizes | ({key: self.obs_sizes[key]} if key else {})
 
@@ -182,20 +182,20 @@ class Actor:
     return PixelNetwork(cnn, ACTIVATIONS[cnn.activation], tuple(sizes), self.activation, output_size, **how)
 
   def _seen(self, obs: Mapping[str, jax.Array], key: str) -> tuple[dict[str, jax.Array], jax.Array | None]:
-    """What a network on pixels is applied to: pictures, and the vector `key` unless that is empty."""
+    """Returns the inputs of a network on pixels: images, and the vector `key` unless that is empty."""
     return {name: obs[name] for name in self.pixel_sizes}, self._vector(obs, key) if key else None
 
   def _vector(self, obs: Mapping[str, jax.Array], key: str) -> jax.Array:
-    """The entry `key` of a normalised observation within the limit."""
+    """Returns the group `key` of a normalised observation, clipped to the limit."""
     return obs[key] if self.obs_limit is None else jnp.clip(obs[key], -self.obs_limit, self.obs_limit)
 
   def _example(self) -> dict[str, jax.Array]:
-    """An observation of zeros, a batch of one."""
+    """Returns an observation of zeros, a batch of one."""
     pictures = {key: jnp.zeros((1, *size), jnp.uint8) for key, size in self.pixel_sizes.items()}
     return pictures | {key: jnp.zeros((1, *size)) for key, size in self.obs_sizes.items()}
 
   def at_precision(self) -> AbstractContextManager[None]:
-    """A context in which matrix products have the networks' precision."""
+    """Returns a context in which matrix products have the networks' precision."""
     return jax.default_matmul_precision(self.precision or jax.config.jax_default_matmul_precision)
 
 
@@ -209,9 +209,9 @@ class ActorCriticParams(struct.PyTreeNode):
 class Critic(linen.Module):
   """Brax's value MLP with its hidden layers computed in `dtype`; parameters and output are float32.
 
-  Writing and reading the hidden activations is most of what an update costs on a GPU. The first layer stays in float32:
-  advantages are differences of neighbouring states' values, which rounded observations would blur. So does the actor:
-  the loss compares its log-probabilities with those at acting time.
+  Writing and reading hidden activations is most of the cost of an update on a GPU. The first layer stays in float32:
+  advantages are differences of neighbouring states' values, which rounded observations would blur. The actor stays in
+  float32, too: the loss compares its log-probabilities with those at acting time.
   """
 
   hidden_layer_sizes: Sequence[int]
@@ -253,7 +253,7 @@ class ActorCritic(Actor):
     return ActorCriticParams(self.policy_network.init(policy), self._critic.init(value, obs))
 
   def value(self, value_params: PyTree, obs: Mapping[str, jax.Array]) -> jax.Array:
-    """State values, [...], for normalised observations."""
+    """Returns state values, [...], for normalised observations."""
     with self.at_precision():
       if self.pixel_sizes:
         return self._critic.apply(value_params, *self._seen(obs, self.value_obs_key))[..., 0]  # pyright: ignore
@@ -261,7 +261,7 @@ class ActorCritic(Actor):
 
 
 class SoftActorCriticParams(struct.PyTreeNode):
-  """What SAC's optimiser changes. The order counts: the critics come first, see `SAC._learn`.
+  """The parameters of SAC's optimiser. The order matters: the critics come first, see `SAC._learn`.
 
   Attributes:
     q: parameters of the twin critics, each array [2, ...].
@@ -278,8 +278,8 @@ class SoftActorCritic(Actor):
   """An actor and two action-value networks, whose layers are one batched product each.
 
   Attributes:
-    batched: whether several evaluations of the critics are one batched product, too. It is what a GPU wants, where a
-      step of SAC costs as many kernels as it has; elsewhere arithmetic counts, of which it does half as much again.
+    batched: whether several evaluations of the critics are one batched product, too. That is faster on a GPU, where
+      the number of kernels counts; elsewhere arithmetic counts, of which it does half as much again.
   """
 
   def __init__(
@@ -299,32 +299,32 @@ class SoftActorCritic(Actor):
     return SoftActorCriticParams(q, self.policy_network.init(policy), jnp.zeros(()))
 
   def q(self, q_params: PyTree, obs: Mapping[str, jax.Array], action: jax.Array) -> jax.Array:
-    """Values of both critics, [2, ...], for normalised observations and actions [..., action_size]."""
+    """Returns the values of both critics, [2, ...], for normalised observations and actions [..., action_size]."""
     inputs = jnp.concatenate([obs[self.value_obs_key], action], axis=-1)
     with self.at_precision():
       return jax.vmap(self._critic.apply, (0, None))(q_params, inputs)[..., 0]  # pyright: ignore[reportIndexIssue, reportCallIssue, reportArgumentType]
 
   def q_each(self, *evaluations: tuple[PyTree, Mapping[str, jax.Array], jax.Array]) -> tuple[jax.Array, ...]:
-    """`q` of several (parameters, observations, actions), all of the same shape."""
+    """Returns `q` of several (parameters, observations, actions), all of the same shape."""
     if not self.batched:
       return tuple(self.q(*evaluation) for evaluation in evaluations)
     return tuple(jax.vmap(self.q)(*jax.tree.map(lambda *x: jnp.stack(x), *evaluations)))
 
   def sample(self, logits: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Actions in [-1, 1] and their log-probabilities, [...]; `noise` is standard normal, [..., action_size]."""
+    """Samples actions in [-1, 1] and their log-probabilities, [...]; `noise` is standard normal, [..., action_size]."""
     normal = self.distribution.create_dist(logits)
     raw_action = normal.loc + normal.scale * noise
     return self.distribution.postprocess(raw_action), self.distribution.log_prob(logits, raw_action)
 
 
 def refuse_pictures(obs_size: ObservationSize, agent: str) -> None:
-  """Raises ConfigError for a task with pictures, which this agent does not read."""
+  """Raises ConfigError for a task with images, which this agent does not read."""
   if isinstance(obs_size, Mapping) and any(key.startswith(PIXELS) for key in obs_size):
     raise ConfigError(f"agent={agent} reads no pictures: choose agent=ppo, or env.vision.enable=false.")
 
 
 def normalize(obs: Mapping[str, jax.Array], normalizer: Normalizer | None) -> dict[str, jax.Array]:
-  """Subtracts the running mean and divides by the running deviation; pictures stay, and with None all of it does."""
+  """Subtracts the running mean and divides by the running std; images and, with None, all groups stay."""
   if normalizer is None:
     return dict(obs)
   mean: PyTree = normalizer.mean

@@ -28,12 +28,12 @@ class Transition(struct.PyTreeNode):
   """Steps of N environments, each [N, ...].
 
   Attributes:
-    obs: observation entries that actor or critics read.
-    next_obs: the same after the step; where an episode ended, its own last ones.
+    obs: observation groups that actor or critics read.
+    next_obs: the same after the step; where an episode ended, its last ones.
     action: in [-1, 1].
     reward: unscaled.
     discount: factor on the value of `next_obs`: 0 where the task ended the episode, else 1 (after a time-out, too).
-    nonfinite: 1 for a step with a number that is not finite, else 0; the critics learn nothing there.
+    nonfinite: 1 for a step with a non-finite number, which the critics skip, else 0.
     first: 1 where an episode begins with `obs`; only with `num_steps` above 1, else None.
   """
 
@@ -61,8 +61,8 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
   """An algorithm that learns from a replay buffer; a subclass fills `init_optimizer` and `learn`.
 
   Attributes:
-    logged: names of what `learn` logs.
-    buffer: of transitions.
+    logged: names of the metrics of `learn`.
+    buffer: the replay buffer.
   """
 
   logged: ClassVar[tuple[str, ...]]
@@ -91,14 +91,14 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
     """Makes gradient steps, one for each batch.
 
     Args:
-      start: what was learned so far.
+      start: the learned state.
       batches: normalised transitions, each [updates, B, ...].
       key: of this device.
       step: training steps so far, [].
 
     Returns:
-      What is learned, and means over the gradient steps: of `logged`, then the share that was left out for a gradient
-      that is not finite.
+      The learned state, and means over the gradient steps: of `logged`, then the share that was skipped for a
+      non-finite gradient.
     """
 
   def init(self, key: jax.Array, policy: Policy | None) -> OffPolicyState:
@@ -127,7 +127,7 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
     kept = transition.replace(obs=stored(transition.obs), next_obs=stored(transition.next_obs))
     replay = self.buffer.insert(state.replay, kept)
 
-    # Learn, once there is enough to learn from: what all gradient steps need is drawn and normalised in one go.
+    # Learn, once the buffer is large enough: batches of all gradient steps are drawn and normalised at once.
     def learn(start: Learned) -> tuple[Learned, jax.Array]:
       shape = (config.grad_updates_per_step, config.batch_size // jax.lax.axis_size(AXIS))
       if config.num_steps > 1:
@@ -177,10 +177,10 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
 
 
 def groups_inside(env: Env, sizes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[str, int]]:
-  """Observation groups of these sizes that another one begins with, and which the buffer therefore leaves out.
+  """Finds observation groups with which another one begins; the buffer does not store them.
 
   Returns:
-    By group: the other, and how many of its numbers are the group.
+    By group: the other group, and the size of the first one.
   """
   found: dict[str, tuple[str, int]] = {}
   parts = env.observation_parts if len(sizes) > 1 else {}
@@ -192,7 +192,7 @@ def groups_inside(env: Env, sizes: Mapping[str, tuple[int, ...]]) -> dict[str, t
 
 
 def n_step(windows: Transition, discounting: float) -> Transition:
-  """Makes one transition of several: rewards add up, discounted, until the episode or the window ends.
+  """Combines several transitions into one: rewards add up, discounted, until the episode or the window ends.
 
   Args:
     windows: successive steps, each [n, ..., ] with `first`.

@@ -1,4 +1,4 @@
-"""Population-based training: agents of one program copy better ones and vary their numbers (Jaderberg et al., 2017)."""
+"""Population-based training: agents of one program copy better ones and perturb settings (Jaderberg et al., 2017)."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,12 +14,12 @@ FACTORS = (0.8, 1.25)
 
 @dataclasses.dataclass(frozen=True)
 class Population:
-  """When and how agents learn from each other.
+  """The exchanges between agents.
 
   Attributes:
     exploit_every: evaluations from one exchange to the next; that before training does not count.
     explore: limits of the settings that agents copy and vary, by key; the others stay their own.
-    seed: of what is drawn.
+    seed: of the random choices.
   """
 
   exploit_every: int
@@ -29,15 +29,15 @@ class Population:
   def exchange(
     self, returns: np.ndarray, settings: Mapping[str, np.ndarray], update: int
   ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Lets each agent of the worst quarter take over what one of the best quarter is.
+    """Replaces each agent of the worst quarter by a copy of one of the best quarter.
 
     Args:
       returns: of each agent, [agents]; NaN is the worst.
       settings: values by key, each [agents, ...].
-      update: number of training steps so far; with the seed it says what is drawn, so that a resumed run draws it, too.
+      update: number of training steps so far; with the seed it determines the draws, also of a resumed run.
 
     Returns:
-      Whose parameters each agent goes on with, [agents], and the settings from then on: an agent that copies another
+      The index of the agent that each copies, [agents], and the new settings: an agent that copies another
       multiplies each of the explored ones by 0.8 or 1.25, within its limit.
     """
     rng = np.random.default_rng([self.seed, update])

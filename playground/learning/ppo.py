@@ -26,8 +26,8 @@ from playground.learning.rollout import Environments, side_by_side, unroll
 from playground.pytree import PyTree
 
 LOSSES = ("total_loss", "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")  # what is logged
-ESTIMATION = "estimation_loss"  # with them where something is estimated
-KL = "kl"  # and where the configuration bounds it
+ESTIMATION = "estimation_loss"  # with an estimator
+KL = "kl"  # with a bounded KL divergence
 _UNROLL = 64  # steps of a trajectory that are one kernel
 _LEAST_SCALE = 1e-2  # of the critic's targets
 _NO_KL = 1e-6  # a divergence below it is rounding
@@ -47,7 +47,7 @@ class Batch(struct.PyTreeNode):
     value: the critic's value when the action was taken, [T, B]; only where the value loss is clipped, else None.
     targets: of the critic, [T, B], and
     advantages: [T, B]; only where they are computed once an epoch, else None.
-    old_logits: of the policy before the update, [T, B, 2 * action_size]; only where the KL divergence is bounded.
+    old_logits: of the policy before the update, [T, B, 2 * action_size]; only with a bounded KL divergence.
     mirrored_obs: normalised observations of the mirror images, each [T, B, ...], and
     mirrored_action: their actions before squashing, [T, B, action_size]; only with `mirror_augmentation`.
   """
@@ -68,7 +68,7 @@ class Batch(struct.PyTreeNode):
 
 
 class PPOState(AlgorithmState):
-  """Also count, mean and sum of squared deviations of the critic's targets so far, [3], where they are normalised."""
+  """Also count, mean and sum of squared differences from the mean of the critic's targets, [3], if normalised."""
 
   targets_seen: jax.Array | None = None
 
@@ -161,7 +161,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
 
       keys = jax.random.split(loss_key, config.num_minibatches)
       learned, log = jax.lax.scan(update, tuple(start), (columns, keys))
-      if config.max_kl is not None:  # an epoch that went too far is the last one
+      if config.max_kl is not None:  # an epoch beyond the KL limit is the last one
         learned = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), learned, tuple(start))
         kl = jax.lax.pmean(log[:, self.losses.index(KL)].mean(), AXIS)
         stopped |= kl > config.max_kl
@@ -177,7 +177,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     metrics["nonfinite_updates"] *= metrics["gradient_steps"]
     if vectors := jax.tree.leaves(networks.vectors(obs)):
       farthest = jnp.stack([jnp.abs(entry).max() for entry in vectors]).max()
-      metrics["obs_farthest"] = jax.lax.pmax(farthest, AXIS)  # of any number from its mean, in standard deviations
+      metrics["obs_farthest"] = jax.lax.pmax(farthest, AXIS)  # largest distance from the mean, in standard deviations
     logits = networks.logits(params.policy, jax.tree.map(lambda x: x[0], obs))
     std = networks.distribution.create_dist(logits).scale.mean()  # before squashing, on the first step of the data
     metrics["policy_std"] = jax.lax.pmean(std, AXIS)
@@ -190,7 +190,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     return state.replace(**learned, normalizer=normalizer), envs, metrics
 
   def _with_targets(self, batch: Batch, params: ActorCriticParams) -> Batch:
-    """The batch with targets and advantages by the critic of `params`; the advantages normalised over all devices."""
+    """Returns the batch with targets and advantages by the critic of `params`, normalised over all devices."""
     values = self.networks.value(params.value, _all_obs(batch))
     targets, advantages = gae(batch, values, self.config)
     if self.config.normalize_advantage:
@@ -200,13 +200,13 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     return batch.replace(targets=targets, advantages=advantages)
 
   def _adapt(self, opt_state: PyTree, kl: jax.Array) -> PyTree:
-    """The optimiser's state with the learning rate that follows from a minibatch's divergence."""
+    """Returns the optimiser's state with the learning rate adapted to a minibatch's divergence."""
     clip, adam = opt_state
     rate = adapted_rate(adam.hyperparams["learning_rate"], kl, self.config)
     return clip, adam._replace(hyperparams=adam.hyperparams | {"learning_rate": rate})
 
   def _minibatch(self, batch: Batch, columns: jax.Array, key: jax.Array) -> tuple[Batch, jax.Array]:
-    """The trajectories in `columns`, their images shifted if `augment_pixels` says so, and a key for the loss."""
+    """Returns the trajectories in `columns`, with shifted images if `augment_pixels` is set, and a key for the loss."""
     last_obs = jax.tree.map(lambda x: x[columns], batch.last_obs)
     minibatch = jax.tree.map(lambda x: x[:, columns], batch.replace(last_obs=None)).replace(last_obs=last_obs)
     if pad := self.config.augment_pixels:
@@ -225,7 +225,7 @@ def ppo_loss(
   config: PPOConfig,
   value_scale: jax.Array | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-  """Clipped surrogate, value and entropy loss (Schulman et al., 2017) with GAE on the present critic.
+  """Clipped surrogate, value and entropy loss (Schulman et al., 2017) with GAE on the current critic.
 
   Args:
     params: actor's and critic's parameters.
@@ -233,14 +233,14 @@ def ppo_loss(
     key: for the sampled entropy of the squashed Gaussian.
     networks: the networks the parameters belong to.
     config: hyperparameters.
-    value_scale: what errors of the critic are divided by, []; None is 1.
+    value_scale: divisor of the critic's errors, []; None is 1.
 
   Returns:
-    The loss, and `LOSSES` by name, with `ESTIMATION` where something is estimated and `KL` where it is bounded.
+    The loss, and `LOSSES` by name, with `ESTIMATION` if an estimator is trained and `KL` if it is bounded.
   """
   logits, estimate = networks.logits_and_estimate(params.policy, batch.obs)
   if batch.targets is None or batch.advantages is None:
-    values = networks.value(params.value, _all_obs(batch))  # in one go: the critic is most of the cost
+    values = networks.value(params.value, _all_obs(batch))  # at once: the critic is most of the cost
     targets, advantages = gae(batch, values, config)
     values = values[:-1]
     if config.normalize_advantage:
@@ -265,14 +265,14 @@ def ppo_loss(
 
   def critic_loss(values: jax.Array) -> jax.Array:
     value_error = squared(targets - values)
-    if (limit := config.clipping_epsilon_value) is not None:  # beyond it the loss stops paying
+    if (limit := config.clipping_epsilon_value) is not None:  # beyond it the gradient is 0
       assert batch.value is not None
       near = batch.value + jnp.clip(values - batch.value, -limit, limit)
       value_error = jnp.maximum(value_error, squared(targets - near))
     return 0.5 * config.vf_loss_coefficient * value_error.mean()
 
   value_loss = critic_loss(values)
-  if batch.mirrored_obs is not None:  # with the log-probabilities, advantages and targets of what was experienced
+  if batch.mirrored_obs is not None:  # with the log-probabilities, advantages and targets of the original
     assert batch.mirrored_action is not None
     mirrored_logits = networks.logits(params.policy, batch.mirrored_obs)
     mirrored_log_prob = networks.distribution.log_prob(mirrored_logits, batch.mirrored_action)
@@ -294,7 +294,7 @@ def ppo_loss(
 
 
 def _mirror(env: Env, networks: ActorCritic) -> Mirror:
-  """The task's mirror; raises ConfigError if it has none."""
+  """Returns the task's mirror; raises ConfigError if it has none."""
   try:
     if networks.pixel_sizes:
       raise ConfigError("pictures are not mirrored.")
@@ -304,10 +304,10 @@ def _mirror(env: Env, networks: ActorCritic) -> Mirror:
 
 
 def adapted_rate(rate: jax.Array, kl: jax.Array, config: PPOConfig) -> jax.Array:
-  """The learning rate of a gradient step (Schulman et al., 2017, section 4, as RSL-RL has it).
+  """Returns the learning rate of a gradient step (Schulman et al., 2017, section 4, as RSL-RL has it).
 
-  Above twice the desired divergence it falls by a third, below half of it it grows by a half; at 0, where the policy
-  has not changed yet, it stays.
+  Above twice the desired divergence the rate falls by a third, below half of it the rate grows by a half; at 0, where
+  the policy has not changed yet, it stays.
 
   Args:
     rate: the learning rate so far, [].
@@ -321,7 +321,7 @@ def adapted_rate(rate: jax.Array, kl: jax.Array, config: PPOConfig) -> jax.Array
 
 
 def count_targets(seen: jax.Array, targets: jax.Array | None) -> jax.Array:
-  """Count, mean and sum of squared deviations, [3], with the targets of all devices added (Chan et al., 1983)."""
+  """Adds the targets of all devices to count, mean and sum of squared differences, [3] (Chan et al., 1983)."""
   assert targets is not None
   devices = jax.lax.axis_size(AXIS)
   count = jnp.float32(targets.size * devices)
@@ -333,12 +333,12 @@ def count_targets(seen: jax.Array, targets: jax.Array | None) -> jax.Array:
 
 
 def _all_obs(batch: Batch) -> dict[str, jax.Array]:
-  """Observations of all steps and after the last one, each [T + 1, B, ...]."""
+  """Returns the observations of all steps and after the last one, each [T + 1, B, ...]."""
   return jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), batch.obs, batch.last_obs)
 
 
 def pay_time_outs(batch: Batch, final_value: jax.Array, config: PPOConfig) -> Batch:
-  """Ends episodes that time cut as if they had earned there what the critic expects of the rest.
+  """Adds the critic's value of the last observation to the reward of steps at the time limit, and terminates there.
 
   Args:
     batch: trajectories.
@@ -356,7 +356,7 @@ def pay_time_outs(batch: Batch, final_value: jax.Array, config: PPOConfig) -> Ba
 def gae(batch: Batch, values: jax.Array, config: PPOConfig) -> tuple[jax.Array, jax.Array]:
   """Generalised advantage estimation (Schulman et al., 2016), as Brax has it.
 
-  A truncated step teaches nothing (delta 0) and cuts the sum of those before it.
+  A truncated step has delta 0 and ends the sum of those before it.
 
   Args:
     batch: B trajectories of T steps.

@@ -15,12 +15,12 @@ from playground.pytree import PyTree
 
 
 class Replay(struct.PyTreeNode):
-  """What a buffer holds.
+  """The content of a buffer.
 
   Attributes:
     data: one row for each transition, [slots, num_envs, columns]; a slot takes one step of all environments. A column
       is a float32 number or, in a buffer of bfloat16, the 16 bits of one or half of those of a float32.
-    inserted: steps put in so far, []; beyond `slots` they replace the oldest.
+    inserted: steps inserted so far, []; beyond `slots` they replace the oldest.
   """
 
   data: jax.Array
@@ -32,16 +32,16 @@ REPLAY_SPEC = Replay(data=P(None, AXIS), inserted=P())  # pyright: ignore[report
 
 
 class ReplayBuffer:
-  """Puts transitions in and draws them; pure functions on `Replay`, each device on its share of the environments."""
+  """Inserts and samples transitions; pure functions on `Replay`, each device on its share of the environments."""
 
   def __init__(self, max_size: int, num_envs: int, example: PyTree, saved: bool = True, dtype: DTypeLike = jnp.float32):
-    """Sizes an empty buffer.
+    """Computes the size of the buffer.
 
     Args:
-      max_size: transitions at most, rounded down to whole steps of all environments.
+      max_size: largest number of transitions, rounded down to whole steps of all environments.
       num_envs: environments, over all devices.
       example: one transition, a tree of float32 arrays or their shapes.
-      saved: whether the newest checkpoint holds the transitions; else a resumed run collects them anew.
+      saved: whether the newest checkpoint holds the transitions; else a resumed run starts with an empty buffer.
       dtype: float32, or bfloat16 to keep arrays at half of the memory; single numbers (rewards, flags) stay float32.
     """
     self.max_size, self.saved = max_size, saved
@@ -56,26 +56,26 @@ class ReplayBuffer:
 
   @property
   def size(self) -> int:
-    """Transitions it can hold, over all devices."""
+    """Returns the capacity in transitions, over all devices."""
     return self.slots * self.num_envs
 
   @property
   def nbytes(self) -> int:
-    """Memory of all of them, over all devices."""
+    """Returns the memory of the full buffer, over all devices, bytes."""
     return self.size * self._row.size * self._row.dtype.itemsize
 
   def init(self, num_envs: int) -> Replay:
-    """An empty buffer for a device's share of the environments."""
+    """Returns an empty buffer for a device's share of the environments."""
     return Replay(jnp.zeros((self.slots, num_envs, *self._row.shape), self._row.dtype), jnp.zeros((), jnp.int32))
 
   def insert(self, replay: Replay, transitions: PyTree) -> Replay:
-    """Puts in one step of all environments, a tree of [num_envs, ...], in the place of the oldest if it is full."""
+    """Inserts one step of all environments, a tree of [num_envs, ...]; a full buffer drops the oldest."""
     rows = self._ravel(transitions)
     data = jax.lax.dynamic_update_slice_in_dim(replay.data, rows[None], replay.inserted % self.slots, 0)
     return Replay(data, replay.inserted + 1)
 
   def sample(self, replay: Replay, key: jax.Array, shape: tuple[int, ...]) -> PyTree:
-    """Draws transitions, a tree of [*shape, ...], each of those held with the same probability."""
+    """Draws stored transitions uniformly, a tree of [*shape, ...]."""
     rows = replay.data.reshape(-1, *self._row.shape)
     held = self.held(replay) * replay.data.shape[1]
     drawn = jax.random.randint(key, (math.prod(shape),), 0, held)
@@ -85,7 +85,7 @@ class ReplayBuffer:
   def sample_windows(self, replay: Replay, key: jax.Array, shape: tuple[int, ...], length: int) -> PyTree:
     """Draws successive transitions of one environment each, a tree of [length, *shape, ...].
 
-    All that are held whole have the same probability; there must be one: no window crosses the newest transition.
+    All complete windows have the same probability, and there must be one; no window crosses the newest transition.
     """
     slots, num_envs = replay.data.shape[:2]
     start_key, env_key = jax.random.split(key)
@@ -98,18 +98,18 @@ class ReplayBuffer:
     return jax.tree.map(lambda x: x.reshape(length, *shape, *x.shape[1:]), transitions)
 
   def held(self, replay: Replay) -> jax.Array:
-    """Slots in use, []: the first ones."""
+    """Returns the number of used slots, which are the first ones, []."""
     return jnp.minimum(replay.inserted, self.slots)
 
 
 def _bits(tree: PyTree) -> jax.Array:
-  """One transition as 16-bit words, [columns]: arrays rounded to bfloat16, single numbers as float32."""
+  """Encodes one transition as 16-bit words, [columns]: arrays rounded to bfloat16, single numbers as float32."""
   leaves = [x.astype(jnp.bfloat16) if x.ndim else x for x in jax.tree.leaves(tree)]
   return jnp.concatenate([jax.lax.bitcast_convert_type(x, jnp.uint16).ravel() for x in leaves])
 
 
 def _from_bits(example: PyTree, words: jax.Array) -> PyTree:
-  """The float32 transition, of the structure and shapes of `example`, that these words stand for."""
+  """Decodes words to the float32 transition, of the structure and shapes of `example`."""
   leaves, structure = jax.tree.flatten(example)
   found, start = [], 0
   for leaf in leaves:

@@ -5,7 +5,7 @@ with respect to the action. A bound on the policy's change, in KL divergence, ke
 buffer and no target network. One training step collects `unroll_length` steps of all environments and passes over them
 `num_updates_per_batch` times.
 
-Differences from the published code, each for one of its oddities: the true last observation of an episode is the next
+Differences from the published code: the true last observation of an episode is the next
 one where time cuts it; the entropy bonus of a next state ends with the episode; the divergence is the exact one of the
 Gaussians before squashing; the critic's prior is a constant.
 """
@@ -34,7 +34,7 @@ _UNROLL = 16  # steps of a λ-return that are one kernel
 
 
 class REPPOParams(struct.PyTreeNode):
-  """What is learned.
+  """The learned parameters.
 
   Attributes:
     policy: parameters of the actor.
@@ -50,9 +50,9 @@ class REPPOParams(struct.PyTreeNode):
 
 
 class Transition(struct.PyTreeNode):
-  """Steps of N environments, each [T, N, ...]: `next_obs` is what the step itself made, `valid` is 0 for a broken one.
+  """Steps of N environments, each [T, N, ...]: `next_obs` is before the auto-reset, `valid` is 0 for a non-finite step.
 
-  `target` is the critic's, `next_embedding` what its auxiliary head predicts; both are None before they are computed.
+  `target` is of the critic, `next_embedding` of its auxiliary head; both are None before they are computed.
   """
 
   obs: dict[str, jax.Array]
@@ -97,20 +97,20 @@ class HLGauss:
   """Values as distributions over bins: a Gaussian histogram (Imani and White, 2018; Farebrother et al., 2024)."""
 
   def __init__(self, low: float, high: float, bins: int):
-    """`bins` bins with centres from `low` to `high`; the Gaussian's deviation is 0.75 of a bin."""
+    """`bins` bins with centres from `low` to `high`; the Gaussian's standard deviation is 0.75 of a bin."""
     width = (high - low) / (bins - 1)
     self.low, self.high, self.deviation = low, high, 0.75 * width
     self.centres = jnp.linspace(low, high, bins)
     self.edges = jnp.linspace(low - width / 2, high + width / 2, bins + 1)
 
   def encode(self, value: jax.Array) -> jax.Array:
-    """Probabilities of the bins, [..., K], for values [...]; those outside are moved to the nearest edge."""
+    """Returns probabilities of the bins, [..., K], for values [...]; those outside are moved to the nearest edge."""
     value = jnp.clip(value, self.low, self.high)[..., None]
     below = jax.scipy.special.erf((self.edges - value) / (jnp.sqrt(2.0) * self.deviation))
     return jnp.diff(below) / (below[..., -1:] - below[..., :1])
 
   def decode(self, logits: jax.Array) -> jax.Array:
-    """Mean values, [...], of distributions with these logits, [..., K]."""
+    """Returns mean values, [...], of distributions with these logits, [..., K]."""
     return (jax.nn.softmax(logits) * self.centres).sum(axis=-1)
 
 
@@ -121,7 +121,7 @@ class REPPONetworks(Actor):
     """Builds the networks.
 
     Raises:
-      ConfigError: a task with pictures, an unknown activation, or an observation entry that the task does not have.
+      ConfigError: a task with images, an unknown activation, or an observation group that the task does not have.
     """
     sizes = env.observation_size
     refuse_pictures(sizes, "reppo")
@@ -146,7 +146,7 @@ class REPPONetworks(Actor):
       return self._critic.apply(q_params, obs[self.value_obs_key], action)  # pyright: ignore[reportReturnType]
 
   def sample(self, logits: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Actions, [..., action_size], and their log-probabilities, [...]; gradients flow through the actions."""
+    """Samples actions, [..., action_size], and their log-probabilities, [...]; gradients flow through the actions."""
     normal = self.distribution.create_dist(logits)
     raw = normal.loc + normal.scale * jax.random.normal(key, normal.loc.shape)
     return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
@@ -190,7 +190,7 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
       statistics = running_statistics.update(statistics, data.obs, pmap_axis_name=AXIS)
     data = data.replace(obs=normalize(data.obs, normalizer), next_obs=normalize(data.next_obs, normalizer))
 
-    # What the critic learns, with the parameters that collected.
+    # Targets of the critic, with the parameters before the update.
     next_action, next_log_prob = networks.sample(networks.logits(state.params.policy, data.next_obs), target_key)
     logits, next_embedding, _ = networks.q(state.params.q, data.next_obs, next_action)
     termination = data.done * (1 - data.truncation)
@@ -207,7 +207,7 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
     (actor, unravel_actor), (critic, unravel_critic) = (ravel_pytree(part) for part in _split(state.params))
 
     def update(carry: PyTree, x: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
-      """One gradient step of the critic, then one of the actor on the new critic."""
+      """Makes a gradient step of the critic, then one of the actor on the new critic."""
       (actor, critic), (actor_opt, critic_opt) = carry
       rows, key = x
       batch = jax.tree.map(lambda x: x[rows], data)
@@ -242,14 +242,14 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
 
 
 def _split(params: REPPOParams) -> tuple[tuple[PyTree, jax.Array, jax.Array], PyTree]:
-  """What the actor's optimiser changes, and what the critic's does."""
+  """Returns the parameters of the actor's optimiser, and of the critic's."""
   return (params.policy, params.log_alpha, params.log_beta), params.q
 
 
 def lambda_returns(
   reward: jax.Array, next_value: jax.Array, done: jax.Array, truncation: jax.Array, discounting: float, decay: float
 ) -> jax.Array:
-  """λ-returns, [T, N].
+  """Returns λ-returns, [T, N].
 
   Args:
     reward: with the entropy bonus, [T, N].
@@ -273,7 +273,7 @@ def lambda_returns(
 def critic_loss(
   params: PyTree, batch: Transition, networks: REPPONetworks, config: REPPOConfig
 ) -> tuple[jax.Array, jax.Array]:
-  """Cross-entropy to the targets' histograms, and the squared error in predicting the next reward and embedding.
+  """Cross-entropy to the targets' histograms, plus the squared error of the predicted reward and embedding.
 
   Args:
     params: the critic's.
@@ -306,7 +306,7 @@ def actor_loss(
   networks: REPPONetworks,
   config: REPPOConfig,
 ) -> tuple[jax.Array, jax.Array]:
-  """Soft value of the policy's own actions, or its divergence where that is too large, and the losses of multipliers.
+  """Soft value of the policy's actions, or its divergence where that is too large, plus losses of the multipliers.
 
   Args:
     params: the actor's, the logarithms of temperature and multiplier.

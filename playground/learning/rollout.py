@@ -1,4 +1,4 @@
-"""Collecting experience: an actor steps a batch of environments for a fixed number of control steps."""
+"""Collects experience: an actor steps a batch of environments for a fixed number of control steps."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -18,14 +18,14 @@ class Transitions(struct.PyTreeNode):
   """Steps of N environments.
 
   Attributes:
-    obs: observations the actions were taken on, as the task gives them, each [T, N, ...].
+    obs: observations before the actions, not normalised, each [T, N, ...].
     raw_action: actions before squashing, [T, N, action_size].
     log_prob: their log-probability under the policy that took them, [T, N].
     reward: [T, N], unscaled.
     termination: 1 where the task ended the episode, [T, N].
     truncation: 1 where the time limit cut it, [T, N].
-    final_value: the critic's value of an episode's last observation where time cut it, else 0, [T, N]; None if not
-      asked for.
+    final_value: the critic's value of an episode's last observation at the time limit, else 0, [T, N]; None without a
+      critic.
   """
 
   obs: dict[str, jax.Array]
@@ -38,7 +38,7 @@ class Transitions(struct.PyTreeNode):
 
 
 class Step(struct.PyTreeNode):
-  """A step of one environment and all that is needed to take it again, every leaf [1, ...].
+  """A step of one environment with its inputs, to replay it; every leaf [1, ...].
 
   Attributes:
     state: the environment before it.
@@ -54,12 +54,12 @@ class Step(struct.PyTreeNode):
 
 
 class NonfiniteCapture(struct.PyTreeNode):
-  """The first step of a run in which some environment's numbers went NaN, infinite or absurd, for replay.
+  """The first step of a run in which numbers of an environment were NaN, infinite or too large, for replay.
 
   Attributes:
-    found: whether there is one, [1] bool (one a device).
-    bits: the `Step` as one row of 32-bit words, [1, words]: on a GPU each array of its own would cost every step of
-      every run a copy or two.
+    found: whether a step was captured, [1] bool (one for each device).
+    bits: the `Step` as one row of 32-bit words, [1, words]: on a GPU separate arrays would cost every step one or two
+      copies each.
   """
 
   found: jax.Array
@@ -71,14 +71,14 @@ class NonfiniteCapture(struct.PyTreeNode):
     return cls(jnp.zeros(1, bool), jnp.zeros_like(bits))
 
   def on_devices(self, count: int) -> "NonfiniteCapture":
-    """The same (on the host) for another number of devices: what was found goes first."""
+    """Returns the capture (on the host) for another number of devices, a captured step first."""
     if len(self.found) == count:
       return self
     order = np.argsort(~self.found, kind="stable")[np.arange(count) % len(self.found)]
     return jax.tree.map(lambda x: x[order], self)
 
   def look(self, before: State, action: jax.Array, model: ModelFields, after: State) -> "NonfiniteCapture":
-    """Keeps the step from `before` to `after` of the first environment that it broke, if none was kept before."""
+    """Captures the step from `before` to `after` of the first non-finite environment, if none was captured before."""
     bad = after.info["nonfinite"]
     which = jnp.argmax(bad)
     take = (bad[which] > 0) & ~self.found[0]
@@ -87,7 +87,7 @@ class NonfiniteCapture(struct.PyTreeNode):
     return NonfiniteCapture(self.found | take, jnp.where(take, row, self.bits))
 
   def first(self, state: State, action_size: int, model: ModelFields) -> Step | None:
-    """The captured step on the host, or None; the arguments, or their shapes, say how to read it."""
+    """Returns the captured step on the host, or None; the arguments, or their shapes, give its structure."""
     found = np.flatnonzero(self.found)
     if not len(found):
       return None
@@ -96,19 +96,19 @@ class NonfiniteCapture(struct.PyTreeNode):
 
 
 def _example(state: State, action_size: int, model: ModelFields) -> Step:
-  """A step's structure, shapes and dtypes."""
+  """Returns a step's structure, shapes and dtypes."""
   first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
   return first(Step(state, jnp.zeros((1, action_size)), dict(model), state.info["nonfinite_state"]))
 
 
 def _to_bits(tree: PyTree) -> jax.Array:
-  """The leaves, each [N, ...], side by side: [N, words] uint32."""
+  """Concatenates the bits of the leaves, each [N, ...]: [N, words] uint32."""
   words = lambda x: jax.lax.bitcast_convert_type(x, jnp.uint32) if x.dtype.itemsize == 4 else x.astype(jnp.uint32)
   return jnp.concatenate([words(x).reshape(len(x), -1) for x in jax.tree.leaves(tree)], axis=1)
 
 
 def _from_bits(row: np.ndarray, example: PyTree) -> PyTree:
-  """One row of them, [words], as a structure with these shapes and dtypes."""
+  """Decodes one row, [words], to a structure with these shapes and dtypes."""
   leaves, structure = jax.tree.flatten(example)
   parts = np.split(row, np.cumsum([leaf.size for leaf in leaves])[:-1])
   read = lambda part, dtype: part.view(dtype) if dtype.itemsize == 4 else part.astype(dtype)
@@ -121,9 +121,9 @@ EpisodeSums = dict[str, jax.Array]
 
 
 def episode_sums(state: State) -> EpisodeSums:
-  """Sums over the batch of what ended in this step: episodes, their returns, lengths and metrics, and bad numbers.
+  """Sums over the episodes that ended in this step: number, returns, lengths, metrics, and non-finite steps.
 
-  On Warp also of the environments that needed more than its buffers hold, which drops contacts or constraints.
+  On Warp it also counts environments that overflow its buffers, which drops contacts or constraints.
   """
   ended = state.info["episode_done"]
   sums = {f"episode_{name}": (ended * total).sum() for name, total in state.info["episode_metrics"].items()}
@@ -136,11 +136,11 @@ class Environments(struct.PyTreeNode):
   """A device's share of the environments during one training step.
 
   Attributes:
-    state: the present state, a batch.
-    capture: the first step that went NaN, infinite or absurd.
+    state: the current batch of states.
+    capture: the first non-finite step.
     model: randomised model fields.
-    sums: what ended in this training step so far, see `episode_sums`; {} before its first step.
-    env: what is stepped.
+    sums: over the episodes that ended in this training step, see `episode_sums`; {} before its first step.
+    env: the task.
   """
 
   state: State
@@ -153,7 +153,7 @@ class Environments(struct.PyTreeNode):
     """Steps each environment once.
 
     Returns:
-      The environments after it, and the observation that the step itself made: where an episode ended, its last.
+      The new environments, and the observation before the auto-reset: where an episode ended, its last.
     """
     after = AutoReset(self.env.env, self.env.full_reset, keep_final_obs=True).step(self.state, action, self.model)
     info = dict(after.info)
@@ -165,7 +165,7 @@ class Environments(struct.PyTreeNode):
   def scan(
     self, step: Callable[["Environments", jax.Array], tuple["Environments", T]], keys: jax.Array
   ) -> tuple["Environments", T]:
-    """Does `step(envs, key)` for one key after the other; returns the environments and what it returned, stacked."""
+    """Scans `step(envs, key)` over keys; returns the environments and the stacked outputs."""
 
     def body(
       carry: tuple[State, NonfiniteCapture], key: jax.Array
@@ -192,8 +192,8 @@ def unroll(
 ) -> tuple[Environments, Transitions]:
   """Steps the environments `length` times with sampled actions.
 
-  With the critic's `value` of normalised observations it values the last observation of every episode that time cuts,
-  in the steps in which it cuts any.
+  With the critic's `value` of normalised observations, it evaluates the last observation of every episode that ends at
+  the time limit, in steps where any does.
   """
 
   def step(envs: Environments, key: jax.Array) -> tuple[Environments, Transitions]:
@@ -221,5 +221,5 @@ def unroll(
 
 
 def side_by_side(x: jax.Array) -> jax.Array:
-  """Stacked trajectories [K, T, N, ...] as [T, K * N, ...]."""
+  """Reshapes stacked trajectories [K, T, N, ...] to [T, K * N, ...]."""
   return x.swapaxes(0, 1).reshape(x.shape[1], -1, *x.shape[3:])

@@ -38,7 +38,7 @@ class SAC(OffPolicy[SACConfig, SoftActorCritic]):
   def learn(self, start: Learned, batches: Transition, key: jax.Array, step: jax.Array) -> tuple[Learned, jax.Array]:
     """Makes gradient steps, one for each batch.
 
-    Parameters travel as one vector: a kernel for each array costs far more.
+    Parameters are one vector: a kernel for each array costs far more.
     """
     params, target_q, opt_state = start
     (flat, unravel), (flat_target, unravel_target) = ravel_pytree(params), ravel_pytree(target_q)
@@ -50,7 +50,7 @@ class SAC(OffPolicy[SACConfig, SoftActorCritic]):
     rates = ravel_pytree(jax.tree.map(jnp.full_like, params, rates))[0]
 
     def update(carry: tuple[PyTree, PyTree, PyTree], x: tuple[Transition, jax.Array]) -> tuple[PyTree, jax.Array]:
-      """One gradient step for critics, actor and temperature, and one of the target critics after them."""
+      """Makes one gradient step for critics, actor and temperature, then updates the target critics."""
       params, target, opt_state = carry
       grads, parts = jax.grad(sac_loss, has_aux=True)(
         unravel(params), unravel_target(target), *x, self.networks, config
@@ -60,7 +60,7 @@ class SAC(OffPolicy[SACConfig, SoftActorCritic]):
       step, new_opt_state = self.optimizer.update(grads, opt_state)
       new_params = params - rates * cast(jax.Array, step)
       new_target = target + config.tau * (new_params[: target.size] - target)  # the critics come first
-      finite = jnp.isfinite(norm)  # a bad gradient is counted and left out
+      finite = jnp.isfinite(norm)  # a non-finite gradient is counted and skipped
       carry = jax.tree.map(lambda n, o: jnp.where(finite, n, o), (new_params, new_target, new_opt_state), carry)
       parts = jnp.where(finite, jnp.append(parts, norm), 0.0)
       return carry, jnp.append(parts, 1.0 - finite)
@@ -83,7 +83,7 @@ def sac_loss(
   both its own loss and the temperature's.
 
   Args:
-    params: what is learned.
+    params: of critics, actor and temperature.
     target_q: the target critics' parameters.
     batch: normalised transitions.
     noise: standard normal draws for the actions on `obs` and on `next_obs`, [2, B, action_size].

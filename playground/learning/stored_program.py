@@ -1,4 +1,4 @@
-"""Lowered functions on disk: a later start traces nothing, and XLA finds what it compiled of them in JAX's cache."""
+"""Stores lowered functions on disk: a later start traces nothing, and finds their executables in JAX's cache."""
 
 import dataclasses
 import hashlib
@@ -19,11 +19,11 @@ from playground.files import replacing
 from playground.pytree import PyTree
 from playground.text import first_line
 
-KEPT = 64  # programs in a folder: those that were used last
+KEPT = 64  # programs in a folder: the last used ones
 
 
 class UnusableProgramError(Exception):
-  """A file is not what was written, or JAX does not take it."""
+  """A file is damaged, or JAX refuses it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ class LoweredFunction:
     """Lowers a function that was traced with `args`.
 
     Raises:
-      ValueError, NotImplementedError: it calls code that JAX does not promise to find again.
+      ValueError, NotImplementedError: it calls code that JAX does not serialise.
     """
     exported = export.export(function)(*args)
     flat = lambda leaves: tuple(0 for _ in leaves)
@@ -61,7 +61,7 @@ class LoweredFunction:
     return cls(bytes(module), exported.in_tree, exported.out_tree, donated)
 
   def compile(self, mesh: Mesh) -> Compiled:
-    """Compiles it for the devices that it was lowered for."""
+    """Compiles the function for the devices that it was lowered for."""
     exported = export.deserialize(bytearray(self.module))
     args, _ = self.in_tree.unflatten([jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in exported.in_avals])
     shardings, _ = self.in_tree.unflatten(exported.in_shardings_jax(mesh))
@@ -69,7 +69,7 @@ class LoweredFunction:
     def call(*args: PyTree) -> PyTree:
       return self.out_tree.unflatten(exported.call(*jax.tree.leaves(args)))
 
-    call.__name__ = exported.fun_name  # as XLA and the profiler call it
+    call.__name__ = exported.fun_name  # its name in XLA and the profiler
     jitted = jax.jit(
       call,
       in_shardings=shardings,
@@ -81,7 +81,7 @@ class LoweredFunction:
 
 @dataclasses.dataclass(frozen=True)
 class StoredProgram:
-  """The lowered functions of one program, by name, in a file that is named by the hash of all that shapes them.
+  """The lowered functions of one program, by name, in a file named by the hash of everything that determines them.
 
   Nothing is read from a folder that others may write to.
 
@@ -105,12 +105,12 @@ class StoredProgram:
         raise UnusableProgramError("it is damaged")
       functions = pickle.loads(zlib.decompress(content[32:]))
       os.utime(self.path)
-    except Exception as error:  # whatever it is, tracing does without
+    except Exception as error:  # any error: tracing replaces the file
       raise self.discard(error) from error
     return functions
 
   def discard(self, error: Exception) -> UnusableProgramError:
-    """Removes the file; returns the error that says so."""
+    """Removes the file; returns an error with the reason."""
     self.path.unlink(missing_ok=True)
     return UnusableProgramError(f"The stored program {self.path} was removed: {first_line(error)}. Tracing anew.")
 
@@ -129,6 +129,6 @@ class StoredProgram:
 
 
 def _is_private(folder: Path) -> bool:
-  """Whether nobody but this user can have written what is in a folder."""
+  """Whether only this user can write to a folder."""
   found = folder.stat()
   return found.st_uid == os.geteuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

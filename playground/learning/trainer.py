@@ -1,4 +1,4 @@
-"""What is the same for all algorithms: the training state, its division over devices, training steps, checkpoints."""
+"""Trains any algorithm: the training state, its sharding over devices, training steps, checkpoints."""
 
 from collections.abc import Mapping, Sequence
 
@@ -25,17 +25,17 @@ from playground.settings import below
 
 
 class TrainState(struct.PyTreeNode):
-  """All that training goes on from: a run restored from it ends with the same parameters, bit for bit.
+  """The complete training state: a run restored from it ends with the same parameters, bit for bit.
 
   `env_state`, `capture` and `replay` are divided over the devices; the rest is the same on all of them.
 
   Attributes:
-    algorithm: what is learned, its `replay` left out.
-    replay: experience, None without a replay buffer.
+    algorithm: the learned state, without its `replay`.
+    replay: the replay buffer's content, or None.
     key: of the next training step.
     env_state: a batch.
-    capture: the first step with a number that is not finite.
-    settings: of `trainer_settings`; a checkpoint notes them as plain numbers.
+    capture: the first non-finite step.
+    settings: of `trainer_settings`; a checkpoint stores them as plain numbers.
   """
 
   algorithm: AlgorithmState
@@ -68,15 +68,15 @@ class Trainer:
   training steps; `join` and `agent` put it there and take it away.
 
   Attributes:
-    algorithm: what is trained.
-    env: the task as a batch that resets itself.
+    algorithm: the algorithm.
+    env: the task as a batch with auto-reset.
     steps_per_update: environment steps of one training step, over all devices.
     settings: the values of the settings that the programs take as arguments, by name.
     init: (key, model fields, policy or None, settings) -> state of a new run.
-    train: (state, model fields, number of training steps) -> (state, metrics); takes the state's buffers over.
-    reset: (state, key, model fields) -> state with all environments reset, but for what outlasts a full reset; takes
-      the state's buffers over.
-    copy: (state) -> state in buffers of its own, as a checkpoint needs it.
+    train: (state, model fields, number of training steps) -> (state, metrics); donates the state's buffers.
+    reset: (state, key, model fields) -> state with all environments reset, except entries that outlast a full reset;
+      donates the state's buffers.
+    copy: (state) -> state in new buffers, for a checkpoint.
   """
 
   def __init__(
@@ -97,7 +97,7 @@ class Trainer:
       agents: the settings of each of several agents (`trainer_settings`), in place of those of `config` and `env`.
 
     Raises:
-      ConfigError: sizes that do not go together or do not divide over the devices, or networks that do not fit the
+      ConfigError: sizes that do not fit each other or do not divide over the devices, or networks that do not fit the
         task.
     """
     self.num_agents = len(agents)
@@ -125,7 +125,7 @@ class Trainer:
     )
 
   def join(self, parts: Sequence[PyTree]) -> PyTree:
-    """Puts the trees of all agents, a tree each, into one; that of a single agent stays as it is."""
+    """Stacks the trees of all agents into one; that of a single agent stays unchanged."""
     on_host = lambda x: isinstance(x, np.ndarray | np.generic)
     stack = lambda *x: np.stack(x) if on_host(x[0]) else jnp.stack(x)
     return jax.tree.map(stack, *parts) if self.num_agents else parts[0]
@@ -145,7 +145,7 @@ class Trainer:
     return self.shapes(jax.eval_shape(self.init, key, model, None, self.settings))
 
   def policy(self, state: TrainState) -> Policy:
-    """Returns what acting needs, and what a new run can start from."""
+    """Returns the policy, which can act and start a new run."""
     return self.algorithm.policy(state.algorithm)
 
   def policy_shape(self) -> Policy:
@@ -157,10 +157,10 @@ class Trainer:
     return put(policy, self.mesh, P())
 
   def notices(self) -> list[str]:
-    """Returns what a user should know before the state is allocated.
+    """Returns notices for the user before the state is allocated.
 
     Raises:
-      ConfigError: it does not fit the devices.
+      ConfigError: the state does not fit the devices.
     """
     buffer = self._buffer
     if buffer is None:
@@ -193,11 +193,11 @@ class Trainer:
     """Reads a training state.
 
     Args:
-      checkpoint: where from.
+      checkpoint: to read from.
       template: the state's structure, shapes and dtypes.
 
     Returns:
-      The state, on the host, and a sentence for the user on what it is.
+      The state, on the host, and a sentence for the user.
 
     Raises:
       CheckpointError: damaged, or made for other shapes.
@@ -224,12 +224,12 @@ class Trainer:
     return put(state.replace(settings=self.settings), self.mesh, self._spec)
 
   def inherit(self, state: TrainState, parents: np.ndarray, settings: Settings) -> TrainState:
-    """Returns a state of several agents in which each has what another one has learned.
+    """Returns a state of several agents in which each has the learned state of its parent.
 
     Args:
       state: of all agents.
-      parents: whose parameters, statistics and optimiser each agent gets, [agents]. Its environments, random key and
-        experience stay its own.
+      parents: index of the agent whose parameters, statistics and optimiser each agent gets, [agents]. Its
+        environments, random key and replay buffer stay its own.
       settings: host arrays of all agents.
     """
     algorithm = take_agents(state.algorithm, parents, self.mesh, P())
@@ -238,7 +238,7 @@ class Trainer:
   def _restore_replay(
     self, checkpoint: Checkpoint, template: TrainState, replay: Replay | None
   ) -> tuple[Replay | None, str]:
-    """Returns the replay buffer, empty if the checkpoint has none, and what the user is told of the state."""
+    """Returns the replay buffer, empty if the checkpoint has none, and the sentence for the user."""
     whole = "the whole training state"
     if self._buffer is None or template.replay is None or replay is None:
       return None, whole
@@ -253,7 +253,7 @@ class Trainer:
     return empty, f"the training state without its replay buffer ({refill})"
 
   def _saved(self, state: PyTree) -> PyTree:
-    """Returns what a checkpoint needs of a state, or of its specs."""
+    """Returns the saved part of a state, or of its specs."""
     return self._without_data(state) if self._buffer and not self._buffer.saved else state
 
   def _without_data(self, state: PyTree) -> PyTree:
