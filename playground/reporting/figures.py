@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 COLOURS = ("#2f6db5", "#d1762f", "#5a9e57", "#b5479a", "#8a6d3b", "#777777")
 Points = Sequence[tuple[float, float]]
+_LEGEND = 30  # lines of names in a panel
 
 
 class Curve(NamedTuple):
@@ -67,28 +68,30 @@ def lines(title: str, series: Mapping[str, Points], x: str, y: str, log: bool = 
 
 
 def curves(panels: Mapping[str, Mapping[str, Curve]], x: str, y: str, kind: str = "svg") -> bytes:
-  """Curves in small panels, as SVG or PNG; panels of more than 30 curves have no legend."""
+  """Curves in small panels, as SVG or PNG; panels of more than 30 lines of names have no legend."""
   columns = min(4, len(panels))
   rows = math.ceil(len(panels) / columns)
+  counts = {title: sum(len(_wrapped(name).splitlines()) for name in group) for title, group in panels.items()}
+  row = max([2.2, *(0.5 + 0.13 * count for count in counts.values() if count <= _LEGEND)])
 
   def draw(figure: "Figure") -> None:
     cells = figure.subplots(rows, columns, squeeze=False).flat
     for (title, group), axes in zip(panels.items(), cells, strict=False):
       for colour, (name, curve) in zip(COLOURS * len(group), group.items(), strict=False):
-        axes.plot(curve.x, curve.y, label=name, color=colour, marker="o" if len(curve.x) == 1 else "")
+        axes.plot(curve.x, curve.y, label=_wrapped(name), color=colour, marker="o" if len(curve.x) == 1 else "")
         if curve.half_width is not None:
           low, high = zip(*((m - h, m + h) for m, h in zip(curve.y, curve.half_width, strict=True)), strict=True)
           axes.fill_between(curve.x, low, high, color=colour, alpha=0.2, linewidth=0)
-      axes.set_title(title, fontsize=9)
+      axes.set_title(_wrapped(title), fontsize=9)
       axes.grid(alpha=0.3)
-      if len(group) <= 30:
-        axes.legend(frameon=False, fontsize=7)
+      if counts[title] <= _LEGEND:
+        axes.legend(frameon=False, fontsize=7).set_in_layout(False)  # else a long name leaves no room for the axes
     for axes in list(cells):
       axes.set_axis_off()
     figure.supxlabel(x)
     figure.supylabel(y)
 
-  return _figure((2.9 * columns, 2.2 * rows + 0.4), draw, kind)
+  return _figure((2.9 * columns, row * rows + 0.4), draw, kind)
 
 
 def bars(title: str, groups: Mapping[str, Mapping[str, float]], x: str) -> str:
@@ -100,11 +103,11 @@ def bars(title: str, groups: Mapping[str, Mapping[str, float]], x: str) -> str:
     height = 0.8 / len(names)
     for i, name in enumerate(names):
       at = [row + i * height for row, group in enumerate(groups.values()) if name in group]
-      axes.barh(at, [g[name] for g in groups.values() if name in g], height, label=name, color=COLOURS[i % 6])
+      axes.barh(at, [g[name] for g in groups.values() if name in g], height, label=_wrapped(name), color=COLOURS[i % 6])
     axes.set_yticks([row + 0.4 - height / 2 for row in range(len(groups))], list(map(_wrapped, groups)))
     axes.invert_yaxis()
     axes.set(title=title, xlabel=x)
-    axes.legend(frameon=False)
+    axes.legend(frameon=False).set_in_layout(False)
 
   return _svg((7, 0.9 + _height(groups, 0.55)), draw)
 

@@ -15,6 +15,9 @@ def test_a_long_setting_leaves_room_for_the_drawing():
     figures.bars("a", {name: {"fixed": 1.0, "scaled": 2.0}}, "x"),
     figures.stacked("a", {name: {"physics": 0.5, "update": 0.5}}, "x"),
   ]
+  drawings.append(
+    figures.curves({name: {f"{name} {i}": figures.Curve([0, 1], [0, 1]) for i in range(4)}}, "x", "y").decode()
+  )
   assert all("<svg" in drawing for drawing in drawings)
 
 
