@@ -148,6 +148,7 @@ def test_plots(watch: Watch, session: Session) -> None:
     plots.choice.value = choice
     session.carry_out()
     assert plots.charts == {} if titles is None else titles in plots.charts
+    assert {chart._impl.parent_container_id for chart in plots.charts.values()} <= {plots._tab._id}
     session.advance(0.1)
     plots.draw()
     if choice == "Observations: state":

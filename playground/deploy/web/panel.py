@@ -74,8 +74,7 @@ class Panel:
       self._add_choices()
     self.view = View(server, session, tabs.add_tab("Scene"))
     self._add_key("Next camera", "C", lambda: self.view.next_camera())
-    with tabs.add_tab("Plots"):
-      self.plots = Plots(self._gui, session)
+    self.plots = Plots(self._gui, session, tabs.add_tab("Plots"))
     with tabs.add_tab("Joints"):
       self.joints = Joints(self._gui, session)
     with tabs.add_tab("Keys"):

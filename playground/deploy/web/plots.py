@@ -29,11 +29,12 @@ class Plots:
     charts: by title.
   """
 
-  def __init__(self, gui: viser.GuiApi, session: Session):
-    """Adds the menu, and the charts of the reward."""
-    self._gui, self._session = gui, session
+  def __init__(self, gui: viser.GuiApi, session: Session, tab: viser.GuiTabHandle):
+    """Adds the menu, and the charts of the reward, to `tab`."""
+    self._gui, self._session, self._tab = gui, session, tab
     groups = [f"{_OBSERVATIONS}: {group}" for group in _groups(session.player)]
-    self.choice = gui.add_dropdown("Plot", (_REWARDS, *groups, _ACTIONS, _NOTHING))
+    with tab:
+      self.choice = gui.add_dropdown("Plot", (_REWARDS, *groups, _ACTIONS, _NOTHING))
     self.choice.on_update(lambda _: session.ask(self._choose))
     self.charts: dict[str, viser.GuiUplotHandle] = {}
     self._choose()
@@ -56,7 +57,8 @@ class Plots:
       chart.remove()
     self._sizes, self._values = _quantities(self.choice.value, self._session.player)
     self._rows: deque[np.ndarray] = deque(maxlen=round(_SECONDS / self._session.player.period))
-    self.charts = {title: self._add_chart(title, size) for title, size in self._sizes.items()}
+    with self._tab:
+      self.charts = {title: self._add_chart(title, size) for title, size in self._sizes.items()}
 
   def _record(self, player: Player) -> None:
     """Notes the state after a policy step."""
