@@ -1,4 +1,4 @@
-"""What a controller must know to run a policy: `policy.yaml`."""
+"""Writes and checks the contract that a controller needs to run a policy: `policy.yaml`."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -17,7 +17,7 @@ from playground.settings import plain
 from playground.text import first_docstring_line
 
 FORMAT = "playground-policy/3"
-Contract = dict[str, Any]  # what YAML has of it, and of the `env` section in it
+Contract = dict[str, Any]  # types of the YAML file, and of its section `env`
 
 _VALUES = {
   "rgb": "red, green and blue, 0 to 255",
@@ -37,18 +37,18 @@ def describe_policy(
   inputs: Mapping[str, tuple[int, ...]],
   state: State,
 ) -> Contract:
-  """Writes the contract down.
+  """Returns the contract of a policy.
 
   Args:
     env: the task.
     env_config: its resolved `env` section.
     task: its name.
     origin: where the policy comes from: run, step, commit.
-    inputs: shapes of the entries of the task's observation that the actor reads.
-    state: any state of one environment, to try the action's law on.
+    inputs: shapes of the observation groups that the actor reads.
+    state: any state of one environment, to test how actions become `ctrl`.
 
   Returns:
-    What YAML knows, in the order to be read in.
+    Plain values, in the order of the file.
   """
   names = input_names(inputs)
   vectors = [entry for entry in inputs if not entry.startswith(PIXELS)]
@@ -86,10 +86,10 @@ def describe_policy(
 
 
 def check_contract(contract: Contract) -> None:
-  """Checks what is read of a contract, which anybody may have written or changed: the types and what they must hold.
+  """Checks the entries of a contract, which may have been written or changed by others: types and values.
 
   Raises:
-    CheckpointError: an entry that is missing or cannot be.
+    CheckpointError: an entry that is missing or invalid.
   """
   _check(contract, "task", lambda x: isinstance(x, str), "a task's name")
   _check(contract, "env", lambda x: isinstance(x, Mapping) and _names(x), "a mapping")
@@ -121,7 +121,7 @@ def check_contract(contract: Contract) -> None:
 def _check(
   node: object, key: str, holds: Callable[[Any], object], what: str, at: str = "", optional: bool = False
 ) -> None:
-  """Raises CheckpointError unless the value of a dotted key is as it must be."""
+  """Raises CheckpointError if the value of a dotted key is invalid."""
   parent, name = None, ""
   for name in key.split("."):
     parent, node = node, node.get(name) if isinstance(node, Mapping) else None
@@ -144,9 +144,9 @@ def _is_number(value: object) -> bool:
 
 
 def _observation(env: Env, group: str) -> list[dict[str, object]]:
-  """Each term of an observation group in its order: name, where it begins, its length, and what a controller must know.
+  """Returns each term of an observation group in order: name, start, length, and its options.
 
-  `scale` multiplies the term; `noise` (with the noise level in it), `delay` and `history` are there where the task has
+  `scale` multiplies the term; `noise` (with the noise level in it), `delay` and `history` are present if the task has
   them; `what` is the first line of the docstring of the term's function.
   """
   observations = getattr(env.unwrapped, "observations", None)
@@ -165,7 +165,7 @@ def _observation(env: Env, group: str) -> list[dict[str, object]]:
 
 
 def _options(options: ObservationOptions, noise_level: float) -> dict[str, object]:
-  """Scale, clip, noise, delay and history of an observation term; None where it has none."""
+  """Returns scale, clip, noise, delay and history of an observation term; None for a missing one."""
   noise = dict(options.noise or {})
   for kind in {"uniform", "gaussian"} & set(noise):
     noise[kind] = (noise_level * np.asarray(noise[kind])).tolist()
@@ -179,14 +179,14 @@ def _options(options: ObservationOptions, noise_level: float) -> dict[str, objec
 
 
 def _commands(config: Contract) -> Contract:
-  """Parameters of the commands `velocity` (as `command`) and `gait`, where the task has them."""
+  """Returns the parameters of the commands `velocity` (as `command`) and `gait`, if the task has them."""
   terms = config.get("commands") or {}
   found = {key: (terms.get(name) or {}).get("params") for key, name in (("command", "velocity"), ("gait", "gait"))}
   return {key: params for key, params in found.items() if params}
 
 
 def _camera(env: Env, entry: str) -> dict[str, object]:
-  """What `env.vision` shows: the channels in their order, what a value says, and where the camera is."""
+  """Returns the images of `env.vision`: channels in order, meaning of values, pose of the camera."""
   vision = env.config.vision
   camera = env.mj_model.camera(vision.camera)
   return {
@@ -204,7 +204,7 @@ def _camera(env: Env, entry: str) -> dict[str, object]:
 
 
 def _delays(config: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-  """The delays that the task simulates, by dotted key."""
+  """Returns the delays that the task simulates, by dotted key."""
   for key, value in config.items():
     if key in OPTIONS:  # an observation term's delay is in its row
       continue
@@ -215,7 +215,7 @@ def _delays(config: Mapping[str, object], prefix: str = "") -> Iterator[tuple[st
 
 
 def _action(env: Env, config: Contract, state: State) -> dict[str, object]:
-  """How an action becomes `ctrl`: base + scale * action, where the task's own `action_to_ctrl` agrees."""
+  """Returns how an action becomes `ctrl`: base + scale * action, if the task's `action_to_ctrl` computes that."""
   base = config.get("action_base", "last_target" if "action_scale" in config else "zero")
   scale = np.asarray(config.get("action_scale", 1.0))
   control = lambda action: np.asarray(env.action_to_ctrl(state, jnp.asarray(action)))
@@ -233,7 +233,7 @@ def _action(env: Env, config: Contract, state: State) -> dict[str, object]:
 
 
 def _home(mj_model: mujoco.MjModel, config: Contract) -> tuple[str, np.ndarray]:
-  """The configuration that poses are told from, and what it is called."""
+  """Returns the reference pose and its name."""
   keyframes = [mj_model.key(i).name for i in range(mj_model.nkey)]
   if not keyframes:
     return "qpos0", mj_model.qpos0
@@ -243,9 +243,9 @@ def _home(mj_model: mujoco.MjModel, config: Contract) -> tuple[str, np.ndarray]:
 
 
 def _actuators(mj_model: mujoco.MjModel, home: tuple[str, np.ndarray]) -> list[dict[str, object]]:
-  """Each actuator in the order of the actions, with its joint where it has one.
+  """Returns each actuator in the order of the actions, with its joint if it has one.
 
-  A position servo's force is kp * (ctrl - q) - kv * qd; the joint's own damping comes on top.
+  A position servo's force is kp * (ctrl - q) - kv * qd; the joint's own damping is added.
   """
   rows = []
   for i in range(mj_model.nu):

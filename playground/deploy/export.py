@@ -1,4 +1,4 @@
-"""`playground export <run>`: writes `policy.onnx` and `policy.yaml`, if they compute what was trained."""
+"""`playground export <run>`: writes `policy.onnx` and `policy.yaml` if they match the trained policy."""
 
 import os
 from collections.abc import Mapping
@@ -15,18 +15,18 @@ from playground.errors import PlaygroundError
 from playground.extras import need
 from playground.files import need_folder, replacing, write_text
 
-TOLERANCE = 1e-5  # of an action, against the trained policy's
+TOLERANCE = 1e-5  # largest difference of an action from the trained policy's
 _ENVS, _DECISIONS = 8, 125  # 1000 observations
 
 
 class ParityError(PlaygroundError):
-  """An exported policy that acts otherwise than the trained one."""
+  """The actions of an exported policy differ from those of the trained one."""
 
 
 def export_run(path: str, *, out: str | None = None, console: Console | None = None) -> int:
   """Exports a run's newest checkpoint, or the one given.
 
-  The exported policy acts on 1000 observations that the trained one made in C MuJoCo, and must do the same.
+  The exported policy must give the same actions on 1000 observations of the trained one in C MuJoCo.
 
   Args:
     path: a run directory, or one of its checkpoints.
@@ -37,8 +37,8 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
     The exit code, 0.
 
   Raises:
-    ParityError: the exported policy acts otherwise; nothing is written.
-    PlaygroundError: no such run or checkpoint, or one that cannot be exported, or no folder that can be written to.
+    ParityError: its actions differ; nothing is written.
+    PlaygroundError: no such run or checkpoint, a policy without an ONNX form, or a folder that is not writable.
   """
   console = console or Console()
   need("deploy", "onnx", "onnxruntime")

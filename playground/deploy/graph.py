@@ -1,4 +1,4 @@
-"""A trained actor as an ONNX graph: normalise, the layers, the first half of the output, tanh (or all, clipped)."""
+"""A trained actor as an ONNX graph: normalisation, layers, the first half of the output, tanh (or all, clipped)."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -14,14 +14,14 @@ from playground.learning.cnn import CNNConfig, cnn_name
 from playground.pytree import PyTree
 
 INPUT, OUTPUT = "obs", "continuous_actions"
-# Old enough for the runtimes on robots' computers; the first that has LayerNormalization.
+# Old enough for runtimes on robots; the first opset with LayerNormalization.
 OPSET, IR_VERSION = 17, 8
 
 _LAYER_NORM_EPSILON = 1e-6  # Flax's default
 
 
 def input_names(entries: Collection[str]) -> dict[str, str]:
-  """What the graph calls the entries of an observation that an actor reads: `obs` the vector, or all there is."""
+  """Returns the graph's names of the observation groups that an actor reads; `obs` is the vector."""
   alone = len(entries) == 1
   names = {entry: re.sub(r"[^A-Za-z0-9_]", "_", entry) for entry in entries}
   return {entry: name if entry.startswith(PIXELS) and not alone else INPUT for entry, name in names.items()}
@@ -41,18 +41,18 @@ def policy_graph(
     params: of the actor, as Flax has them: of its MLP `hidden_<i>` with `kernel` [in, out] and `bias` [out], where its
       layers are normalised `LayerNorm_<i>` with `scale` and `bias`; of an actor that sees, `output` is the last layer,
       and for each camera there are the layers of its CNN.
-    inputs: shapes of the observation's entries that it reads, in its order: pictures, then the vector.
+    inputs: shapes of the observation groups that it reads, in its order: images, then the vector.
     activation: of the hidden layers, as in `agent.network.activation`.
-    normalization: mean and deviation of the vector, [n] each; None if the actor sees it as it is.
-    cnn: what is done with pictures, if there are any.
-    obs_limit: what the vector is clipped to after that; None without a limit.
+    normalization: mean and std of the vector, [n] each; None without normalisation.
+    cnn: settings of the CNN, if there are images.
+    obs_limit: clip range of the normalised vector; None without a limit.
 
   Returns:
-    The model: `obs` float32 [1, n], and pictures uint8 [1, H, W, C] (`input_names`) -> `continuous_actions` float32
+    The model: `obs` float32 [1, n], and images uint8 [1, H, W, C] (`input_names`) -> `continuous_actions` float32
     [1, action_size] in [-1, 1].
 
   Raises:
-    ConfigError: the actor has other layers.
+    ConfigError: the actor has unknown layers.
   """
   pictures = [entry for entry in inputs if entry.startswith(PIXELS)]
   hidden = sum(name.startswith("hidden_") for name in params)
@@ -81,7 +81,7 @@ def policy_graph(
   for i, name in enumerate(layers):
     kernel, bias = np.asarray(params[name]["kernel"]), np.asarray(params[name]["bias"])
     last = i == len(layers) - 1
-    if last:  # mean and deviation of the actions before they are squashed: the mean is the mode
+    if last:  # mean and std of the actions before squashing: the mean is the mode
       size = len(bias) // 2
       kernel, bias = kernel[:, :size], bias[:size]
     graph.apply("Gemm", graph.constant(kernel), graph.constant(bias))

@@ -1,4 +1,4 @@
-"""What somebody who watches a policy can choose from: the checkpoints of a run, or of all stages of a chain."""
+"""The checkpoints that the viewer offers: those of a run, or of all stages of a chain."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,38 +16,38 @@ _MEANING = {"env": (*_ENV, *_CONTROL), "agent": ("name", "network", "normalize_o
 class Menu:
   """The checkpoints that lie on disk, as training adds and removes them.
 
-  A stage of a chain is left out, with a sentence, if its policies cannot take the place of the newest stage's.
+  A stage of a chain is left out, with a sentence, if its policies do not fit the task of the newest stage.
 
   Attributes:
-    trained: the checkpoint to begin with.
+    trained: the first checkpoint.
   """
 
   def __init__(self, folder: Path, trained: LoadedPolicy, say: Callable[[str], object]):
-    """Takes the absolute folder of a run or a chain, a checkpoint of its last stage, and who shows a sentence."""
+    """Takes the absolute folder of a run or chain, a checkpoint of its last stage, and a function to notify."""
     self.trained = trained
     self._folder, self._say = folder, say
     self._fits = {trained.run_dir.path: True}
 
   def checkpoints(self, acting: Path | None = None) -> list[Path]:
-    """All there are, newest last, and the one that acts, though it be gone."""
+    """Returns all checkpoints, newest last, and the current one, even if it was removed."""
     here = lambda stage: {acting} if acting is not None and acting.parents[1] == stage else set()
     return [path for stage in self._stages() for path in sorted({*find_checkpoints(stage), *here(stage)})]
 
   def best(self) -> Path | None:
-    """The one with the highest return of the last stage; None if there is none that has a return."""
+    """Returns the checkpoint with the highest return of the last stage; None without a return."""
     try:
       return find_checkpoints(self._stages()[-1] / "checkpoints" / BEST)[0]
     except CheckpointError:
       return None
 
   def label(self, path: Path) -> str:
-    """Control steps trained, in a chain behind the stage's name."""
+    """Returns the label of a checkpoint: trained control steps, in a chain after the stage's name."""
     stage = path.parents[1]
     name = "" if stage == self._folder else f"{stage.name.partition('_')[2]} "
     return f"{name}{int(path.name):,}"
 
   def _stages(self) -> list[Path]:
-    """The run, or the chain's stages to choose from, the last one last."""
+    """Returns the run, or the chain's stages in order."""
     if self._folder == self.trained.run_dir.path:
       return [self._folder]
     stages = find_stages(self._folder)
@@ -59,7 +59,7 @@ class Menu:
     return [stage for stage in stages if self._fits[stage]]
 
   def _misfit(self, stage: Path) -> str:
-    """Why a stage's policies cannot act here, "" if they can."""
+    """Returns why a stage's policies do not fit the task, "" if they fit."""
     try:
       theirs = self.trained.at(find_checkpoints(stage)[0]).run_dir.config
     except CheckpointError as error:

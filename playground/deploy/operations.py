@@ -1,4 +1,4 @@
-"""What a trained actor is made of, as ONNX operations: activations, and the CNN that a camera's pictures go through."""
+"""ONNX operations of a trained actor: activations, and the CNN for images of a camera."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,7 +13,7 @@ from playground.pytree import PyTree
 
 
 class Chain:
-  """Appends nodes to a chain of operations, each of which takes the value of the one before."""
+  """Appends nodes to a chain of operations; each takes the output of the previous one."""
 
   def __init__(self):
     self.value = ""
@@ -27,7 +27,7 @@ class Chain:
     return name
 
   def apply(self, op: str, *others: str, **attributes: Any) -> None:
-    """Applies an operation to the present value and others; what comes out is the present value."""
+    """Applies an operation to the current value and others; its output becomes the current value."""
     output = f"value_{len(self.nodes)}"
     self.nodes.append(helper.make_node(op, [self.value, *others], [output], **attributes))
     self.value = output
@@ -40,7 +40,7 @@ def _swish(graph: Chain) -> None:
 
 
 def _gelu(graph: Chain) -> None:
-  """As Flax computes it, with tanh: x / 2 * (1 + tanh(sqrt(2 / pi) * (x + 0.044715 x^3)))."""
+  """GELU as in Flax, with tanh: x / 2 * (1 + tanh(sqrt(2 / pi) * (x + 0.044715 x^3)))."""
   x = graph.value
   graph.apply("Pow", graph.constant(3.0))
   graph.apply("Mul", graph.constant(0.044715))
@@ -62,7 +62,7 @@ ACTIVATIONS: dict[str, Callable[[Chain], None]] = {
 
 
 def _all_features(graph: Chain, _: list[int]) -> None:
-  graph.apply("Transpose", perm=[0, 2, 3, 1])  # Flax counts channels last
+  graph.apply("Transpose", perm=[0, 2, 3, 1])  # Flax has channels last
   graph.apply("Flatten")
 
 
@@ -82,7 +82,7 @@ def _expected_places(graph: Chain, size: list[int]) -> None:
   graph.apply("Flatten", axis=0)
 
 
-# From the last layer, [1, C, H, W] of a size (H, W), to features [1, F].
+# From the last layer, [1, C, H, W] of size (H, W), to features [1, F].
 _POOLS: dict[str, Callable[[Chain, list[int]], None]] = {
   "none": _all_features,
   "avg": _pooled("GlobalAveragePool"),
@@ -92,10 +92,10 @@ _POOLS: dict[str, Callable[[Chain, list[int]], None]] = {
 
 
 def _normalize_channels(graph: Chain) -> None:
-  """Each channel to mean 0 and deviation 1.
+  """Normalises each channel to mean 0 and std 1.
 
-  Step by step, and by the means of rows' means: ONNX Runtime's InstanceNormalization subtracts the mean last, and sums
-  of a whole picture lose digits, both too many for a policy of steep actions.
+  It works in steps, with means of rows' means: ONNX Runtime's InstanceNormalization subtracts the mean last, and sums
+  over a whole image lose digits; both errors are too large for a policy with steep actions.
   """
   x = graph.value
   _mean_of_picture(graph)
@@ -111,14 +111,14 @@ def _normalize_channels(graph: Chain) -> None:
 
 
 def _mean_of_picture(graph: Chain) -> None:
-  """Of each channel: [1, C, 1, 1] of [1, C, H, W]."""
+  """Returns the mean of each channel, [1, C, 1, 1] of [1, C, H, W]."""
   graph.apply("ReduceMean", axes=[3])
   graph.apply("ReduceMean", axes=[2])
 
 
 def see(graph: Chain, params: Mapping[str, PyTree], cnn: CNNConfig, size: list[int]) -> None:
-  """From a picture [1, H, W, C] uint8 of a size (H, W) to its features [1, F]."""
-  same = {"auto_pad": "SAME_UPPER"}  # on both sides, one more below and on the right: XLA's way, too
+  """Maps an image [1, H, W, C] uint8 of size (H, W) to features [1, F]."""
+  same = {"auto_pad": "SAME_UPPER"}  # on both sides, an odd one below and on the right, as in XLA
   graph.apply("Cast", to=TensorProto.FLOAT)
   graph.apply("Transpose", perm=[0, 3, 1, 2])
   if cnn.normalize_channels:

@@ -12,8 +12,8 @@ from playground.deploy.policy import ActingPolicy
 from playground.envs.base import Env, State
 
 STEP = 0.1  # m/s and rad/s of the command, for each press of a key
-_COMMAND = "command"  # entry of `info`: the velocity that a joystick asks for
-_TERM = "reward/"  # what metrics begin with that are terms of the reward
+_COMMAND = "command"  # entry of `info`: the velocity command of a joystick
+_TERM = "reward/"  # prefix of metrics that are reward terms
 
 
 class Player:
@@ -30,7 +30,7 @@ class Player:
     force: external forces and torques in the next policy steps, world frame, N and N m, [nbody, 6].
     takes_commands: whether the task follows a velocity command.
     period: seconds of one policy step.
-    seconds: since this episode began.
+    seconds: time in this episode, s.
     episode_return: sum of rewards in this episode.
     terms: each weighted reward term of the last policy step, by name.
   """

@@ -1,4 +1,4 @@
-"""A policy as a controller has it: `policy.onnx`, run by ONNX Runtime on one core, and its contract `policy.yaml`."""
+"""An exported policy: `policy.onnx`, run by ONNX Runtime on one core, and its contract `policy.yaml`."""
 
 import hashlib
 import time
@@ -19,37 +19,37 @@ Seen = Observation | np.ndarray | Mapping[str, np.ndarray]  # by a policy: obser
 
 
 class ActingPolicy(Protocol):
-  """What acts in a player or an evaluation: an exported policy, or a script."""
+  """An exported policy or a script that acts in a player or an evaluation."""
 
   contract: Contract
 
   def actions(self, obs: Seen) -> np.ndarray:
-    """Actions in [-1, 1], [..., action_size], for a task's observations with any leading axes."""
+    """Returns actions in [-1, 1], [..., action_size], for observations with any leading axes."""
     ...
 
   def act(self, policy: object, obs: Observation, key: jax.Array) -> jax.Array:
-    """The same from within jitted code, as evaluations call a policy."""
+    """Returns the same actions inside jitted code, as evaluations call a policy."""
     ...
 
 
 class ExportedPolicy:
-  """Maps an observation to an action, as the contract says."""
+  """Maps an observation to an action, with ONNX Runtime."""
 
   def __init__(self, model: bytes, contract: Contract):
-    """Takes the ONNX model and what `playground.deploy.contract` says of it.
+    """Loads an ONNX model with its contract (`playground.deploy.contract`).
 
     Raises:
-      CheckpointError: the model is damaged, takes or gives something else, or is not the one that the contract is of.
+      CheckpointError: the model is damaged, has other inputs or outputs, or does not belong to the contract.
     """
     need("deploy", "onnxruntime")
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # what is wrong with a model is said below
+    options.log_severity_level = 4  # errors of a model are raised below
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
       self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's have no base of their own
+    except Exception as error:  # onnxruntime's errors have no common base
       raise CheckpointError(f"The policy is no model that ONNX Runtime can read: {error}") from None
     facts = contract["policy"]
     told = {row["name"]: row["shape"] for row in facts["inputs"]} | {facts["output"]: [1, facts["action_size"]]}
@@ -57,7 +57,7 @@ class ExportedPolicy:
     if found != told:
       raise CheckpointError(f"The policy is not the one that its contract tells of: {found}, and not {told}.")
     own = hashlib.sha256(model).hexdigest()
-    if facts.get("sha256", own) != own:  # what was exported long ago has none
+    if facts.get("sha256", own) != own:  # older exports have none
       raise CheckpointError("The policy and its contract are not of one export (sha256): export the run again.")
     self.model = model
     self.contract = contract
@@ -67,16 +67,16 @@ class ExportedPolicy:
     """Reads `<name>.onnx` and `<name>.yaml` beside it.
 
     Raises:
-      CheckpointError: one of them is missing, or is not what `playground export` writes.
+      CheckpointError: a file is missing, or is not of `playground export`.
     """
     path = Path(path).expanduser()
     for file in (path, path.with_suffix(".yaml")):
       if not file.is_file():
         raise CheckpointError(f"{file} does not exist: `playground export <run>` writes a policy and its contract.")
-    model = path.read_bytes()  # before its contract, which is written first: an export meanwhile is noticed
+    model = path.read_bytes()  # before its contract, which is written first: this detects a concurrent export
     try:
       contract = yaml.safe_load(path.with_suffix(".yaml").read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError):  # a date that is none, say
+    except (yaml.YAMLError, ValueError, RecursionError):  # such as an invalid date
       contract = None
     if not isinstance(contract, dict) or contract.get("format") != FORMAT:
       raise CheckpointError(f"{path.with_suffix('.yaml')} is not a policy's contract ({FORMAT}): export the run again.")
@@ -90,7 +90,7 @@ class ExportedPolicy:
       raise CheckpointError(f"{path}: {error}") from None
 
   def actions(self, obs: Seen) -> np.ndarray:
-    """Actions in [-1, 1], [..., action_size], for a task's observations with any leading axes: one inference each."""
+    """Returns actions in [-1, 1], [..., action_size], for observations with any leading axes: one inference each."""
     feeds, entries = {}, self._read(obs)
     for row in self.contract["policy"]["inputs"]:
       feeds[row["name"]] = np.asarray(entries[row["entry"]], row["type"]).reshape(-1, *row["shape"])
@@ -100,14 +100,14 @@ class ExportedPolicy:
     return out.reshape(*self._batch(entries), -1)
 
   def act(self, policy: object, obs: Observation, key: jax.Array) -> jax.Array:
-    """The same from within jitted code, as evaluations call a policy."""
+    """Returns the same actions inside jitted code, as evaluations call a policy."""
     del policy, key
     entries = self._read(obs)
     out = jax.ShapeDtypeStruct((*self._batch(entries), self.contract["policy"]["action_size"]), np.float32)
     return jax.pure_callback(self.actions, out, entries, vmap_method="broadcast_all")
 
   def latency(self, obs: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Seconds that each inference takes here, [N], for what the actor reads, by entry [N, ...]."""
+    """Returns the seconds of each inference on this machine, [N], for inputs by group [N, ...]."""
     seconds = []
     for i in range(*self._batch(obs)):
       row = {entry: values[i] for entry, values in obs.items()}
@@ -117,12 +117,12 @@ class ExportedPolicy:
     return np.array(seconds)
 
   def _read(self, obs: Seen) -> dict[str, np.ndarray | jax.Array]:
-    """The entries that the actor reads; an observation that is one vector counts as `state`."""
+    """Returns the groups that the actor reads; a flat observation counts as `state`."""
     entries = obs if isinstance(obs, Mapping) else {"state": obs}
     return {row["entry"]: entries[row["entry"]] for row in self.contract["policy"]["inputs"]}
 
   def _batch(self, entries: Mapping[str, np.ndarray | jax.Array]) -> tuple[int, ...]:
-    """Leading axes of entries."""
+    """Returns the leading axes of groups."""
     row = self.contract["policy"]["inputs"][0]
     shape = np.shape(entries[row["entry"]])
     return shape[: len(shape) + 1 - len(row["shape"])]

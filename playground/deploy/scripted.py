@@ -1,4 +1,4 @@
-"""Actions without a policy, zero or random: to look at a task before anything is trained."""
+"""Zero or random actions, to view a task without a policy."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,10 +21,10 @@ AGENTS = ("zero", "random")
 
 
 class ScriptedPolicy:
-  """Gives zeros or uniformly random actions in [-1, 1], where an `ExportedPolicy` gives a network's."""
+  """Acts with zeros or uniformly random actions in [-1, 1], in place of an `ExportedPolicy`."""
 
   def __init__(self, agent: str, task: str, env: Env, seed: int):
-    """Takes one of `AGENTS` and the task that it acts on.
+    """Takes one of `AGENTS` and the task.
 
     Raises:
       UnknownNameError: there is no such agent.
@@ -42,17 +42,17 @@ class ScriptedPolicy:
     }
 
   def actions(self, obs: Seen) -> np.ndarray:
-    """Actions [..., action_size] for observations with any leading axes."""
+    """Returns actions [..., action_size] for observations with any leading axes."""
     shape = (*self._batch(obs), self._action_size)
     return (self._scale * self._generator.uniform(-1, 1, shape)).astype(np.float32)
 
   def act(self, policy: object, obs: Observation, key: jax.Array) -> jax.Array:
-    """The same from within jitted code, as evaluations call a policy."""
+    """Returns the same actions inside jitted code, as evaluations call a policy."""
     del policy
     return self._scale * jax.random.uniform(key, (*self._batch(obs), self._action_size), minval=-1.0)
 
   def _batch(self, obs: Seen) -> tuple[int, ...]:
-    """Leading axes of observations."""
+    """Returns the leading axes of observations."""
     if not isinstance(obs, Mapping):
       return np.shape(obs)[:-1]
     name = next(iter(obs))
@@ -77,7 +77,7 @@ def build_task(
   """
   setup(this_machine(compose(["hardware=cpu"]).hardware))
   config: Any = config_dict(compose([f"env={task}", *overrides]).env)
-  config.impl = "warp" if sees(config) else "jax"  # whose model is the smallest to build; it is not simulated
+  config.impl = "warp" if sees(config) else "jax"  # the smallest model to build; it is not simulated
   for event in config.events.values():
     if event is not None and event.get("mode") == "interval" and not interval_events:
       event.enabled = False

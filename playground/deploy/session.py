@@ -120,7 +120,7 @@ class Session:
 
   @property
   def push_speed(self) -> float:
-    """The largest `velocity` of the task's interval event whose name begins with push, m/s; 3 without one."""
+    """Returns the largest `velocity` of the interval event whose name begins with push, m/s; 3 without one."""
     events = self.player.env.config.get("events") or {}
     pushes = [event for name, event in events.items() if name.startswith("push") and event and event.mode == "interval"]
     return next((max(event.params.velocity) for event in pushes if "velocity" in (event.get("params") or {})), 3.0)

@@ -1,4 +1,4 @@
-"""A run's policy with its task on C MuJoCo: what is exported, and played."""
+"""Loads a run's policy with its task on C MuJoCo, to export or play it."""
 
 import hashlib
 from pathlib import Path
@@ -21,11 +21,11 @@ from playground.runs.csv_tracker import read_metrics
 from playground.runs.loaded_policy import LoadedPolicy, load_policy
 from playground.settings import Section
 
-_EXACT = "highest"  # precision of matrix products: what the exported policy computes
+_EXACT = "highest"  # precision of matrix products, as in the exported policy
 
 
 def load_exact(path: str | Path) -> LoadedPolicy:
-  """Reads a run's newest checkpoint, or the one given, with its task on C MuJoCo; all of it computes on the CPU.
+  """Reads a run's newest checkpoint, or the one given, with its task on C MuJoCo, on the CPU.
 
   Raises:
     PlaygroundError: no such run or checkpoint, or one that does not fit.
@@ -34,10 +34,10 @@ def load_exact(path: str | Path) -> LoadedPolicy:
 
 
 def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:
-  """Lets the policy's mode act, noise and all.
+  """Runs the policy's mode with the task's noise, and records it.
 
   Returns:
-    What the actor saw, by entry [num_envs * decisions, ...], what it did, [..., action_size], and a state of one
+    The actor's inputs, by group [num_envs * steps, ...], its actions, [..., action_size], and a state of one
     environment.
   """
   batch, networks = wrap_for_training(trained.env), trained.trainer.networks
@@ -56,7 +56,7 @@ def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[s
 
 
 def export_policy(trained: LoadedPolicy, state: State | None = None) -> ExportedPolicy:
-  """The policy as a controller has it; `state` is any of one environment (a fresh one if None)."""
+  """Exports the policy in memory; `state` is any of one environment (after a reset if None)."""
   need("deploy", "onnx", "onnxruntime")
   policy, agent, networks = jax.device_get(trained.policy), trained.config.agent, trained.trainer.networks
   params, seen = networks.mlp(policy.params.policy, policy.normalizer if agent.normalize_observations else None)
@@ -80,7 +80,7 @@ def export_policy(trained: LoadedPolicy, state: State | None = None) -> Exported
 
 
 def _newest_evaluation(trained: LoadedPolicy) -> dict[str, float]:
-  """`steps` and the scores of the last evaluation in the training run, {} if there was none."""
+  """Returns `steps` and the scores of the last evaluation in training, {} without one."""
   table = read_metrics(trained.run_dir.metrics_csv)
   if "eval/episode_reward" not in table:
     return {}
@@ -96,8 +96,8 @@ def load_on_c_physics(task: str, config: Section | ConfigDict) -> Env:
   """Builds a task on C MuJoCo.
 
   Raises:
-    ConfigError: it sees pictures, and MuJoCo-Warp, which renders them, is not installed.
+    ConfigError: the task has images, and MuJoCo-Warp, which renders them, is not installed.
   """
   own = config_dict(config)
-  own.impl = "warp" if sees(own) else "jax"  # whose model is the smallest to build; it is not simulated
+  own.impl = "warp" if sees(own) else "jax"  # the smallest model to build; it is not simulated
   return on_c_physics(registry.load(task, config=own))

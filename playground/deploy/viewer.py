@@ -1,4 +1,4 @@
-"""MuJoCo's native viewer on a policy: push with the mouse, steer with the arrow keys."""
+"""Shows a policy in MuJoCo's native viewer: push with the mouse, steer with the arrow keys."""
 
 import os
 import sys
@@ -19,7 +19,7 @@ from playground.runs.interrupts import noted_signals
 # GLFW's codes of the keys -> component of the command, direction.
 _STEERING = {265: (0, 1), 264: (0, -1), 263: (2, 1), 262: (2, -1), ord(","): (1, 1), ord("."): (1, -1)}
 _AS_THE_TASK_DRAWS, _RESET = 259, 257  # backspace, enter
-_CLOSING = 5.0  # s for a window to go
+_CLOSING = 5.0  # s for a window to close
 _HELP = (
   "Keys: up and down go, left and right turn, comma and period go sideways, backspace leaves commands to the task, "
   "enter begins anew. Double-click a body, then hold ctrl and drag with the right button to push it."
@@ -27,13 +27,13 @@ _HELP = (
 
 
 def need_display() -> None:
-  """Raises HardwareError where there is no screen for a window."""
+  """Raises HardwareError without a screen."""
   if not sys.platform.startswith("linux"):
     return
   display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
   if not display:
     raise HardwareError("--viewer needs a display, and there is none here: use --video FILE or --web.")
-  if not _opens_a_window():  # MuJoCo's would wait for ever
+  if not _opens_a_window():  # MuJoCo's viewer would wait forever
     raise HardwareError(f"--viewer cannot open a window on the display {display}: use --video FILE or --web.")
 
 
@@ -51,7 +51,7 @@ def _opens_a_window() -> bool:
 
 
 def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
-  """Shows a policy in real time until its window is closed, or ctrl+c."""
+  """Shows a policy in real time until its window is closed, or until ctrl+c."""
   import mujoco.viewer
 
   player = Player(env, exported, seed)
