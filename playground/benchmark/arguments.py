@@ -9,7 +9,7 @@ from playground.settings import Setting, settings
 from playground.text import format_value
 
 T = TypeVar("T")
-GROUPS = ("hardware", "debug", "randomization", "robot", "terrain")  # overrides without a dot that may be given, too
+GROUPS = ("hardware", "debug", "randomization", "robot", "terrain")  # allowed overrides without a dot
 OVERRIDES = "overrides"  # the field that takes overrides, where a command has one
 
 
@@ -18,11 +18,11 @@ def parse(command: str, options: type[T], arguments: Sequence[str]) -> T:
 
   Args:
     command: its name, for messages.
-    options: a settings class; a field `overrides` takes what is for the run's configuration.
+    options: a settings class; a field `overrides` takes overrides of the run's configuration.
     arguments: `key=value` each.
 
   Raises:
-    ConfigError: not of that form, given twice, or a value of another type.
+    ConfigError: another form, a repeated key, or a value of another type.
     UnknownNameError: no such key.
   """
   known = dict(settings(options))
@@ -49,7 +49,7 @@ def parse(command: str, options: type[T], arguments: Sequence[str]) -> T:
 
 
 def check_limits(options: object) -> None:
-  """Raises ConfigError for numbers that are not within their limits, and for lists of nothing."""
+  """Raises ConfigError for numbers outside their limits, and for empty lists."""
   for name, setting in settings(type(options)).items():
     value = getattr(options, name)
     if setting.default and value == ():
@@ -59,7 +59,7 @@ def check_limits(options: object) -> None:
 
 
 def help_of(options: type) -> list[str]:
-  """A line for each key: its default and what it does."""
+  """Returns a line for each key: default and help."""
   shown = {name: setting for name, setting in settings(options).items() if name != OVERRIDES}
   keys = {name: f"{name}={format_value(setting.default)}" for name, setting in shown.items()}
   width = max(map(len, keys.values()), default=0) + 2
@@ -67,7 +67,7 @@ def help_of(options: type) -> list[str]:
 
 
 def _read(setting: Setting, text: str) -> object:
-  """The value of a key: text, true or false, a number, or a tuple of texts or numbers, each once."""
+  """Parses the value of a key: text, true or false, a number, or a tuple of unique texts or numbers."""
   if text == "null" and setting.nullable:
     return None
   if setting.text_depth == 0:

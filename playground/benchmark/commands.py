@@ -1,4 +1,4 @@
-"""The commands: the options of each, and the measurements that they stand for."""
+"""The commands: options and measurements of each."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from playground.paper import tasks_of
 
 RESULTS = Path("results/benchmarks")
 
-# Of the paper's pixel tables (appendix D): episodes of 3 and 4 s, for the Panda with all that is randomised.
+# Of the paper's pixel tables (appendix D): episodes of 3 and 4 s, for the Panda with randomisation.
 PIXEL_CONDITIONS = {
   "CartpoleBalanceVision": ["env.ctrl_dt=0.04", "env.episode_length=75"],
   "PandaPickCubeCartesianVision": [
@@ -107,7 +107,7 @@ class Breakdown(OfTasks):
 
 @dataclasses.dataclass(frozen=True)
 class Pixels(OfTasks):
-  """Time of a step from pixels, as in the paper: state alone, with pictures, with inference, with training."""
+  """Time of a step from pixels, as in the paper: state alone, with images, with inference, with training."""
 
   sizes: Annotated[Sequence[int], counts(1), "sides of the pictures"] = (32, 64, 128, 256)
   num_envs: Annotated[Sequence[int], counts(1), "numbers of environments"] = (1024,)
@@ -147,7 +147,7 @@ class Pixels(OfTasks):
 
 @dataclasses.dataclass(frozen=True)
 class Topology(OfRuns):
-  """Training steps/s, and whole runs, on 1, 2, 4, ... devices, with hyperparameters as they are and scaled."""
+  """Training steps/s, and whole runs, on 1, 2, 4, ... devices, with hyperparameters unchanged and scaled."""
 
   devices: Annotated[Sequence[int], counts(1), "numbers of devices; none is 1, 2, 4, ... as many as there are"] = ()
   hyperparameters: Annotated[Sequence[str], "scaled: environments and batch times the devices"] = ("fixed", "scaled")
@@ -224,7 +224,7 @@ class BesidePeer(OfTasks):
 
   @property
   def ours(self) -> str:
-    """Our side's `agent`."""
+    """Returns `agent` of our side."""
     return f"{self.agent}_v020"
 
   def check(self) -> None:
@@ -308,6 +308,6 @@ def run(command: Measuring) -> int:
   table = Table(Path(command.out) if command.out else RESULTS / f"{command.name}.csv")
   hardware = [text for text in command.overrides if text.startswith("hardware")]
   devices, facts = probe(hardware, command.gpus)
-  jobs = command.jobs(devices)  # says what does not fit, before anything else is said
+  jobs = command.jobs(devices)  # raises for invalid options, before any output
   print(f"{devices} x {facts['device']}; {facts['versions']}")
   return run_jobs(jobs, table, facts, command)

@@ -1,4 +1,4 @@
-"""`playground-bench golden`: does what learned still learn? Whole runs, with a window for each metric."""
+"""`playground-bench golden`: checks whole runs for regressions, with a window for each metric."""
 
 import dataclasses
 import math
@@ -35,13 +35,13 @@ class Options(Plan):
 
 @dataclasses.dataclass(frozen=True)
 class Golden:
-  """A run and what must come of it.
+  """A run and the expected results.
 
   Attributes:
     name: of the run.
     overrides: of `playground-run`.
-    windows: least and most of the last value of a column of metrics.csv.
-    source: where the windows are from.
+    windows: lowest and highest last value of a column of metrics.csv.
+    source: of the windows.
   """
 
   name: str
@@ -51,7 +51,7 @@ class Golden:
 
 
 def run(options: Options) -> int:
-  """Trains and judges; returns the exit code: 0, 1 for a failed run or a value outside, 3 where the time was up.
+  """Trains and judges; returns the exit code: 0, 1 for a failed run or a value outside, 3 if the time was up.
 
   Raises:
     PlaygroundError: an invalid option, or a file of sets that is not one.
@@ -76,7 +76,7 @@ def run(options: Options) -> int:
 
 
 def judge(golden: Golden, found: Mapping[str, float]) -> bool:
-  """Prints a line for each metric that was measured; returns whether none of them is outside its window."""
+  """Prints a line for each measured metric; returns whether all are inside their windows."""
   good = True
   for metric, (least, most) in golden.windows.items():
     if metric in found:
@@ -88,7 +88,7 @@ def judge(golden: Golden, found: Mapping[str, float]) -> bool:
 
 
 def measurement(golden: Golden, options: Options) -> Measurement:
-  """The run as a job; raises ConfigError for overrides that are invalid."""
+  """Makes a measurement of the run; raises ConfigError for overrides that are invalid."""
   overrides = [*golden.overrides, *options.overrides]
   agent = compose(overrides).agent_name
   columns = {"benchmark": "golden", "task": golden.name, "agent": agent, "who": "ours", "setting": ""}
@@ -104,7 +104,7 @@ def setting(overrides: Sequence[str], metric: str) -> str:
 
 
 def values(rows: Sequence[Mapping[str, str]], job: Measurement, device: str) -> dict[str, float]:
-  """The newest value of each metric of a run on this device."""
+  """Returns the newest value of each metric of a run on this device."""
   metrics = dict(zip(job.arguments["settings"], job.arguments["metrics"], strict=True))
   same = {"benchmark": "golden", "task": job.columns["task"], "quantity": QUANTITY, "device": device}
   own = [row for row in rows if row["setting"] in metrics and all(row[key] == text for key, text in same.items())]
@@ -112,10 +112,10 @@ def values(rows: Sequence[Mapping[str, str]], job: Measurement, device: str) -> 
 
 
 def read(path: Path) -> dict[str, dict[str, Golden]]:
-  """The sets of a file, by name.
+  """Reads the sets of a file, by name.
 
   Raises:
-    ConfigError: the file cannot be read, or an entry is not of the form of benchmarks/golden.yaml.
+    ConfigError: the file is unreadable, or an entry has another form than in benchmarks/golden.yaml.
   """
   try:
     content = yaml.safe_load(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Measurements as jobs of the sweep's runner, each in a process of its own; rows go to the table as they come."""
+"""Runs measurements as jobs of the sweep's runner, each in a process of its own; rows are written at once."""
 
 import contextlib
 import dataclasses
@@ -24,8 +24,8 @@ from playground.sweep.runner import Runner
 from playground.sweep.view import View
 
 WORKER = (*PYTHON, "-W", "ignore", "-m", "playground.benchmark.worker")
-GRACE_S = 40  # between asking a process to end and ending it: a training run saves first
-TAIL = 30  # lines of a failed process that are shown
+GRACE_S = 40  # s between SIGTERM and SIGKILL: a training run saves first
+TAIL = 30  # shown lines of a failed process
 
 Row = dict[str, Any]
 Add = Callable[["Measurement", Row], None]  # takes a row of a measurement
@@ -37,9 +37,9 @@ class Measurement:
 
   Attributes:
     measure: a function of `measures`, `module:function`; without a function, `measure` of the module.
-    arguments: of that function; `seeds`, where it takes them, shrinks to those not measured yet.
+    arguments: of that function; `seeds`, if it has them, shrinks to those not measured yet.
     columns: of its rows (benchmark, task, agent, who, setting).
-    last: columns of its last row; there is one for each seed if it takes seeds.
+    last: columns of its last row; there is one for each seed if it has seeds.
   """
 
   measure: str
@@ -48,7 +48,7 @@ class Measurement:
   last: Mapping[str, str]
 
   def left(self, table: Table, device: str) -> "Measurement | None":
-    """The part that the table does not have for this device yet; None if there is none."""
+    """Returns the part that the table lacks for this device; None if there is none."""
     row = {"device": device, **self.columns, **self.last}
     if "seeds" not in self.arguments:
       return None if table.has(row) else self
@@ -61,7 +61,7 @@ class Measurement:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-  """How measurements are run."""
+  """Settings of running measurements."""
 
   rerun: Annotated[bool, "measure again what the CSV has already"] = False
   minutes: Annotated[float | None, positive(), "stop after this long; the same command again measures the rest"] = None
@@ -73,7 +73,7 @@ class Plan:
 
 
 class _Rows(View):
-  """Hands each row on as soon as its measurement prints it, and prints why measurements fail."""
+  """Passes on each row as soon as its measurement prints it, and prints the reasons of failures."""
 
   def __init__(self, sweep: SweepDirectory, measurements: Sequence[Measurement], add: Add):
     super().__init__(sweep)
@@ -105,16 +105,16 @@ class _Rows(View):
         print(f"{measurement}: {self.reasons[job.name]}", file=sys.stderr, flush=True)
 
   def _why(self, job: Job, state: JobState) -> str:
-    """The reason of a failure, with the end of the log if the process did not give one itself."""
+    """Returns the reason of a failure, with the end of the log if the process gave no reason."""
     folder = self._sweep.folder(job)
     if folder.run.status.get("reason"):
       return state.reason
-    lines = folder.log.read_text(encoding="utf-8", errors="replace").splitlines()[1:]  # the first is the worker's own
+    lines = folder.log.read_text(encoding="utf-8", errors="replace").splitlines()[1:]  # the first is the worker's
     return "\n".join([state.reason, *[line for line in lines if line.strip() and not line.startswith(ROW)][-TAIL:]])
 
 
 def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int, _Rows]:
-  """Runs measurements; returns the runner's exit code and how they ended."""
+  """Runs measurements; returns the runner's exit code and their states."""
   gpus = list(map(str, plan.gpus)) or [ALL]
   slots = [Slot(number, gpus[number % len(gpus)], ()) for number in range(plan.workers)]
   with tempfile.TemporaryDirectory() as temporary:
@@ -134,12 +134,12 @@ def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int
 
 
 def probe(overrides: Sequence[str], gpus: Sequence[int]) -> tuple[int, dict[str, str]]:
-  """The number of devices that measurements will have, and their columns `device` and `versions`.
+  """Returns the number of devices of measurements, and their columns `device` and `versions`.
 
-  Asks a process of its own, for this one holds no device.
+  A child process finds them, since this one holds no device.
 
   Raises:
-    HardwareError: the device cannot be used.
+    HardwareError: the device does not work.
   """
   found: list[Row] = []
   columns: dict[str, str] = dict.fromkeys(("task", "agent", "who", "setting"), "")
@@ -153,10 +153,10 @@ def probe(overrides: Sequence[str], gpus: Sequence[int]) -> tuple[int, dict[str,
 
 
 def run_jobs(measurements: Sequence[Measurement], table: Table, facts: Mapping[str, str], plan: Plan) -> int:
-  """Runs what the table does not have yet.
+  """Runs the measurements that the table lacks.
 
   Returns:
-    0 when all is there, 1 when something failed, 3 when the time was up before, 130 or 143 when interrupted.
+    0 when the table is complete, 1 after a failure, 3 when the time was up, 130 or 143 when interrupted.
   """
   todo = [left for each in measurements if (left := each if plan.rerun else each.left(table, facts["device"]))]
   if len(todo) < len(measurements):

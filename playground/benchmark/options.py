@@ -1,4 +1,4 @@
-"""Options that the commands share, and the measurements that they make of them."""
+"""Options that the commands share, and their measurements."""
 
 import abc
 import dataclasses
@@ -35,7 +35,7 @@ class Measuring(Plan, abc.ABC):
 
   @abc.abstractmethod
   def jobs(self, devices: int) -> list[Measurement]:
-    """The measurements on a machine with so many devices."""
+    """Returns the measurements on a machine with this number of devices."""
 
   def check(self) -> None:
     """Raises PlaygroundError for invalid options, before anything expensive."""
@@ -68,11 +68,11 @@ class OfTasks(Measuring):
       raise ConfigError(
         f"hardware.devices= is no override of {self.name}: only topology, with devices=, measures on several."
       )
-    for task in self.chosen() if self.overrides else self.chosen()[:1]:  # without any, all go as they are
+    for task in self.chosen() if self.overrides else self.chosen()[:1]:  # without any, all run unchanged
       self.configured(task)
 
   def chosen(self) -> list[str]:
-    """The tasks of `suite` and `tasks`, each once; a suite's tasks that this package does not have are left out."""
+    """Returns the tasks of `suite` and `tasks`, each once, without tasks of a suite that this package lacks."""
     if not self.suite and not self.tasks:
       raise ConfigError(f"Name what to measure: tasks=CartpoleBalance,CheetahRun or suite={'|'.join(SUITES)}|all.")
     known = task_names()
@@ -82,27 +82,27 @@ class OfTasks(Measuring):
     return list(dict.fromkeys([*self.tasks, *(n for n in tasks_of(self.suite or "all") if self.suite and n in known)]))
 
   def configured(self, task: str, *more: str) -> RunConfig:
-    """The configuration of a task's run; raises ConfigError for invalid overrides."""
+    """Returns the configuration of a task's run; raises ConfigError for invalid overrides."""
     return compose([f"env={task}", f"agent={self.agent}", *self.overrides, *more])
 
   def with_envs(self, task: str, count: int) -> list[str]:
-    """Overrides for so many environments; PPO's batch grows where each would give less than a trajectory."""
+    """Returns overrides for a number of environments; PPO's batch grows if each would give less than a trajectory."""
     setting = [f"agent.num_envs={count}"]
-    if self.agent.startswith("ppo"):  # every environment gives a whole number of trajectories, no fewer than tuned
+    if self.agent.startswith("ppo"):  # every environment gives whole trajectories, at least the tuned number
       agent = self.configured(task).agent
       batch = agent.batch_size * max(1, -(-count // (agent.batch_size * agent.num_minibatches)))
       setting += [f"agent.batch_size={batch}"] * (batch != agent.batch_size)
-    self.configured(task, *setting)  # a number that does not fit is said here
+    self.configured(task, *setting)  # raises for a number that does not fit
     return setting
 
   def job(self, measure: str, task: str, setting: Sequence[str] = (), **arguments: object) -> Measurement:
-    """A measurement with the overrides of `setting`."""
+    """Returns a measurement with the overrides of `setting`."""
     overrides = [*self.overrides, *setting]
     arguments = {"task": task, "agent": self.agent, "overrides": overrides, "seconds": self.seconds, **arguments}
     return Measurement(measure, arguments, self.columns(task, self.agent, setting), {"quantity": QUANTITY[measure]})
 
   def on_one_device(self, job: Measurement) -> Measurement:
-    """The measurement with one device for each process; as most tables are about that, `setting` does not say it."""
+    """Returns the measurement with one device for each process; `setting` omits it, as most tables have one."""
     arguments = {**job.arguments, "overrides": [*job.arguments["overrides"], "hardware.devices=1"]}
     return dataclasses.replace(job, arguments=arguments)
 
@@ -122,7 +122,7 @@ class OfRuns(OfTasks):
     return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
 
   def whole_run(self, task: str, agent: str, seed: int, setting: Sequence[str] = ()) -> Measurement:
-    """A measurement that trains from beginning to end, for the budget."""
+    """Returns a measurement of a whole training."""
     setting = [*setting, *self.budget()]
     told = [*self.overrides, *setting]
     arguments = {"task": task, "agent": agent, "overrides": told, "told": told, "seeds": [seed]}

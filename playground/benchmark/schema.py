@@ -60,7 +60,7 @@ class Table:
     """Opens or begins the table; what a kill left of a half-written last row is dropped.
 
     Raises:
-      ConfigError: the file holds something else, or cannot be written.
+      ConfigError: the file holds something else, or is not writable.
     """
     self.path = path
     self._rows: list[dict[str, str]] = []
@@ -78,7 +78,7 @@ class Table:
 
     Raises:
       KeyError: a column or quantity that the schema does not have.
-      ConfigError: the file cannot be written any more.
+      ConfigError: writing the file failed.
     """
     if unknown := set(row) - set(COLUMNS):
       raise KeyError(f"no columns of a row: {unknown}")
@@ -132,5 +132,5 @@ def _end_last_row(file: BinaryIO) -> None:
 
 
 def commit_of(git: Mapping[str, Any] | None) -> str:
-  """The column `commit` for what `git_state` says."""
+  """Returns the column `commit` from `git_state`."""
   return "" if git is None else git["commit"][:7] + "+" * git["dirty"]

@@ -35,7 +35,7 @@ def main() -> None:
 
   job = json.loads(sys.argv[1])
   arguments, folder, facts = job["arguments"], Path(job["folder"]), Facts()
-  os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # else a GPU looks full from the start
+  os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # else a GPU appears full from the start
   if not job["cache"]:
     os.environ |= {name: str(folder / name) for name in CACHES}
   if job["shares"]:  # with the measurements that see the same GPUs

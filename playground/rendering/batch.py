@@ -1,8 +1,8 @@
-"""Pictures of a whole batch of environments on the device they run on, by MuJoCo-Warp's ray caster.
+"""Renders images of a batch of environments on their device, with MuJoCo-Warp's ray caster.
 
 `BatchRenderer.render` is written for one environment and is jitted, mapped and scanned over like any other function.
-The renderer below it wants to know the size of its batch beforehand, in a context of its own: `render` makes one when
-it is traced for a batch of a new size, so that training, evaluation and a single picture each have theirs.
+MuJoCo-Warp's renderer needs a context for each batch size: `render` makes one when it is traced for a batch of a new
+size, so that training, evaluation and a single image each have their own.
 """
 
 import dataclasses
@@ -19,23 +19,23 @@ from playground.pytree import PyTree
 from playground.rendering.video import camera_names
 
 Pictures = dict[str, jax.Array]
-Context = Any  # of MuJoCo-Warp, which names no type of it
-Rendered = tuple[dict[str, Pictures], jax.Array]  # by camera; and a zero that is there only when they are
+Context = Any  # of MuJoCo-Warp, which has no public type for it
+Rendered = tuple[dict[str, Pictures], jax.Array]  # by camera; and a zero that depends on them
 _KINDS = ("rgb", "depth", "segmentation")
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-  """What is rendered, of every environment alike.
+  """Settings of the images, the same for every environment.
 
   Attributes:
     cameras: names.
-    width: of each picture, pixels.
-    height: of each picture, pixels.
+    width: of each image, pixels.
+    height: of each image, pixels.
     kinds: `rgb`, `depth` and `segmentation`, any of them.
     shadows: whether lights cast them (those with `castshadow`).
-    textures: whether materials show theirs; without, only their colours.
-    geom_groups: which geoms are seen.
+    textures: whether materials show textures or only colours.
+    geom_groups: groups of the visible geoms.
   """
 
   cameras: tuple[str, ...]
@@ -51,14 +51,14 @@ class BatchRenderer:
   """Renders the environments of one task."""
 
   def __init__(self, physics: Physics, view: View):
-    """Checks what is asked for; what is made for a batch is made when it is traced.
+    """Checks the view; buffers of a batch are made when `render` is traced.
 
     Args:
-      physics: the task's, on Warp.
-      view: what to render.
+      physics: of the task, on Warp.
+      view: settings of the images.
 
     Raises:
-      ConfigError: a backend that cannot render, or nothing to render.
+      ConfigError: a backend without rendering, or nothing to render.
       UnknownNameError: a camera or kind that does not exist.
     """
     if physics.impl != "warp":
@@ -78,19 +78,19 @@ class BatchRenderer:
     self._contexts: dict[tuple[object, ...], list[Context]] = {}
 
   def render(self, model: mjx.Model, data: PhysicsData) -> tuple[dict[str, Pictures], PhysicsData]:
-    """Renders one environment as it is at this moment.
+    """Renders the current state of one environment.
 
     Args:
       model: the device model, randomised or not.
       data: simulator state.
 
     Returns:
-      For each camera its pictures by kind: `rgb` [H, W, 3] uint8, `depth` [H, W] float32, metres along the optical
-      axis and 0 for nothing, `segmentation` [H, W] int32, the geom's id and -1 for nothing; and the state to go on
-      with. Two renderings write into the same buffers of the context: whatever renders next must come from that state,
-      or nothing tells the compiler which of them is first.
+      For each camera its images by kind: `rgb` [H, W, 3] uint8, `depth` [H, W] float32, metres along the optical
+      axis and 0 for nothing, `segmentation` [H, W] int32, the geom's id and -1 for nothing; and the state to
+      continue with. Two renderings write into the same buffers of the context: the next rendering must use that state,
+      so that the compiler knows their order.
     """
-    # Rays are computed once for all environments, unless the lens is another than the task's.
+    # Rays are computed once for all environments, unless the field of view is randomised.
     task = self._physics.model
     lenses = model.cam_fovy is not task.cam_fovy or model.cam_intrinsic is not task.cam_intrinsic
     shared = jax.tree.map(lambda _: False, model)
@@ -99,7 +99,7 @@ class BatchRenderer:
     return pictures, data.replace(time=data.time + token)
 
   def _draw(self, lenses: bool, own: mjx.Model, model: mjx.Model, data: PhysicsData) -> Rendered:
-    """What `_render` returns, of a batch [N] of states; `own` says which of the model's fields have that axis, too."""
+    """Returns the result of `_render` for a batch [N] of states; `own` tells which model fields have that axis."""
 
     @jax.custom_batching.custom_vmap
     def draw(model: mjx.Model, data: PhysicsData) -> Rendered:
@@ -110,7 +110,7 @@ class BatchRenderer:
 
     @draw.def_vmap
     def widen(count: int, mapped: PyTree, model: mjx.Model, data: PhysicsData) -> Rendered:
-      # A map over a batch is a larger batch: what both of them share stays shared.
+      # A map over a batch is a larger batch: fields shared by both stay shared.
       size = data.time.shape[-1]
 
       def merge(x: jax.Array, is_mapped: bool, is_own: bool) -> jax.Array:
@@ -129,7 +129,7 @@ class BatchRenderer:
     return draw(model, data)
 
   def _render(self, context: Context, model: mjx.Model, data: PhysicsData) -> Rendered:
-    """The pictures, and a zero that is there only when they are."""
+    """Returns the images, and a zero that depends on them."""
     handle = context.pytree()
     full = mjx.refit_bvh(model, self._physics.present(model, data), handle)
     seg: Any = None
@@ -152,10 +152,10 @@ class BatchRenderer:
     return pictures, token.sum().astype(data.time.dtype)
 
   def _contexts_of(self, size: int, lenses: bool) -> list[Context]:
-    """The renderer's buffers for a batch, on every device that the function being traced runs on.
+    """Returns the renderer's buffers for a batch, on every device of the function being traced.
 
-    Of GPUs one context has the buffers of each. To Warp there is but one CPU: where JAX divides it into several
-    devices, which draw at the same time, each needs a context.
+    One context has the buffers of all GPUs. Warp has a single CPU device: where JAX divides the CPU into several
+    devices, which render concurrently, each needs a context.
     """
     devices, view = _devices(), self.view
     key = (size, lenses, *devices)
@@ -180,12 +180,12 @@ class BatchRenderer:
 
 
 def _bytes(packed: jax.Array) -> jax.Array:
-  """Red, green and blue, [..., 3] uint8, of pixels 0xAARRGGBB."""
+  """Returns red, green and blue, [..., 3] uint8, of pixels 0xAARRGGBB."""
   return jnp.stack([(packed >> shift) & 0xFF for shift in (16, 8, 0)], axis=-1).astype(jnp.uint8)
 
 
 def _devices() -> list[str]:
-  """Warp's names of this process's devices."""
+  """Returns Warp's names of this process's devices."""
   # Inside a function that is mapped over a mesh, its devices: the first ones (hardware.mesh.make_mesh).
   count = max(1, jax.sharding.get_abstract_mesh().size // jax.process_count())
   if jax.default_backend() != "gpu":
@@ -194,5 +194,5 @@ def _devices() -> list[str]:
 
 
 def _place() -> jax.Array:
-  """Which of `_devices()` the function being traced runs on, [] int32."""
+  """Returns the index in `_devices()` of the function being traced, [] int32."""
   return jax.lax.axis_index(jax.sharding.get_abstract_mesh().axis_names) % len(_devices())

@@ -1,4 +1,4 @@
-"""Finds a way to draw without a screen. Never imports mujoco here: a broken GL library kills the process that tries."""
+"""Finds an OpenGL backend without a screen. Never imports mujoco here: a broken GL library kills the process."""
 
 import functools
 import os
@@ -21,14 +21,14 @@ with mujoco.Renderer(model, 16, 16) as renderer:
   renderer.update_scene(data)
   assert renderer.render().any()
 """
-_ASKED = "PLAYGROUND_MUJOCO_GL"  # where `withhold_gl` puts what the user asked for
-_OFF = ("disable", "disabled", "off", "false", "0")  # what MuJoCo itself takes for "no GL"
+_ASKED = "PLAYGROUND_MUJOCO_GL"  # where `withhold_gl` stores the user's MUJOCO_GL
+_OFF = ("disable", "disabled", "off", "false", "0")  # values that mean "no GL" to MuJoCo
 
 
 def withhold_gl() -> None:
-  """Keeps the user's MUJOCO_GL for the children that draw.
+  """Stores the user's MUJOCO_GL for the child processes that render.
 
-  A process that trains draws nothing, yet `import mujoco` fails in it if the backend named there is not installed.
+  A process that trains renders nothing, yet `import mujoco` fails in it if the backend named there is not installed.
   """
   if "MUJOCO_GL" in os.environ:
     os.environ[_ASKED] = os.environ.pop("MUJOCO_GL")
@@ -50,7 +50,7 @@ def find_gl() -> str | None:
 
 
 def works(backend: str, timeout_s: float = 60.0) -> bool:
-  """Returns whether MuJoCo can draw a picture with this backend, found out in a subprocess."""
+  """Tests in a subprocess whether MuJoCo renders an image with this backend."""
   command = [*PYTHON, "-c", _PROBE]
   try:
     done = subprocess.run(command, env=gl_environment(backend), capture_output=True, timeout=timeout_s)

@@ -2,7 +2,7 @@
 
 `python -m playground.rendering.video <out.mp4> <scratch> <pipe>` is the child, which `render_video` starts with the
 trajectory as its standard input; $MUJOCO_GL chooses how it draws. The child owns the scratch folder. It removes the
-folder and ends when its parent dies, however that happens: then the other end of the pipe closes.
+folder and ends when its parent dies for any reason, which closes the other end of the pipe.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 MAX_FPS = 50.0
 _TRIES = 100
-# Names of cameras that look on from where a task is seen best; the swimmer's is tracking1.
+# Names of cameras with the best view of a task; the swimmer's is tracking1.
 _CAMERAS = ("track", "tracking", "tracking1", "fixed", "side", "front", "back", "cam0")
 
 
@@ -56,19 +56,19 @@ def render_video(
   Args:
     mj_model: the MjModel that `qpos` belongs to.
     qpos: [T, nq]; rows from the first NaN on are left out.
-    out_path: the .mp4 to write; complete or absent, whatever happens.
+    out_path: the .mp4 to write; it is complete or absent.
     dt: seconds between two rows of `qpos`.
-    camera: a camera of the model; by default one meant for looking on, else one that follows a floating base.
+    camera: a camera of the model; by default one made for videos, else one that follows a floating base.
     width: pixels, even.
     height: pixels, even.
     mocap_pos: [T, nmocap, 3].
     mocap_quat: [T, nmocap, 4].
-    seen: [T, H, W, 1 or 3] uint8, what a policy sees of it: shown on the right, as high as the video, its pixels apart.
-    timeout_s: when to give up; by default a minute and a half second a frame.
+    seen: [T, H, W, 1 or 3] uint8, the policy's images: shown on the right, as high as the video, without smoothing.
+    timeout_s: time limit; by default a minute and a half second a frame.
     notify: takes one sentence if there is no video.
 
   Returns:
-    `out_path`, or None if it could not be rendered.
+    `out_path`, or None if rendering failed.
   """
   out_path = Path(out_path).absolute()
   backend = find_gl()
@@ -81,7 +81,7 @@ def render_video(
   environment = gl_environment(backend) | {
     # The child runs this very package, whatever its folder.
     "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
-    "JAX_PLATFORMS": "cpu",  # and must never reach for the GPU memory that training holds
+    "JAX_PLATFORMS": "cpu",  # and must never use the GPU memory of training
   }
   scratch = Path(tempfile.gettempdir()).absolute() / f"playground_video_{secrets.token_hex(8)}"
   theirs, ours = os.pipe()
@@ -103,7 +103,7 @@ def render_video(
         reason = f"rendering with MUJOCO_GL={backend} took longer than {timeout_s:g} s"
       finally:
         with contextlib.suppress(OSError):
-          os.killpg(child.pid, signal.SIGKILL)  # the whole group: the encoder would live on and write its file
+          os.killpg(child.pid, signal.SIGKILL)  # the whole group: else the encoder would continue and write its file
   finally:
     os.close(theirs)
     os.close(ours)
@@ -115,10 +115,10 @@ def render_video(
 
 
 def need_place(video: str | None, camera: str | None = None) -> Path | None:
-  """Where `--video` says, None if it was not given.
+  """Returns the path of `--video`, None without one.
 
   Raises:
-    ConfigError: it cannot be written there, or only `--camera` was given.
+    ConfigError: the path is not writable, or only `--camera` was given.
   """
   if video is None:
     if camera is not None:
@@ -137,17 +137,17 @@ def need_camera(model: "mujoco.MjModel", name: str | None, option: str) -> None:
 
 
 def camera_names(model: "mujoco.MjModel") -> list[str]:
-  """Names of the model's cameras."""
+  """Returns the names of the model's cameras."""
   return [name for i in range(model.ncam) if (name := model.camera(i).name)]
 
 
 def frame_stride(dt: float) -> int:
-  """Returns every how many rows a frame is taken, so that playback is real time at no more than `MAX_FPS`."""
+  """Returns the rows between two frames, so that playback is real time at no more than `MAX_FPS`."""
   return max(1, math.ceil(1 / (MAX_FPS * dt) - 1e-6))
 
 
 def _pack(mj_model: "mujoco.MjModel", qpos: np.ndarray, **arrays: Any) -> bytes:
-  """A trajectory `qpos` [T, nq], its model and what else is not None, as the bytes of an .npz file."""
+  """Packs a trajectory `qpos` [T, nq], its model and other arrays that are not None as the bytes of an .npz file."""
   import mujoco
 
   qpos = np.asarray(qpos)
@@ -161,11 +161,11 @@ def _pack(mj_model: "mujoco.MjModel", qpos: np.ndarray, **arrays: Any) -> bytes:
 
 
 def _work(out_path: Path, scratch: Path, pipe: int) -> None:
-  """The child's work: makes the video in its scratch folder and puts it in its place."""
+  """Runs in the child: makes the video in its scratch folder and moves it to its path."""
   scratch.mkdir(mode=0o700)
   threading.Thread(target=_end_with_parent, args=(scratch, pipe), daemon=True).start()
   try:
-    os.chdir(scratch)  # what MuJoCo logs, and what a killed encoder leaves, goes with the folder
+    os.chdir(scratch)  # logs of MuJoCo, and files of a killed encoder, are removed with the folder
     rendered = scratch / "video.mp4"
     _render(io.BytesIO(sys.stdin.buffer.read()), rendered)
     out_path.parent.mkdir(parents=True, exist_ok=True)
@@ -176,8 +176,8 @@ def _work(out_path: Path, scratch: Path, pipe: int) -> None:
 
 
 def _end_with_parent(scratch: Path, pipe: int) -> None:
-  """Waits until the parent has died, however it did, then removes the scratch folder and ends, encoder included."""
-  os.read(pipe, 1)  # returns when nobody holds the other end any more
+  """Waits until the parent has died, then removes the scratch folder and ends with the encoder."""
+  os.read(pipe, 1)  # returns when the other end is closed
   for _ in range(_TRIES):
     if not scratch.exists():
       break
@@ -201,7 +201,7 @@ def _render(trajectory: io.BytesIO, out_path: Path) -> None:
     raise PlaygroundError("the trajectory has no finite state to draw.")
   model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
   model.vis.global_.offheight = max(height, model.vis.global_.offheight)
-  # Measured without a GPU, 640x480: 18 ms a frame instead of 30 at MuJoCo's 4096, and no difference to the eye.
+  # Measured without a GPU, 640x480: 18 ms a frame instead of 30 at MuJoCo's 4096, and no visible difference.
   model.vis.quality.shadowsize = min(2048, model.vis.quality.shadowsize)
   stride = frame_stride(dt)
   seen = saved.get("seen")
@@ -230,7 +230,7 @@ def _render(trajectory: io.BytesIO, out_path: Path) -> None:
 
 
 def enlarged(picture: np.ndarray, height: int) -> np.ndarray:
-  """A picture [H, W, 1 or 3] of `height` rows and an even number of columns, [height, width, 3]; pixels stay sharp."""
+  """Enlarges an image [H, W, 1 or 3] to `height` rows and an even width, [height, width, 3], without smoothing."""
   rows, columns = picture.shape[:2]
   width = 2 * max(1, round(height * columns / rows / 2))
   picture = picture[np.arange(height)[:, None] * rows // height, np.arange(width) * columns // width]
@@ -238,7 +238,7 @@ def enlarged(picture: np.ndarray, height: int) -> np.ndarray:
 
 
 def choose_camera(model: "mujoco.MjModel", name: str | None = None) -> "str | mujoco.MjvCamera":
-  """Returns the named camera, or the best one the model offers for looking at it from outside."""
+  """Returns the named camera, or the model's best one for videos."""
   import mujoco
 
   need_camera(model, name, "camera")
@@ -253,7 +253,7 @@ def choose_camera(model: "mujoco.MjModel", name: str | None = None) -> "str | mu
 
 
 def follow(view: "mujoco.MjvCamera", model: "mujoco.MjModel") -> None:
-  """Has a free camera (an MjvCamera) follow a robot that walks; on others it stays as it is."""
+  """Makes a free camera (an MjvCamera) follow a robot that walks; others stay fixed."""
   import mujoco
 
   if walks(model):
@@ -262,7 +262,7 @@ def follow(view: "mujoco.MjvCamera", model: "mujoco.MjModel") -> None:
 
 
 def walks(model: "mujoco.MjModel") -> bool:
-  """Whether to follow what moves first: a robot that walks out of the picture, but no free object on a table."""
+  """Whether to follow the first body: a robot that may walk out of the image, but no free object on a table."""
   import mujoco
 
   roots = [model.body_rootid[b] for b in model.jnt_bodyid]

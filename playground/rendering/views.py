@@ -1,4 +1,4 @@
-"""A contact sheet: what a task's camera sees at the start of episodes, each on a randomised model of its own."""
+"""Writes a contact sheet: images of a task's camera at the start of episodes, each on its own randomised model."""
 
 import math
 from collections.abc import Mapping
@@ -18,17 +18,17 @@ _GAP = 2  # pixels between two views
 
 
 def save_views(env: Env, events: Mapping[str, object], path: str | Path, count: int = 16, seed: int = 0) -> Path:
-  """Writes `count` views as one picture.
+  """Writes `count` views as one image.
 
   Args:
-    env: a task with pictures in its observation.
+    env: a task with images in its observation.
     events: `env.events`, see `Randomizer`.
     path: the .png to write.
     count: views, all rendered at once.
     seed: of episodes and models.
 
   Raises:
-    ConfigError: the task sees nothing, no views, or the file is not a .png that can be written.
+    ConfigError: the task has no images, no views, or the file is no writable .png.
   """
   import matplotlib.image
 
@@ -51,7 +51,7 @@ def save_views(env: Env, events: Mapping[str, object], path: str | Path, count: 
 
 
 def sheet(pictures: np.ndarray) -> np.ndarray:
-  """Lays pictures [N, H, W, 1 or 3] uint8 side by side in rows, one picture [..., 3]."""
+  """Arranges images [N, H, W, 1 or 3] uint8 in rows of one image [..., 3]."""
   count, height, width, _ = pictures.shape
   columns = math.ceil(math.sqrt(count))
   rows = math.ceil(count / columns)

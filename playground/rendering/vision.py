@@ -16,17 +16,17 @@ from playground.rendering.video import camera_names
 from playground.text import format_value
 
 _CHANNELS = {"rgb": 3, "gray": 1, "depth": 1, "segmentation": 1}
-_MAX_GEOMS = 255  # that a byte tells apart, beside nothing
+_MAX_GEOMS = 255  # ids that fit in a byte, beside nothing
 
 
 class Vision(Wrapper):
   """Adds the observation `pixels/<camera>` to a task's own: uint8 [height, width, channels].
 
-  Which of them an agent reads is its own choice (`agent.network.policy_obs_key`). Like the task it is for one
-  environment. An image shows the state that it comes with. With `frames` above 1 the last ones lie behind each other,
-  the newest last; the past is read out of the last observation, so an episode's frames are all of that episode: before
-  its first image there were only images like it. Brightness, a factor on all pixels, is drawn for every episode; an
-  auto-reset, which restores the first observation, restores that one's brightness for this step.
+  The agent chooses the groups that it reads (`agent.network.policy_obs_key`). Like the task it is for one environment.
+  An image shows the state of its observation. With `frames` above 1 the last images are stacked, the newest last; they
+  come from the last observation, so all are of one episode, whose first observation repeats the first image.
+  Brightness, a factor on all pixels, is drawn for every episode; an auto-reset, which restores the first observation,
+  restores its brightness for this step.
   """
 
   jitted, observation_size = Env.jitted, Env.observation_size
@@ -52,7 +52,7 @@ class Vision(Wrapper):
       raise ConfigError(f"env.vision.brightness={list(brightness)}: geoms have no brightness, leave it [1.0, 1.0].")
     self._image, self._camera, self._farthest = config.image, config.camera, config.farthest
     self._frames, self._brightness = config.frames, brightness
-    self._warp_model = env.mjx_model  # to be rendered, wherever the task is simulated later (`c_physics.py`)
+    self._warp_model = env.mjx_model  # the model to render, also where the task is simulated elsewhere (`c_physics.py`)
     size = {"width": config.width, "height": config.height}
     kind = "rgb" if self._image in ("rgb", "gray") else self._image
     looks = {"shadows": config.shadows, "textures": config.textures}
@@ -71,7 +71,7 @@ class Vision(Wrapper):
     state = self.env.reset(rng, model)
     info = state.info
     if self._varies:
-      key, draw = jax.random.split(jax.random.fold_in(rng, 1))  # leaves the task its own draws
+      key, draw = jax.random.split(jax.random.fold_in(rng, 1))  # does not change the draws of the task
       info = info | {"vision_rng": key, "brightness": self._draw(draw), "vision_first_step": jnp.ones((), bool)}
     frame, data = self._render(state.data, info, model)
     return self._with(state.replace(data=data, info=info), jnp.tile(frame, self._frames))
@@ -97,7 +97,7 @@ class Vision(Wrapper):
   def _render(
     self, data: PhysicsData, info: Mapping[str, PyTree], model: mjx.Model | None
   ) -> tuple[jax.Array, PhysicsData]:
-    """Renders the present image, [height, width, channels] uint8; returns also the state to go on with."""
+    """Renders the current image, [height, width, channels] uint8; also returns the state to continue with."""
     shown: Any = self.env.model_of(info, self._warp_model if model is None else model)
     images, data = self._renderer.render(shown, data)
     seen = images[self._camera]
@@ -114,6 +114,6 @@ class Vision(Wrapper):
     return (frame if frame.dtype == jnp.uint8 else jnp.round(frame).astype(jnp.uint8)), data
 
   def _with(self, state: State, frames: jax.Array) -> State:
-    """The state with the images in its observation."""
+    """Returns the state with images in its observation."""
     own = state.obs if isinstance(state.obs, Mapping) else {"state": state.obs}
     return state.replace(obs={**own, PIXELS + self._camera: frames})

@@ -1,4 +1,4 @@
-"""How a robot looks in videos: our drawn primitives, or the meshes of its model in MuJoCo Menagerie."""
+"""Chooses the visuals of a robot in videos: our primitives, or the meshes of its model in MuJoCo Menagerie."""
 
 from pathlib import Path
 from typing import Any
@@ -24,17 +24,17 @@ _DRAWN = 3  # geoms of groups below are drawn
 
 
 def drawn_model(env: Env, visuals: str) -> mujoco.MjModel:
-  """The model to draw a task's `qpos` with.
+  """Returns the model for rendering a task's `qpos`.
 
   Args:
     env: the task.
     visuals: `primitives`, the task's own model, or `menagerie`, the same with the robot's meshes (downloaded once by
-      the package mujoco-menagerie). What is simulated is the same.
+      the package mujoco-menagerie). The simulation is the same.
 
   Raises:
     UnknownNameError: no such visuals.
     ConfigError: the task's robot is not in Menagerie, or the package is not installed.
-    HardwareError: the meshes are not in the package's cache and cannot be downloaded.
+    HardwareError: the meshes are not in the package's cache, and the download failed.
   """
   return lookup({"primitives": lambda env: env.mj_model, "menagerie": _with_meshes}, visuals, "video.visuals")(env)
 
@@ -66,7 +66,7 @@ def _menagerie_spec(robot: str) -> mujoco.MjSpec:
 def dress(spec: mujoco.MjSpec, source: mujoco.MjSpec) -> None:
   """Draws the bodies of `spec` with the mesh geoms that the bodies of the same names have in `source`.
 
-  A body's own drawn geoms go; geoms that collide, and bodies without a namesake, stay as they are.
+  The visual geoms of these bodies are removed; colliding geoms, and bodies without a namesake, stay.
 
   Raises:
     ConfigError: no body has a namesake with meshes.

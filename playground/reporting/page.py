@@ -1,4 +1,4 @@
-"""A page as a list of blocks, written as Markdown with pictures beside it or as one HTML file; the text of numbers."""
+"""A page as a list of blocks, written as Markdown with figures beside it or as one HTML file; formatting of numbers."""
 
 import base64
 import dataclasses
@@ -23,7 +23,7 @@ class Text:
 
 
 class Link(str):
-  """A cell that leads to a file beside the page."""
+  """A cell with a link to a file beside the page."""
 
   target: str
 
@@ -70,12 +70,12 @@ svg,img{max-width:100%;height:auto} figcaption{font-size:.9rem;color:#555}
 
 
 def to_markdown(blocks: Iterable[Block], pictures: str) -> str:
-  """Markdown; pictures are files `<pictures>/<name>.svg`."""
+  """Returns Markdown; figures are files `<pictures>/<name>.svg`."""
   return "\n\n".join(_markdown(block, pictures) for block in blocks) + "\n"
 
 
 def to_html(blocks: Sequence[Block], title: str) -> str:
-  """One HTML file that needs nothing beside it."""
+  """Returns one HTML file without external files."""
   body = "\n".join(_html(block) for block in blocks)
   head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
   return f"<!doctype html>\n<html lang=en><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
@@ -124,19 +124,19 @@ def _cell(cell: str) -> str:
 
 
 def _numeric(table: Table) -> list[bool]:
-  """For each column, whether what is in it are numbers."""
+  """Returns for each column whether it holds numbers."""
   is_number = lambda cell: not isinstance(cell, Link) and (cell[:1].isdigit() or cell in ("", NOT_MEASURED))
   columns = [[row[i] for row in table.rows] for i in range(len(table.header))]
   return [all(map(is_number, column)) and any(cell[:1].isdigit() for cell in column) for column in columns]
 
 
 def short(value: float) -> str:
-  """A number with four digits, or all before the point."""
+  """Formats a number with four digits, or all before the point."""
   return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def mean_and_ci95(values: Iterable[float]) -> tuple[float, float | None]:
-  """Mean, and half the width of its 95 % confidence interval (Student's t); None from one value."""
+  """Returns the mean, and half the width of its 95 % confidence interval (Student's t; None for one value)."""
   import numpy as np
 
   sample = np.asarray(list(values), float)
@@ -146,7 +146,7 @@ def mean_and_ci95(values: Iterable[float]) -> tuple[float, float | None]:
 
 
 def t_factor(count: int) -> float:
-  """Half the width of a mean's 95 % confidence interval over the standard deviation of `count` values."""
+  """Returns the half-width of a mean's 95 % confidence interval in units of the std of `count` values."""
   from scipy.special import stdtrit
 
   return float(stdtrit(count - 1, 0.975)) / count**0.5 if count > 1 else 0.0

@@ -1,7 +1,7 @@
-"""`playground-bench gate`: has something become slower? Ratios within one run, so that any machine can tell.
+"""`playground-bench gate`: finds slowdowns by ratios within one run, which hold on any machine.
 
-Each check takes the processor time of a piece of ours and, in turn with it, that of a workload which has nothing of
-ours in it but uses the machine in the same way; the ratio is compared with the committed one (`benchmarks/gate.csv`).
+Each check measures the processor time of a piece of our code and, in turns, that of a reference workload without our
+code that uses the machine in the same way; the ratio is compared with the committed one (`benchmarks/gate.csv`).
 """
 
 import csv
@@ -36,7 +36,7 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-  """What a check may be: the committed ratio, and the factor on it from which on it fails."""
+  """The limit of a check: the committed ratio, and the factor above which it fails."""
 
   ratio: float
   tolerance: float
@@ -77,7 +77,7 @@ def run(options: Options) -> int:
 
 
 def judge(checks: "Mapping[str, Callable[[], Pair]]", limits: Mapping[str, Limit], repeats: int) -> int:
-  """Compares checks with their limits; a ratio above its limit must show a second time. Returns the exit code."""
+  """Compares checks with their limits; a ratio above its limit is measured a second time. Returns the exit code."""
   slow = []
   if new := next((name for name in checks if name not in limits), None):
     raise ConfigError(f"{new} has no committed ratio: `playground-bench gate update=true checks={new}` adds it.")
@@ -95,14 +95,14 @@ def judge(checks: "Mapping[str, Callable[[], Pair]]", limits: Mapping[str, Limit
 
 
 def measure(pair: "Pair", repeats: int) -> float:
-  """Median over turns of the time that ours takes as a multiple of the reference's, one right after the other."""
+  """Returns the median over turns of our time over the reference's, measured right after each other."""
   for timed in pair:
     timed()
   return statistics.median(_seconds(pair[0]) / _seconds(pair[1]) for _ in range(repeats))
 
 
 def _seconds(timed: "Timed") -> float:
-  """Processor time of all threads of this process: what others do on the machine is hardly in it."""
+  """Returns the processor time of all threads of this process, which other processes hardly affect."""
   begin = time.process_time()
   timed()
   return time.process_time() - begin

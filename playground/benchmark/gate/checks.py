@@ -1,4 +1,4 @@
-"""What the gate times: pieces of ours, each with a reference; small, on the CPU."""
+"""The checks of the gate: small pieces of our code on the CPU, each with a reference."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,13 +18,13 @@ from playground.pytree import PyTree
 
 jax.config.update("jax_platforms", "cpu")
 
-Timed = Callable[[], object]  # does its work and waits for it
+Timed = Callable[[], object]  # runs and waits for the result
 Pair = tuple[Timed, Timed]  # ours and the reference, both compiled
 LENGTH = 20  # control steps of one call
 
 
 def env_step(task: str, num_envs: int) -> Pair:
-  """A task's training step, over MJX alone stepping the same model as often."""
+  """A task's training step, over the same number of MJX steps of the same model."""
   env = registry.load(task, overrides={"impl": "jax"})
   wrapped = wrap_for_training(env)
 
@@ -49,7 +49,7 @@ def training_step(agent: str, overrides: tuple[str, ...], layers: tuple[int, int
 
   Args:
     agent: ppo or sac.
-    overrides: sizes that make it so.
+    overrides: sizes.
     layers: rows, width and number of the products.
   """
   config = compose(["env=CartpoleBalance", f"agent={agent}", "env.impl=jax", *overrides])

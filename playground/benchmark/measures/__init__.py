@@ -1,1 +1,1 @@
-"""What a worker runs: a module each, with `measure(facts, **arguments)`."""
+"""The measurements that a worker runs: modules with `measure(facts, **arguments)`."""

@@ -1,4 +1,4 @@
-"""The time of each part of training: the loop with its parts added one by one, as in the paper's pixel tables."""
+"""Measures the time of each part of training: adds parts to the loop one by one, as in the paper's pixel tables."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -43,7 +43,7 @@ def measure(
   watch_memory: bool = False,
   until: str = "update",
 ) -> None:
-  """A row for each of `PARTS` up to `until`: seconds a control step of one environment takes with all parts so far.
+  """Emits a row for each of `PARTS` up to `until`: seconds of a control step with all parts so far.
 
   The parts take turns, and the best turn of each counts, since their differences matter. The memory is that of all
   parts together: JAX's, and with `watch_memory` the GPU driver's.
@@ -78,9 +78,9 @@ def measure(
 
 
 def _repeat(subject: Subject, run: Run, carry: PyTree) -> Callable[[int], PyTree]:
-  """A function that does `run` a number of times, each time on from where it was."""
+  """Returns a function that repeats `run`, each time from its last state."""
   run = jax.jit(run, donate_argnums=0)
-  carry = jax.tree.map(jnp.copy, carry)  # parts begin in the same state, and each takes its carry's buffers over
+  carry = jax.tree.map(jnp.copy, carry)  # parts start from the same state, and each donates the buffers of its carry
 
   def call(count: int) -> PyTree:
     nonlocal carry
@@ -93,7 +93,7 @@ def _repeat(subject: Subject, run: Run, carry: PyTree) -> Callable[[int], PyTree
 
 
 def _train(subject: Subject, state: TrainState) -> Callable[[int], PyTree]:
-  """A function that does a number of training steps that learn."""
+  """Returns a function that makes a number of training steps."""
   trainer = subject.trainer
 
   def call(count: int) -> PyTree:
@@ -106,7 +106,7 @@ def _train(subject: Subject, state: TrainState) -> Callable[[int], PyTree]:
 
 
 def _rolls(subject: Subject, state: TrainState, length: int) -> dict[str, tuple[Run, PyTree, int]]:
-  """The parts up to the update: what runs `length` steps, what it carries, control steps that each counts for."""
+  """Returns the parts before the update: function of `length` steps, its carry, control steps of each."""
   trainer, env = subject.trainer, subject.trainer.env
   task, repeat, num_envs = env.unwrapped, env.action_repeat, trainer.config.num_envs
   bare, policy = Vectorize(task), trainer.policy(state)
@@ -118,7 +118,7 @@ def _rolls(subject: Subject, state: TrainState, length: int) -> dict[str, tuple[
     return lambda state, model, key: env.step(state, random_actions(key), model)
 
   def act(carry: PyTree, model: ModelFields, key: jax.Array) -> PyTree:
-    state, policy = carry  # carried along, for what a function merely refers to is compiled into it
+    state, policy = carry  # in the carry, because closed-over arrays are compiled in as constants
     return env.step(state, trainer.act(policy, state.obs, key, False), model), policy
 
   def advance(data: PhysicsData, fields: dict[str, jax.Array]) -> PhysicsData:

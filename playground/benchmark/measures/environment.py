@@ -1,4 +1,4 @@
-"""Environment steps alone, with random actions."""
+"""Measures environment steps alone, with random actions."""
 
 import jax
 
@@ -9,9 +9,9 @@ LENGTH = 20  # control steps of one call
 
 
 def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float) -> None:
-  """A row for env steps a second of as many environments as `agent.num_envs` says, and one for memory.
+  """Emits a row for env steps/s of `agent.num_envs` environments, and one for memory.
 
-  The environments are those that a trainer steps: guarded, limited, reset when done, on randomised models.
+  The environments are wrapped as in training: guard, time limit, auto-reset, randomised models.
   """
   subject = Subject.build(facts, task, agent, overrides)
   env, model, num_envs = subject.trainer.env, subject.model, subject.trainer.config.num_envs

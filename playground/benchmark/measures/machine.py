@@ -17,17 +17,17 @@ from playground.runs.provenance import package_versions
 
 _NAMES = {"python": "Python", "jax": "JAX", "mujoco": "MuJoCo", "mujoco-mjx": "MJX", "warp-lang": "Warp"}
 
-INTERVAL_S = 0.5  # between two questions to the driver
+INTERVAL_S = 0.5  # s between two queries of the driver
 
 
 def measure(facts: Facts, overrides: list[str]) -> None:
-  """A row whose value is the number of devices of a run with these overrides."""
+  """Emits a row with the number of devices of a run with these overrides."""
   hardware = setup(compose(["env=CartpoleBalance", *overrides]).hardware)
   facts.emit("devices", hardware.mesh.size, "", device=device_name(), versions=versions())
 
 
 def device_name() -> str:
-  """The kind of device; of a CPU also which one and how many cores, else two laptops are the same device."""
+  """Returns the kind of device; of a CPU also its model and number of cores, to distinguish machines."""
   kind = jax.devices()[0].device_kind
   if jax.devices()[0].platform != "cpu":
     return kind
@@ -37,7 +37,7 @@ def device_name() -> str:
 
 
 def versions() -> str:
-  """Versions of the packages that decide speed, in one line."""
+  """Returns the versions of packages that affect speed, in one line."""
   found = package_versions()
   parts = [f"{name} {found[key]}" for key, name in _NAMES.items() if found.get(key)]
   driver = _query_gpu("driver_version")
@@ -46,9 +46,9 @@ def versions() -> str:
 
 @contextlib.contextmanager
 def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
-  """A row for the most memory in use on the GPU during the block beyond what was before it; none without a GPU.
+  """Emits a row for the peak GPU memory during the block above that before it; none without a GPU.
 
-  The driver is asked twice a second, so that memory outside JAX (Warp's arrays, compiled code) counts.
+  It queries the driver twice a second, so that memory outside JAX (Warp's arrays, compiled code) counts.
   """
   ask = lambda: float(_query_gpu("memory.used") or "nan")
   before, most, ended = ask(), 0.0, threading.Event()
@@ -69,7 +69,7 @@ def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
 
 
 def _query_gpu(field: str) -> str | None:
-  """A field of nvidia-smi for the first GPU that this process may use; None without one."""
+  """Returns a field of nvidia-smi for the first GPU of this process; None without one."""
   first = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0] or "0"
   if not shutil.which("nvidia-smi"):
     return None

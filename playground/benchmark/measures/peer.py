@@ -1,4 +1,4 @@
-"""The public package's training, run by its own interpreter (`playground/benchmark/peer/`)."""
+"""Measures the public package's training, run by its own interpreter (`playground/benchmark/peer/`)."""
 
 import json
 import math
@@ -23,7 +23,7 @@ class PeerFailedError(PlaygroundError):
 
 
 def rates(facts: Facts, task: str, seconds: float, backend: str, seeds: list[int], peer: dict[str, str]) -> None:
-  """Rows for the best epoch's steps a second, time to the first update and memory, as `training` has them of ours."""
+  """Emits rows for steps/s of the best epoch, time to the first update and memory, like `training` for ours."""
   (seed,) = seeds
   job = {"task": task, "backend": backend, "seed": seed, "steps": _epoch_steps(task, seconds), "epochs": EPOCHS}
   with used_memory(facts, seed):
@@ -42,7 +42,7 @@ def whole(
   facts: Facts, task: str, agent: str, num_timesteps: int | None, backend: str, told: list[str], seeds: list[int],
   peer: dict[str, str],
 ) -> None:  # fmt: skip
-  """Rows as `runs.whole` has them of ours, with the peer's own evaluations.
+  """Emits rows like `runs.whole` for ours, with the peer's own evaluations.
 
   Its wall-clock time differs: the peer compiles its training while it runs.
   """
@@ -60,18 +60,18 @@ def whole(
 
 
 def drive(facts: Facts, peer: dict[str, str], job: Mapping[str, object]) -> dict[str, Any]:
-  """Runs a job in the peer's driver, and fills in the facts that its rows share.
+  """Runs a job in the peer's driver, and fills in the columns that its rows share.
 
   Args:
-    facts: of the rows.
+    facts: columns of the rows.
     peer: its `name`, `python` (interpreter), `path` (PYTHONPATH) and `menagerie` (folder of robot models).
     job: the driver's argument.
 
   Raises:
-    PeerFailedError: it ended with an error, or was ended.
+    PeerFailedError: it failed, or was killed.
   """
   env = {**os.environ, "PYTHONPATH": peer["path"], "PEER_MENAGERIE": peer["menagerie"]}
-  env.pop("JAX_COMPILATION_CACHE_DIR", None)  # the peer keeps no compiled programs
+  env.pop("JAX_COMPILATION_CACHE_DIR", None)  # the peer does not cache compiled programs
   command = [peer["python"], "-W", "ignore", str(PEERS[peer["name"]].driver), json.dumps(job)]
   done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=env)
   lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
@@ -83,7 +83,7 @@ def drive(facts: Facts, peer: dict[str, str], job: Mapping[str, object]) -> dict
 
 
 def _epoch_steps(task: str, seconds: float) -> int:
-  """Control steps that take about `seconds`, from the paper's rate on its A100."""
+  """Returns control steps that take about `seconds`, from the paper's rate on its A100."""
   rows = [row for suite in SUITES for row in paper_table(f"{suite}_throughput") if row["registry_env"] == task]
   rate = float(rows[0]["ppo_sps_mean"]) if rows else 250_000.0
   return math.ceil(1.5 * rate * seconds)

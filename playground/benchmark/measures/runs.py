@@ -1,4 +1,4 @@
-"""Whole commands: `playground-run` to its first update or to its end, and curricula stage by stage."""
+"""Measures whole commands: `playground-run` to its first update or its end, and curricula stage by stage."""
 
 import hashlib
 import itertools
@@ -31,11 +31,11 @@ class RunFailedError(PlaygroundError):
 
 
 def startup(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float) -> None:
-  """Rows `cold` and `warm`: the same command twice in fresh processes, its budget cut to the first update that learns.
+  """Emits rows `cold` and `warm`: the same command twice in new processes, up to the first update that learns.
 
   Evaluation is compiled, too; the one before training runs after the first training call, as in any run.
   """
-  del seconds  # this times one run as it is
+  del seconds  # measures one run unchanged
   chosen = [f"env={task}", f"agent={agent}", *overrides]
   with tempfile.TemporaryDirectory() as folder:
     short = [f"agent.num_timesteps={_one_update(compose(chosen))}", "agent.num_evals=2", "agent.num_resets_per_eval=0"]
@@ -50,9 +50,9 @@ def startup(facts: Facts, task: str, agent: str, overrides: list[str], seconds: 
 
 
 def whole(facts: Facts, task: str, agent: str, overrides: list[str], told: list[str], seeds: list[int]) -> None:
-  """A row for each evaluation, `step=<steps trained>`, then those of the whole run, the last evaluation's return last.
+  """Emits a row for each evaluation, `step=<steps trained>`, then those of the whole run, the final return last.
 
-  The whole run has the device to itself, its compiling too. `told` is the measurement's setting, to which an
+  The whole run, compilation included, has the device alone. `told` is the measurement's setting, to which an
   evaluation's row adds its step.
   """
   (seed,) = seeds
@@ -72,7 +72,7 @@ def whole(facts: Facts, task: str, agent: str, overrides: list[str], told: list[
 
 
 def chain(facts: Facts, experiment: str, overrides: list[str], runs: str, again: bool, seeds: list[int]) -> None:
-  """Rows for each stage of a curriculum, `stage=<name>`, and for all together, `stage=all`.
+  """Emits rows for each stage of a curriculum, `stage=<name>`, and for the whole, `stage=all`.
 
   An unfinished run of the same experiment, overrides and seed is resumed; its times are sums over its starts. A
   finished one is read, and its commit is the rows', unless `again` asks for a new one.
@@ -94,7 +94,7 @@ def chain(facts: Facts, experiment: str, overrides: list[str], runs: str, again:
 
 
 def golden(facts: Facts, overrides: list[str], metrics: list[str], settings: list[str]) -> None:
-  """A row for each of a run's metrics: the last value of that column of metrics.csv; `settings` are their `setting`."""
+  """Emits a row for each metric of a run: the last value of its column of metrics.csv, with its `setting`."""
   with tempfile.TemporaryDirectory() as folder:
     run = RunDirectory(Path(folder) / "run")
     run_training([*overrides, "video.enable=false", "tracking=csv", f"run_dir={run.path}"])
@@ -113,7 +113,7 @@ def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
   with subprocess.Popen(
     command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace", env=env
   ) as process:
-    signal.signal(signal.SIGTERM, lambda *_: process.terminate())  # it saves, and this process waits for that
+    signal.signal(signal.SIGTERM, lambda *_: process.terminate())  # it saves, and this process waits
     out, errors = process.communicate()
   if process.returncode:
     lines = (errors or out).strip().splitlines()
@@ -122,7 +122,7 @@ def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
 
 
 def facts_of(manifest: Mapping[str, object]) -> dict[str, object]:
-  """Columns of a row, from a run's manifest."""
+  """Returns columns of a row, from a run's manifest."""
   precision = f"physics {manifest['matmul_precision']}, networks {manifest['network_precision']}"
   return {"backend": manifest["impl"], "devices": manifest["num_devices"], "precision": precision}
 
@@ -134,27 +134,27 @@ def emit_returns(
   seed: int,
   quantity: str = "return",
 ) -> None:
-  """A row for each evaluation: (steps trained, mean return, seconds into the run)."""
+  """Emits a row for each evaluation: (steps trained, mean return, seconds into the run)."""
   for step, score, seconds in evaluations:
     columns = {"setting": " ".join((*setting, f"step={step:.0f}")), "seed": seed}
     facts.emit(quantity, score, "", **columns, conditions=f"{facts['conditions']}; after {seconds:.1f} s")
 
 
 def emit_result(facts: Facts, result: Mapping[str, float | None], quantities: Sequence[str], **columns: object) -> None:
-  """A row for each quantity that the result of a run has, in their order."""
+  """Emits a row for each quantity of the result of a run, in order."""
   for quantity in quantities:
     if (value := result.get(quantity)) is not None:
       facts.emit(quantity, value, _UNITS.get(quantity, ""), **columns)
 
 
 def _one_update(config: RunConfig) -> int:
-  """The budget (control steps) with which something is learned once."""
+  """Returns the budget (control steps) of one update that learns."""
   settings = config.agent
   return (settings.prefill_updates + 1) * settings.steps_per_update * config.env.action_repeat
 
 
 def _chain_run(runs: Path, experiment: str, overrides: list[str], seed: int, again: bool) -> RunDirectory:
-  """The run directory, one for each set of overrides; if `again`, the first of the numbered that is not finished."""
+  """Returns the run directory, one for each set of overrides; with `again`, the first unfinished numbered one."""
   told = [hashlib.sha256(" ".join(overrides).encode()).hexdigest()[:8]] if overrides else []
   name = "_".join([experiment, *told, f"seed_{seed}"])
   numbered = (name if number == 1 else f"{name}_{number}" for number in itertools.count(1))

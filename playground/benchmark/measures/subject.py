@@ -1,4 +1,4 @@
-"""Shared by the measurements: a task with its trainer, clocks, and the facts of this process."""
+"""Shared by the measurements: a task with its trainer, clocks, and columns of this process."""
 
 import contextlib
 import dataclasses
@@ -45,7 +45,7 @@ class Subject:
 
   @classmethod
   def build(cls, facts: Facts, task: str, agent: str, overrides: Sequence[str], num_agents: int = 1) -> "Subject":
-    """Builds it, one run or several agents in one program, and fills in the facts that its rows share."""
+    """Builds the subject, of one agent or several in one program, and fills in the columns that its rows share."""
     config = compose([f"env={task}", f"agent={agent}", *overrides])
     hardware = setup(config.hardware)
     if config.hardware.scale_envs:
@@ -72,17 +72,17 @@ class Subject:
 
   @functools.cached_property
   def model(self) -> ModelFields:
-    """The training environments' randomised models."""
+    """Returns the randomised models of the training environments."""
     return self.draw(self.config.seed)[0]
 
   def key(self, seed: int) -> jax.Array:
-    """A random key, on all devices; of several agents one each."""
+    """Returns a random key, on all devices; of several agents one each."""
     keys = [np.asarray(jax.random.PRNGKey(seed + i)) for i in range(max(self.trainer.num_agents, 1))]
     return put(self.trainer.join(keys), self.trainer.mesh, P())
 
 
 def told(overrides: Sequence[str]) -> list[str]:
-  """The overrides that a row's setting shows: all but the default of one device."""
+  """Returns the overrides in a row's setting: all but the default of one device."""
   return [text for text in overrides if text != ONE_DEVICE]
 
 
@@ -94,7 +94,7 @@ def _precision(hardware: Hardware, trainer: Trainer) -> str:
 
 @contextlib.contextmanager
 def alone(lock: str | None) -> Iterator[None]:
-  """Holds the device during the block: other measurements wait with their timing (they may compile)."""
+  """Locks the device during the block: other measurements may compile, but wait with their timing."""
   if lock is None:
     yield
     return
@@ -104,22 +104,22 @@ def alone(lock: str | None) -> Iterator[None]:
 
 
 def rate(call: Callable[[int], PyTree], steps: int, seconds: float) -> tuple[float, float]:
-  """How fast something repeats.
+  """Measures a rate.
 
   Args:
-    call: does a number of repetitions and returns what it computed; called before, so nothing is compiled any more.
-    steps: what one repetition counts for.
-    seconds: how long to time it, at least one repetition.
+    call: makes a number of repetitions and returns their result; already compiled.
+    steps: of one repetition.
+    seconds: duration of the measurement, at least one repetition.
 
   Returns:
-    Steps a second over all of the time, and that time (s).
+    Steps a second over the whole time, and that time (s).
   """
   begin = time.perf_counter()
   jax.block_until_ready(call(1))
   taken = time.perf_counter() - begin
   if taken >= seconds:
     return steps / taken, taken
-  each = max(1, math.ceil(min(1.0, seconds) / taken))  # calls of about a second: the host's share of one is nothing
+  each = max(1, math.ceil(min(1.0, seconds) / taken))  # calls of about a second: the host's overhead is negligible
   done, begin = 0, time.perf_counter()
   while (taken := time.perf_counter() - begin) < seconds:
     jax.block_until_ready(call(each))
@@ -128,14 +128,14 @@ def rate(call: Callable[[int], PyTree], steps: int, seconds: float) -> tuple[flo
 
 
 def peak_memory_gib() -> float | None:
-  """Most that JAX's allocator held on any device, None where it does not say (CPU)."""
+  """Returns the peak of JAX's allocator on any device, GiB; None if unknown (CPU)."""
   peaks = [(device.memory_stats() or {}).get("peak_bytes_in_use") for device in jax.local_devices()]
   known = [peak for peak in peaks if peak is not None]
   return max(known) / 2**30 if known else None
 
 
 def emit_peak(facts: Facts, **columns: object) -> None:
-  """A row for the memory, where it is known."""
+  """Emits a row for the peak memory, if known."""
   peak = peak_memory_gib()
   if peak is not None:
     facts.emit("peak_memory_gib", peak, "GiB", **columns)

@@ -1,4 +1,4 @@
-"""Training alone, at full speed: what the paper's throughput tables measure."""
+"""Measures training alone, at full speed, as in the paper's throughput tables."""
 
 from contextlib import nullcontext
 from functools import partial
@@ -23,20 +23,20 @@ def measure(
   watch_memory: bool = False,
   num_agents: int = 1,
 ) -> None:
-  """Rows for compile time, time to the first update and memory, and for each seed the steps a second.
+  """Emits rows for compile time, time to the first update, memory, and for each seed steps/s.
 
-  A seed starts from new networks, environments and randomised models; its first update is not timed. The time holds no
-  evaluation and no reset of all environments. One compilation serves all seeds.
+  A seed starts from new networks, environments and randomised models; its first update is not timed. The time
+  includes no evaluation and no full reset. One compilation serves all seeds.
 
   Args:
-    facts: takes the rows.
-    task: which.
+    facts: for the rows.
+    task: its name.
     agent: an option of the group.
     overrides: of the run's configuration.
     seeds: of the trainings.
-    seconds: how long to time each, at least one update.
-    watch_memory: ask the GPU's driver, too, how much is in use.
-    num_agents: how many train in one program, each from a seed of its own; their steps are added up.
+    seconds: duration of each measurement, at least one update.
+    watch_memory: whether to query the GPU driver for the memory in use.
+    num_agents: agents in one program, each with a seed of its own; their steps are added up.
   """
   with used_memory(facts, seeds[0]) if watch_memory else nullcontext():
     subject = Subject.build(facts, task, agent, overrides, num_agents)
@@ -49,7 +49,7 @@ def measure(
     for seed in seeds:
       model = program.model if seed == seeds[0] else subject.draw(seed)[0]
       with alone(facts.lock):
-        state = None  # the last seed's goes before the next one's comes: a replay buffer is large
+        state = None  # frees the last seed's state before the next one: a replay buffer is large
         state = program.init(subject.key(seed), model, None, trainer.settings)
 
         def train(count: int) -> jax.Array:
@@ -58,7 +58,7 @@ def measure(
           return metrics["nonfinite"]
 
         jax.block_until_ready(train(warm_up))
-        if seed == seeds[0] and facts.lock is None:  # with a lock, waiting for it would be in the time
+        if seed == seeds[0] and facts.lock is None:  # with a lock, the time would include waiting for it
           facts.emit("start_to_first_update_s", process_age_s(), "s", seed=seed)
         speed, timed = rate(train, trainer.steps_per_update * num_agents, seconds)
       how = f"{timed:.1f} s timed after the first update, no evaluation, no outer resets"

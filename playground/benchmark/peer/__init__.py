@@ -1,4 +1,4 @@
-"""Other packages to measure beside ours; each lives in an environment of its own, none is a dependency."""
+"""Other packages to compare with; each is in an environment of its own, none is a dependency."""
 
 import os
 import subprocess
@@ -24,17 +24,17 @@ PEERS = {"playground020": Peer(Path(__file__).parent / "playground020.py", "play
 
 
 def check_peer(peer: str, python: str, path: str, menagerie: str) -> None:
-  """Asks the peer's interpreter for the package, and looks for its robots.
+  """Checks that the peer's interpreter has the package, and that its robots exist.
 
   Args:
     peer: one of `PEERS`.
     python: interpreter of the environment that it is installed in.
     path: PYTHONPATH of that interpreter.
-    menagerie: folder of robot models, one folder each; none where it fetches them itself.
+    menagerie: folder of robot models, one folder each; none if the package downloads them.
 
   Raises:
     UnknownNameError: there is no such peer.
-    ConfigError: the interpreter is not there, the package not installed for it, or the folder holds no robot.
+    ConfigError: the interpreter does not exist, lacks the package, or the folder holds no robot.
   """
   if peer not in PEERS:
     raise UnknownNameError(f"peer={peer} does not exist: choose from {', '.join(PEERS)}.{nearest(peer, PEERS)}")

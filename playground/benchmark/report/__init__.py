@@ -1,4 +1,4 @@
-"""`playground-bench report`: one page from everything that was measured, and the tables of the result pages."""
+"""`playground-bench report`: writes a page of all measurements, and the tables of the result pages."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ def run(options: Options) -> int:
   """Writes the page.
 
   Raises:
-    ConfigError: no rows anywhere, a file of them that is damaged, or a folder that cannot be read or written.
+    ConfigError: no rows, a damaged file, or a folder that is not readable or writable.
   """
   if options.pages is not None:
     pages = write_pages(Path(options.pages).expanduser(), Path(ROWS[0]))

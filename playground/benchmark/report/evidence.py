@@ -1,4 +1,4 @@
-"""What has been measured: rows of all tables, whoever wrote them, and learning curves."""
+"""Reads measurements: rows of all tables, and learning curves."""
 
 import csv
 import dataclasses
@@ -21,7 +21,7 @@ class Figure:
   Attributes:
     mean: over the rows.
     ci95: half the width of the confidence interval over seeds, None from one row.
-    rows: what it is the mean of; they agree in all but seed and value.
+    rows: of the mean; they differ in seed and value only.
   """
 
   mean: float
@@ -36,7 +36,7 @@ class Evidence:
   """All rows and curves below some folders."""
 
   def __init__(self, folders: Sequence[Path]):
-    self.files: list[Path] = []  # those that something was found in
+    self.files: list[Path] = []  # files with a used row
     self.rows: list[Row] = []
     self.curves: dict[str, list[tuple[float, float]]] = {}
     self.mode_curves: dict[str, list[tuple[float, float]]] = {}  # of the policy's mode, where `curves` is of samples
@@ -49,12 +49,12 @@ class Evidence:
       self.files += [path] * bool(rows or curves)
 
   def find(self, **wanted: str) -> list[Figure]:
-    """Figures of the rows with these columns, a GPU's before a CPU's, then the newest, then the largest."""
+    """Returns figures of the rows with these columns, sorted: GPU before CPU, then the newest, then the largest."""
     groups: dict[tuple[str, ...], dict[str, Row]] = {}
     for row in self.rows:
       if all(row[name] == text for name, text in wanted.items()):
         same = (str(row["source"]), *(row[name] for name in SAME))
-        groups.setdefault(same, {})[row["seed"]] = row  # measured again: the later one counts
+        groups.setdefault(same, {})[row["seed"]] = row  # measured again: the later row counts
     figures = []
     for rows in groups.values():
       mean, ci95 = mean_and_ci95(row["value"] for row in rows.values())
@@ -63,7 +63,7 @@ class Evidence:
     return sorted(figures, key=order)
 
   def best(self, **wanted: str) -> Figure | None:
-    """The first of `find`, None if there is none."""
+    """Returns the first of `find`, None if there is none."""
     return next(iter(self.find(**wanted)), None)
 
 
@@ -71,12 +71,12 @@ SAME = ("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "
 
 
 def _before(date: str) -> list[int]:
-  """A key that sorts later dates first."""
+  """Returns a key that sorts later dates first."""
   return [-ord(character) for character in date] or [0]
 
 
 def _read(path: Path) -> list[dict[str, str]]:
-  """Lines of a CSV, without those that a kill, or a command that is writing them now, left cut short."""
+  """Reads the rows of a CSV, without incomplete ones."""
   try:
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
       return [line for line in csv.DictReader(file) if None not in line.values()]
@@ -92,7 +92,7 @@ def _number(path: Path, text: str) -> float:
 
 
 def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
-  """Rows of a table in the columns of the schema; a table of whole runs has a column for each quantity."""
+  """Returns rows of a table in the columns of the schema; a table of whole runs has a column for each quantity."""
   if not lines or "task" not in lines[0]:
     return
   for line in lines:
@@ -106,7 +106,7 @@ def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
 
 
 def _curves(path: Path, lines: Sequence[dict[str, str]], column: str) -> dict[str, list[tuple[float, float]]]:
-  """Learning curves of a file, (steps, return in `column`) by name: one a run, where it says which."""
+  """Returns learning curves of a file, (steps, return in `column`) by name, one for each run."""
   curves: dict[str, list[tuple[float, float]]] = {}
   if (path.parent.parent / "config.yaml").is_file():  # a stage of a chain, whose own curve has it
     return curves

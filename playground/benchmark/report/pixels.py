@@ -1,4 +1,4 @@
-"""The page's section on pixels: steps a second and where they go, beside the paper's and other simulators'."""
+"""The section on pixels: steps/s and their parts, beside the paper's and other simulators'."""
 
 from collections.abc import Iterable, Mapping
 
@@ -11,14 +11,14 @@ from playground.reporting.page import Block, Heading, Table, Text
 SEEN = {"episodes": "state", "pixels": "+ pictures", "inference": "+ inference", "update": "+ training"}
 PARTS = ("physics", "rendering", "inference", "policy update")  # what each of them adds, as the paper calls it
 MEMORY = "used_memory_gib"
-PAPER = ("paper, Madrona", "64", "1024")  # who, side of the pictures, environments
+PAPER = ("paper, Madrona", "64", "1024")  # who, width of the images, environments
 _SIZES = ("env.vision.width", "env.vision.height", "agent.num_envs")
 
-Group = tuple[str, str, str, str, str]  # task, who, side of the pictures, environments, device
+Group = tuple[str, str, str, str, str]  # task, who, width of the images, environments, device
 
 
 def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Steps a second from pixels, beside the paper's and those of other simulators that it quotes."""
+  """Builds the section of steps/s from pixels, beside the paper's and those that it quotes."""
   yield Heading(2, "From pixels")
   yield Text(
     "Control steps a second with each part added; random actions before inference, a fresh policy after. The paper's: "
@@ -60,7 +60,7 @@ def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def _ours(evidence: Evidence) -> dict[tuple[Group, str], dict[str, Figure]]:
-  """What was measured, by part (or `MEMORY`), for each group and what else its setting says."""
+  """Returns measurements by part (or `MEMORY`), for each group and the rest of its setting."""
   groups: dict[tuple[Group, str], dict[str, Figure]] = {}
   memory = evidence.find(benchmark="pixels", quantity=MEMORY)
   for figure in reversed(evidence.find(benchmark="pixels", quantity="seconds_per_step") + memory):
@@ -76,7 +76,7 @@ def _ours(evidence: Evidence) -> dict[tuple[Group, str], dict[str, Figure]]:
 
 
 def _paper() -> dict[str, Mapping[str, float]]:
-  """Its steps a second, by task and component, in the order of `SEEN`."""
+  """Returns the paper's steps/s, by task and component, in the order of `SEEN`."""
   speeds: dict[str, dict[str, float]] = {}
   for row in paper_table("pixel_breakdown"):
     if row["kind"] == "measured":
@@ -85,6 +85,6 @@ def _paper() -> dict[str, Mapping[str, float]]:
 
 
 def _shares(seconds: list[float]) -> list[str]:
-  """What each part adds to the time of a step, and its share of the last one's, for times as in `SEEN`."""
+  """Returns the time that each part adds to a step, and its share of the total, for times as in `SEEN`."""
   added = [max(0.0, time - before) for time, before in zip(seconds, [0.0, *seconds[:-1]], strict=True)]
   return [f"{time * 1e6:.3g} ({time / seconds[-1]:.0%})" for time in added]

@@ -1,4 +1,4 @@
-"""The page's sections, each from the rows that its benchmark left; what is missing is said to be."""
+"""The page's sections, each from the rows of its benchmark; a missing one names its command."""
 
 import functools
 import re
@@ -22,14 +22,14 @@ _CURVE = re.compile(
 
 
 class Notes:
-  """Conditions, told once each below the tables."""
+  """Conditions, listed once each below the tables."""
 
   def __init__(self) -> None:
     self._texts: dict[str, int] = {}
 
   def number(self, figure: Figure) -> str:
-    """The note of a figure's conditions."""
-    untimed = re.sub(r"[\d.]+ s timed", "timed", figure["conditions"])  # else every seed has a note of its own
+    """Returns the number of the note on a figure's conditions."""
+    untimed = re.sub(r"[\d.]+ s timed", "timed", figure["conditions"])  # else every seed would have a note of its own
     commit = figure["commit"] and f"commit {figure['commit']}"
     parts = (figure["precision"], figure["versions"], figure["note"], untimed, commit)
     text = "; ".join(part for part in parts if part)
@@ -346,5 +346,5 @@ def _with_ci(figure: Figure) -> str:
 
 
 def nothing(command: str) -> Block:
-  """Says what would measure what is missing."""
+  """Names the command that measures a missing section."""
   return Text(f"{NOT_MEASURED.capitalize()}: `playground-bench {command}` does.")

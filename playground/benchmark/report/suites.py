@@ -1,6 +1,6 @@
 """The tables of the result pages and the grids of the gallery, from results/reference/ and the catalogue.
 
-A page is written by hand but for what stands between two comments, which `playground-bench report pages=docs` replaces.
+A page is written by hand except for the text between two comments, which `playground-bench report pages=docs` replaces.
 Each suite has a page with a row for each task and one with every run, where tasks that are not learnt come first.
 """
 
@@ -26,7 +26,7 @@ GALLERY = "gallery.md"
 GRID_BEGIN, GRID_END = GENERATED.format("grid {}"), "<!-- end of grid -->"
 _GRID_WIDTH = 4  # loops in a row
 _TITLES = {"open": "Not learnt yet", "learning": "Learning", "solved": "Solved"}
-# What a row says in columns of its own.
+# Settings that have columns of their own.
 _BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env=\w+| \(learning\)")
 _SHORT = {"agent.": "", "curriculum.": ""}
 _COLUMNS, _FIGURE = ("task", "run", "physics", "M steps", "return"), "success or falls"
