@@ -10,35 +10,33 @@ from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul, quat_to_mat
 
 from playground.envs.base import State
 from playground.envs.manipulation import arm, handover, peg, pick_cartesian, push
-from playground.envs.manipulation.arm import TabletopTask
-from playground.envs.task import InitialState
+from playground.envs.task import InitialState, Task
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.mdp.manipulators import ArmContext, ArmRobot
 from playground.physics.backend import PhysicsData, mjx
 from playground.robots.panda.kinematics import JOINT_RANGE, inverse_kinematics
 
 
-class _NoForward(TabletopTask):
+class NoForward(Task):
   """Resets compute no kinematics, so poses and sensors are 0 at first; what a task carries outlasts an auto-reset."""
 
   episode_info = ()
 
   def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:
-    ctrl = self.rest_ctrl(initial) if initial.ctrl is None else initial.ctrl
-    mocap = {name: getattr(initial, name) for name in ("mocap_pos", "mocap_quat")}
-    fields = {name: value for name, value in mocap.items() if value is not None}
-    return self.physics.make(qpos=initial.qpos, qvel=initial.qvel, ctrl=ctrl, **fields)
+    del model
+    given = {name: value for name, value in vars(initial).items() if value is not None}
+    return self.physics.make(**{"ctrl": self.rest_ctrl(initial), **given})
 
 
-class ArmTask(_NoForward, arm.ArmTask):
+class ArmTask(NoForward, arm.ArmTask):
   """Once the hand has reached the object, it counts as reached for the rest of the environment's life."""
 
 
-class SinglePegInsertion(_NoForward, peg.SinglePegInsertion):
+class SinglePegInsertion(NoForward, peg.SinglePegInsertion):
   """The first observation lacks poses."""
 
 
-class HandOver(_NoForward, handover.HandOver):
+class HandOver(NoForward, handover.HandOver):
   """The first observation lacks poses."""
 
   episode_info = ("first_step", "best_potential", "picked")
@@ -70,7 +68,7 @@ class OpenCabinet(ArmTask):
     return super().first_info(data, key, model) | {"target_pos": jnp.stack([x, jnp.zeros(()), jnp.array(0.5)])}
 
 
-class PickCubeCartesian(_NoForward, pick_cartesian.PickCubeCartesian):
+class PickCubeCartesian(NoForward, pick_cartesian.PickCubeCartesian):
   """The cube starts 3 cm inside the floor, the hand is called back from a start with the cube, no limits are known."""
 
   episode_info = ("reached_box", "first_step", "best_potential", "current_pos", "last_act")
@@ -107,7 +105,7 @@ class PickCubeCartesianVision(PickCubeCartesian, pick_cartesian.PickCubeCartesia
     return super().first_info(data, key, model) | {"target_pos": goal[0]}
 
 
-class PushCube(_NoForward, push.PushCube):
+class PushCube(NoForward, push.PushCube):
   """Zeros are observed until the first delayed observation arrives; delays and counters outlast an auto-reset.
 
   Limits are taken for ranges about 0, a new goal's place and turn come from one key, and levels have no end.

@@ -9,29 +9,21 @@ import jax.numpy as jnp
 import mujoco
 from mujoco.mjx._src.math import normalize
 
+from playground.compat020.arms import NoForward
 from playground.envs.manipulation import reorient, rotate
 from playground.envs.manipulation.in_hand import HandTask
-from playground.envs.task import InitialState
 from playground.mdp import events
 from playground.mdp.poses import Pose, sensed_pose, uniform_quat
-from playground.physics.backend import PhysicsData, mjx
 
 
-class _HandTask(HandTask):
-  """The goal is a cube that collides, a reset computes no kinematics, and `info` outlasts an auto-reset."""
-
-  episode_info = ()
+class _HandTask(NoForward, HandTask):
+  """The goal is a cube that collides."""
 
   def scene(self, config: Any) -> mujoco.MjSpec:
     spec = super().scene(config)
     block = spec.body("goal").geoms[-1]
     block.contype = block.conaffinity = 1
     return spec
-
-  def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:
-    del model
-    given = {name: value for name, value in vars(initial).items() if value is not None}
-    return self.physics.make(**{"ctrl": self.rest_ctrl(initial), **given})
 
 
 class RotateZ(_HandTask, rotate.RotateZ):

@@ -1,72 +1,7 @@
-"""Physics in plain C MuJoCo, behind the same two operations: any task runs on it as it is.
-
-It is the other simulator that a policy is tried in before a robot, and it needs no compiling. A batch is stepped one
-environment after another on one core, so it is for looking, not for training.
-"""
-
-import copy
-import threading
-
-import jax
-import mujoco
-import numpy as np
+"""Any task in plain C MuJoCo, as it is."""
 
 from playground.envs.base import Env
-from playground.errors import ConfigError
-from playground.physics.backend import STATE_FIELDS, Physics, PhysicsData, mjx
-
-
-class CPhysics(Physics):
-  """MuJoCo's own `mj_forward` and `mj_step`, called back from jitted code; see `Physics`.
-
-  A state is complete (`STATE_FIELDS`), so every call sets all of it and nothing is left over from the one before.
-  Within a control step MuJoCo computes in double precision; what a task keeps between them is single.
-  """
-
-  def __init__(self, mj_model: mujoco.MjModel, *, derived: tuple[str, ...]):
-    """Takes a model and the names out of `DERIVED_FIELDS` that the task reads."""
-    super().__init__(mj_model, derived=derived)
-    self._c_model = copy.copy(mj_model)
-    # C MuJoCo starts an unstable simulation anew. Its numbers should show instead, as MJX's do.
-    self._c_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    self._c_data = mujoco.MjData(self._c_model)
-    self._lock = threading.Lock()  # programs may run at the same time
-    example = self._keep(self._template())
-    self._shapes = {
-      name: jax.ShapeDtypeStruct(np.shape(value), value.dtype)
-      for name in (*STATE_FIELDS, *derived)
-      if (value := getattr(example, name)) is not None
-    }
-
-  def forward(self, model: mjx.Model, data: PhysicsData) -> PhysicsData:
-    return self._call(model, data, 0)
-
-  def step(self, model: mjx.Model, data: PhysicsData, ctrl: jax.Array, num_substeps: int) -> PhysicsData:
-    return self._call(model, data.replace(ctrl=ctrl), num_substeps)
-
-  def _call(self, model: mjx.Model, data: PhysicsData, num_substeps: int) -> PhysicsData:
-    if model is not self.model:
-      raise ConfigError("C MuJoCo simulates the model as it is: nothing of it can be randomised.")
-    state = {name: getattr(data, name) for name in STATE_FIELDS}
-    run = lambda state: self._run(state, num_substeps)
-    return PhysicsData(**jax.pure_callback(run, self._shapes, state, vmap_method="broadcast_all"))
-
-  def _run(self, state: dict[str, np.ndarray], num_substeps: int) -> dict[str, np.ndarray]:
-    """Runs each environment of a batch (any leading axes): `num_substeps` steps, or for 0 a forward pass."""
-    state = {name: np.asarray(value) for name, value in state.items()}
-    batch = state["time"].shape
-    out = {name: np.empty((*batch, *shape.shape), shape.dtype) for name, shape in self._shapes.items()}
-    with self._lock:
-      for i in np.ndindex(batch):
-        for name, value in state.items():
-          setattr(self._c_data, name, value[i].reshape(np.shape(getattr(self._c_data, name))))
-        if num_substeps:
-          mujoco.mj_step(self._c_model, self._c_data, num_substeps)
-        else:
-          mujoco.mj_forward(self._c_model, self._c_data)
-        for name, values in out.items():
-          values[i] = np.reshape(getattr(self._c_data, name), self._shapes[name].shape)
-    return out
+from playground.physics.c_mujoco import CPhysics
 
 
 def on_c_physics(env: Env) -> Env:

@@ -115,10 +115,8 @@ class Task(Env):
 
   def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:
     """Returns the physics of a start state, after a forward pass."""
-    ctrl = self.rest_ctrl(initial) if initial.ctrl is None else initial.ctrl
-    fields = {"qpos": initial.qpos, "qvel": initial.qvel, "ctrl": ctrl}
-    fields |= {"mocap_pos": initial.mocap_pos, "mocap_quat": initial.mocap_quat}
-    return self.physics.forward(model, self.physics.make(**{k: v for k, v in fields.items() if v is not None}))
+    given = {name: value for name, value in vars(initial).items() if value is not None}
+    return self.physics.forward(model, self.physics.make(**{"ctrl": self.rest_ctrl(initial), **given}))
 
   def model_of(self, info: Mapping[str, Any], model: mjx.Model | None) -> mjx.Model:
     model = super().model_of(info, model)
