@@ -121,11 +121,9 @@ class RobotKeys:
   hip_rolls: Annotated[Sequence[str], "hip joints that move the leg sideways"]
   knees: Annotated[Sequence[str], "knee joints"]
   pose_weights: Annotated[Sequence[float], at_least_0().each, "weight of each joint in rewards of the pose"]
-  gaits: Annotated[
-    Mapping[str, Sequence[float]], Limit().each, "phase of each foot at the start, rad: -pi leaves the floor, 0 is up"
-  ]
+  gaits: Annotated[Mapping[str, Sequence[float]], Limit().each, "first phase of each foot, rad: -pi lifts off, 0 is up"]
   restricted_range: Annotated[
-    Mapping[str, Sequence[float]], span(-MOST), "limits of a joint with env.restricted_joint_range, rad"
+    Mapping[str, Sequence[float]], span(-MOST), "with env.restricted_joint_range: limits, rad"
   ]
   target_range: Annotated[TargetRangeKeys, "limits of the targets with env.clip_targets; without: the servos'"]
   sensors: Annotated[SensorKeys, "sensors by the name that terms read"]
@@ -182,11 +180,9 @@ class TaskKeys:
   robot: RobotKeys
   scene: Annotated[SceneKeys | str, "ground and contacts; of arms, a scene of playground/robots/tabletop.py"]
   keyframe: Annotated[str, "keyframe of the scene that episodes start from, before reset events"]
-  action_base: Annotated[
-    str, "target = base + action_scale * action: default_pose, joint_pos, last_target; hands: home"
-  ]
+  action_base: Annotated[str, "target - action_scale * action: default_pose, joint_pos, last_target; hands: home"]
   action_scale: Annotated[
-    float | Sequence[float], positive().each, "change of the target that an action of 1 makes, rad (slides, tendons: m)"
+    float | Sequence[float], positive().each, "target's change by an action of 1, rad (slides: m)"
   ]
   clip_targets: Annotated[bool, "whether targets are clipped to the servos' ranges (the torque is bounded anyway)"]
   restricted_joint_range: Annotated[bool, "whether the joints' limits are env.robot.restricted_range"]
@@ -205,9 +201,7 @@ class TaskKeys:
   observation_delay: Annotated[Sequence[int], _DELAY, "delay of the group state, drawn in every control step, steps"]
   curriculum: GoalLevels
   success_distance: Annotated[float, positive(), "largest distance from the goal that counts as success, m"]
-  success_angle: Annotated[
-    float | None, positive(), "largest turn from the goal that counts as success, rad; null: any"
-  ]
+  success_angle: Annotated[float | None, positive(), "largest turn from the goal that is a success, rad; null: any"]
   success_steps: Annotated[int, count(0), "control steps at the goal before it counts as reached"]
   success_threshold: Annotated[float, positive(), "largest turn from the goal that counts as success, rad"]
   stuck_after: Annotated[float, positive(), "time without a goal reached after which `rotations` counts no more, s"]
