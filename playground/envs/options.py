@@ -180,7 +180,7 @@ class TaskKeys:
   robot: RobotKeys
   scene: Annotated[SceneKeys | str, "ground and contacts; of arms, a scene of playground/robots/tabletop.py"]
   keyframe: Annotated[str, "keyframe of the scene that episodes start from, before reset events"]
-  action_base: Annotated[str, "target - action_scale * action: default_pose, joint_pos, last_target; hands: home"]
+  action_base: Annotated[str, "what an action is added to: default_pose, joint_pos, last_target; hands: home"]
   action_scale: Annotated[
     float | Sequence[float], positive().each, "target's change by an action of 1, rad (slides: m)"
   ]
