@@ -1,6 +1,7 @@
 """Which jobs of a sweep `launcher=together` gives one process, and such a sweep as users start it."""
 
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from playground.sweep.local import LocalLauncher
 from playground.sweep.together import TogetherLauncher
 from tests.processes import WITHOUT_WARP
 from tests.runs.helpers import TASK
+from tests.sweep.helpers import STUB, run
 
 
 def make(path: Path, *overrides: str) -> SweepDirectory:
@@ -87,6 +89,25 @@ def test_what_is_no_population(jobs: list[str], settings: dict[str, Any], messag
     TogetherLauncher.check(TogetherConfig(exploit_every=2, **settings), listed)
 
 
+GROUP = f"""
+import itertools, subprocess, sys
+for apart, run in itertools.groupby(sys.argv[1:], "--".__eq__):
+  if not apart:
+    subprocess.run([*{STUB!r}, *run], check=True)
+"""  # does what the stub does for each of the runs
+
+
+def test_one_process_does_the_jobs_of_a_group(tmp_path: Path) -> None:
+  sweep = make(tmp_path / "sweep", "seed=1", "seed=2")
+  assert run(sweep, "launcher=together", command=(sys.executable, "-c", GROUP)) == 0
+  assert [state.status for state in sweep.states().values()] == ["finished"] * 2
+  first, second = (sweep.folder(job) for job in sweep.jobs)
+  assert first.record["job_pid"] == second.record["job_pid"]
+  assert "trained together with 000" in second.log.read_text()
+  assert list(pd.read_csv(sweep.path / "sweep.csv")["final_return"]) == [2.0, 3.0]
+
+
+@pytest.mark.slow
 def test_a_sweep_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   sweep = ["-m", *TASK, "agent.num_timesteps=200", "seed=1,2", "launcher=together", f"sweep_dir={tmp_path / 'sweep'}"]
   monkeypatch.setattr("sys.argv", ["playground-run", *sweep])
