@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,14 @@ from playground.rendering.batch import BatchRenderer, View
 # Cart (m) and pole (rad): in the middle, to the right and leaning, to the left and leaning the other way.
 POSES = jnp.array([[0.0, 0.0], [0.7, 0.4], [-0.7, -0.4]])
 WIDTH, HEIGHT = 32, 24
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_fast() -> Iterator[None]:
+  """Warp's compiler takes half as long for kernels that need not be fast."""
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr("warp.config.optimization_level", 0)
+    yield
 
 
 @cache
