@@ -4,10 +4,14 @@ import re
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 from playground import registry
-from playground.hardware.mesh import GROUP
+from playground.config import compose
+from playground.hardware.mesh import GROUP, make_mesh
+from playground.learning.trainer import Trainer, trainer_settings
 from playground.physics.backend import WORLDS, batch_size
+from playground.runs.train import model_sampler
 
 
 def test_a_control_step_calls_warp_at_one_place() -> None:
@@ -26,3 +30,22 @@ def test_warps_buffers_grow_with_the_environments_of_all_agents_on_a_device() ->
   jax.vmap(batch, axis_name=GROUP)(jnp.zeros((3, 4)))
   environment(jnp.zeros(()))
   assert sizes == [4, 12, 1]
+
+
+@pytest.mark.slow
+def test_agents_with_other_rewards_and_models_call_warp_once() -> None:
+  sizes = ["num_envs=40", "num_eval_envs=4", "batch_size=40", "num_minibatches=1", "unroll_length=2"]
+  task = ["env=Go1JoystickFlatTerrain", "tuned=null", "randomization=go1", "env.impl=warp"]
+  task += [f"agent.{size}" for size in sizes]
+  weights = [f"env.rewards.track_linear_velocity_exp.weight={weight}" for weight in (1.0, 0.5)]
+  configs = [compose([*task, weight]) for weight in weights]
+  env = registry.load("Go1JoystickFlatTerrain", config=configs[0].env)
+  settings = [trainer_settings(config.agent, env.settings_of(config.env)) for config in configs]
+  trainer, draw = Trainer(env, configs[0].agent, make_mesh(1), None, settings), model_sampler(env, configs[0], 40, 4)
+  model = jax.eval_shape(lambda: trainer.join([draw(seed)[0] for seed in (0, 1)]))
+  state = jax.eval_shape(trainer.init, jax.ShapeDtypeStruct((2, 2), jnp.uint32), model, None, trainer.settings)
+  traced = trainer.train.trace(state, model, jax.ShapeDtypeStruct((), jnp.int32))
+  program = traced.lower(lowering_platforms=("cuda",)).as_text()  # no GPU is needed
+  (call,) = re.findall(r".*custom_call @\w*func_wrapper.*", program)
+  contacts = 2 * 40 * env.config.naconmax_per_env
+  assert f"tensor<80x{env.mj_model.nv}xf32>" in call and f"tensor<{contacts}x3x3xf32>" in call
