@@ -57,7 +57,8 @@ def test_interrupted_and_started_again(tmp_path: Path) -> None:
 
 def test_a_group_that_is_killed_loses_nothing(tmp_path: Path) -> None:
   def group(folder: Path) -> "subprocess.Popen[str]":
-    return start(tmp_path, "launcher=together", f"sweep_dir={folder}", f"hardware.cache_dir={tmp_path / 'cache'}")
+    own = [f"sweep_dir={folder}", f"hardware.cache_dir={tmp_path / 'cache'}", "launcher.cores_per_job=1000"]
+    return start(tmp_path, "launcher=together", *own)
 
   def saved(job: Path) -> list[int]:
     return sorted(int(path.name) for path in (job / "checkpoints").glob("*") if path.name.isdigit())
