@@ -33,7 +33,7 @@ class Entry:
     agent: the algorithm that its experiment trains with.
     budget: environment steps of its tuned set.
     experiment: its experiment.
-    status: solved, learning or open, as `status` says; "not measured" without a reference run.
+    status: solved, learning or open, see `status`; "not measured" without a reference run.
     reference_return: return of the best reference run at its end, or of a chain's last stage.
     reference_steps: environment steps of that run.
     reference_agent: what trained it.

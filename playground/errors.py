@@ -30,7 +30,7 @@ class HardwareError(PlaygroundError):
   """More, or other, hardware asked for than this machine has."""
 
 
-# What the operating system says of a path, a disk or a limit of the machine, and never because of a bug of ours.
+# Errors of the operating system about a path, a disk or a limit of the machine, never caused by a bug of ours.
 _OF_THE_MACHINE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP}
 _OF_THE_MACHINE |= {errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ESTALE}
 

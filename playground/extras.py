@@ -1,4 +1,4 @@
-"""Optional parts: what they need besides the package, said in one sentence where it is not installed."""
+"""Optional parts: the extra that each needs, and the error without it."""
 
 import importlib.util
 

@@ -151,7 +151,7 @@ def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Plain]:
     **kinds: the types of those keys that the caller reads, as far as they are there.
 
   Raises:
-    CheckpointError: the file cannot be read, is not JSON or has a value of another type.
+    CheckpointError: the file is unreadable, is not JSON or has a value of another type.
   """
   if not path.is_file():
     return {}

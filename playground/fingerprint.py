@@ -33,7 +33,7 @@ class NoFingerprintError(Exception):
 
 
 def digest(parts: Mapping[str, object]) -> str:
-  """Returns the hash of named values whose `repr` says all of them."""
+  """Returns the hash of named values, by their `repr`."""
   return hashlib.sha256(repr(sorted(parts.items())).encode()).hexdigest()
 
 

@@ -2,5 +2,5 @@
 
 import sys
 
-# Never import from the current folder (-P), which may be somebody else's; PYTHONPATH holds.
+# Never import from the current folder (-P), which may be another user's; PYTHONPATH holds.
 PYTHON = (sys.executable, "-P")

@@ -1,6 +1,6 @@
 """Domain randomisation: the events of a task that draw fields of its model.
 
-Such an event says which entries of a model field change, how, and what is drawn:
+Such an event names the entries of a model field, the operation, and the distribution:
 
 ```yaml
 events:

@@ -83,7 +83,7 @@ def load(
 
   Raises:
     UnknownNameError: no such task or key.
-    ConfigError: a value that cannot be.
+    ConfigError: an invalid value.
   """
   default = _composed(name).env if config is None else config
   if isinstance(config, ConfigDict) and list(config) == sorted(config):  # a copy of a ConfigDict has its keys sorted
@@ -93,7 +93,7 @@ def load(
 
 
 def build(env_config: TaskConfig) -> "Env":
-  """Builds the task that a composed env section describes, with a camera if that says so (`env.vision`)."""
+  """Builds the task that a composed env section describes, with a camera if `env.vision` enables it."""
   make = cast("Callable[[ConfigDict], Env]", task_class(str(env_config.task)))
   env = make(env_config)
   if not sees(env_config):

@@ -25,7 +25,7 @@ def quoted(value: object) -> str:
 
 
 def first_line(error: Exception) -> str:
-  """What an error says first, to be put into a sentence of ours."""
+  """Returns the first line of an error, to be put into a sentence."""
   return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
 
 

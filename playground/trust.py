@@ -1,6 +1,6 @@
 """Which code a configuration may name: a task's class, `module:name`.
 
-A configuration may be somebody else's: that of a run, a policy or a sweep. Importing a module runs it, so the module's
+A configuration of a run, a policy or a sweep may come from another user. Importing a module runs it, so the module's
 name is checked first. Trusted are this package, installed packages that register tasks (entry points of the group
 `playground.tasks`), and packages that the user names on this command line (`trust=my_package`, `--trust my_package`)
 or in Python (`trust("my_package")`).
@@ -34,7 +34,7 @@ def trusted_object(key: str, spec: object) -> object:
 
   Args:
     key: where the configuration names it, for errors.
-    spec: what it says, `module:name`.
+    spec: the value, `module:name`.
 
   Raises:
     ConfigError: it is of another form, does not exist, or belongs to a package that is not trusted, which is then not

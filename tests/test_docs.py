@@ -4,12 +4,14 @@ import ast
 import functools
 import importlib.util
 import inspect
+import io
 import itertools
 import json
 import re
 import shlex
 import subprocess
 import sys
+import tokenize
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -144,6 +146,21 @@ def test_a_page_has_the_fields_words(page: Path):
   """Words of our own that a reader would have to learn."""
   text = re.sub("`[^`\n]+`", "", page.read_text(encoding="utf-8").lower())
   assert [word for word in BANNED if re.search(rf"\b{word}\b", text)] == []
+
+
+def test_docstrings_and_comments_have_the_fields_words():
+  found = []
+  for path in sorted((REPOSITORY / "playground").rglob("*.py")):
+    source = path.read_text(encoding="utf-8")
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    texts = [token.string for token in tokens if token.type == tokenize.COMMENT]
+    nodes = [
+      node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+    ]
+    texts += [ast.get_docstring(node) or "" for node in nodes]
+    text = re.sub(r"`[^`\n]+`|^ *\**\w+:", "", "\n".join(texts).lower(), flags=re.M)  # code, names of parameters
+    found += [f"{path.name}: {word}" for word in BANNED if re.search(rf"\b{word}\b", text)]
+  assert found == []
 
 
 def test_every_pip_finds_the_extras_that_are_told():

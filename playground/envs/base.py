@@ -18,7 +18,7 @@ from playground.physics.backend import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.physics.warp_kernels import quiet_warp
 
 Observation = jax.Array | dict[str, jax.Array]
-PIXELS = "pixels/"  # what entries of an observation that are pictures begin with: [height, width, channels] uint8
+PIXELS = "pixels/"  # prefix of image groups of an observation: [height, width, channels] uint8
 
 
 class State(struct.PyTreeNode):
@@ -27,7 +27,7 @@ class State(struct.PyTreeNode):
   Attributes:
     data: simulator state.
     obs: observation, one vector or a dict of vectors ("state" for the actor, "privileged_state" for the critic) and
-      pictures (`pixels/<camera>`).
+      images (`pixels/<camera>`).
     reward: scalar reward of the step just taken.
     done: scalar 0/1 float, the episode ended in this step.
     metrics: scalars logged each step; the key set is the same at reset and step.
@@ -172,7 +172,7 @@ class Env(abc.ABC):
 
 
 def newest_picture(env: Env, obs: Observation) -> jax.Array | None:
-  """The newest frame of an observation's first camera, [..., H, W, 1 or 3] uint8; None without pictures."""
+  """The newest frame of an observation's first camera, [..., H, W, 1 or 3] uint8; None without images."""
   cameras = sorted(key for key in obs if key.startswith(PIXELS)) if isinstance(obs, Mapping) else []
   if not cameras:
     return None

@@ -45,11 +45,11 @@ class InitialState(struct.PyTreeNode):
 class Task(Env):
   """A robot in a scene whose rewards, observations, terminations, commands and events are terms of its config.
 
-  A subclass builds the scene, says what its robot is (`make_robot`) and how an action becomes `ctrl`; where it carries
+  A subclass builds the scene, defines its robot (`make_robot`) and how an action becomes `ctrl`; where it carries
   more from step to step than actions, commands and events do, it adds that in `first_info` and `next_info`.
 
   Attributes:
-    robot: the robot's constant facts.
+    robot: the robot's constants.
     rewards, terminations, observations, commands, events: the managers of the config's terms.
   """
 
@@ -91,7 +91,7 @@ class Task(Env):
 
   @abc.abstractmethod
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> Any:
-    """Returns the robot's constant facts; terms read `c.robot`."""
+    """Returns the robot's constants; terms read `c.robot`."""
 
   def initial_state(self, key: jax.Array, model: mjx.Model) -> InitialState:
     """Returns the state that reset events change: by default that of the robot's keyframe at rest."""

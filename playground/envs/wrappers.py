@@ -138,9 +138,9 @@ _SUMMARIES: dict[str, Callable[[jax.Array, jax.Array, jax.Array], jax.Array]] = 
 class Episode(Wrapper):
   """Ends episodes after `length` control steps and repeats each action.
 
-  `info["episode_metrics"]` holds the episode's `sum_reward`, `length` and, of each metric, the sum over its decisions
-  or what the task's `summaries` says; a step that is not finite counts in sums only, with 0. A decision has the metrics
-  of its last repeat, those that are a `max` of all repeats until the episode ends.
+  `info["episode_metrics"]` holds the episode's `sum_reward`, `length` and of each metric the sum over policy steps, or
+  the reduction of the task's `summaries`; a non-finite step counts in sums only, with 0. A policy step has the metrics
+  of its last repeat; those with a `max` have that of all repeats until the episode ends.
 
   A time-out gives done = 1 with `info["truncation"]` = 1, kept apart from the task's own termination. With repeats an
   episode that terminates in an earlier one stays done and earns nothing in the later ones.
@@ -236,7 +236,7 @@ class AutoReset(Wrapper):
       return keys[:, 1]
 
     if self.full_reset:
-      # A reset costs a forward pass over the whole batch: skip it in the steps in which nobody is done.
+      # A reset costs a forward pass over the whole batch: skip it in steps in which no environment is done.
       after = jax.lax.cond(after.done.any(), self._restart, lambda s, *_: s, after, new_keys(), model)
     else:
       data = after.data.replace(**where_done(after.done, own[PREFIX + "first_data"], start_of(after)))

@@ -74,7 +74,7 @@ class _VelocityCommand:
 
 @dataclasses.dataclass
 class UniformVelocity(_VelocityCommand):
-  """Draws all components anew, uniformly; some commands are to stand still.
+  """Draws all components uniformly; some commands are to stand still.
 
   Attributes:
     zero_probability: of standing still.

@@ -1,4 +1,4 @@
-"""What the functions of terms read: a robot's constant facts, and one environment after one control step."""
+"""What the functions of terms read: a robot's constants, and one environment after one control step."""
 
 import functools
 import re
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Robot:
-  """A robot's constant facts, found in the compiled model by name.
+  """A robot's constants, found in the compiled model by name.
 
   Attributes:
     mj_model: the compiled scene.
@@ -98,7 +98,7 @@ class StepContext:
 
   Attributes:
     env: the task: its model and control step `dt`.
-    robot: the robot's constant facts.
+    robot: the robot's constants.
     data: the physics after the step.
     info: what the task carries, as it stood during the step.
     action: the action just applied, shape [action_size].

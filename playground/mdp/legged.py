@@ -1,4 +1,4 @@
-"""A robot on legs: its constant facts, and what terms read of it in a step."""
+"""Robots on legs: constants, and quantities that terms read in a step."""
 
 import functools
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Arms at a table and hands with a cube: their constant facts, and what terms read of them in a step."""
+"""Arms at a table and hands with a cube: constants, and quantities that terms read in a step."""
 
 import functools
 import re
@@ -23,7 +23,7 @@ _REACH = 0.012  # m from the gripper's tip to the object's centre
 
 
 class Manipulator(Robot):
-  """Constant facts of arms or of a hand, and of their scene.
+  """Constants of arms or of a hand, and of their scene.
 
   Attributes:
     joint_ids: of the arms' or the hand's joints, those of grippers' fingers excepted.
@@ -45,7 +45,7 @@ class Manipulator(Robot):
 
 
 class ArmRobot(Manipulator):
-  """Constant facts of one or two arms and of their scene; the keyframe's joints and `ctrl` are within their limits.
+  """Constants of one or two arms and of their scene; the keyframe's joints and `ctrl` are within their limits.
 
   Attributes:
     driven: indices of the actuators that act on a joint, and of those joints in `qpos`.
@@ -77,7 +77,7 @@ class ArmRobot(Manipulator):
 
 
 class Hand(Manipulator):
-  """A hand's constant facts, found in the compiled scene (`playground.robots.in_hand`) in its keyframe `home`.
+  """A hand's constants, found in the compiled scene (`playground.robots.in_hand`) in its keyframe `home`.
 
   Attributes:
     has_servos: whether each joint has a position servo of its own; else tendons pull it.

@@ -385,7 +385,7 @@ def object_lifted(c: ArmContext, height: float) -> jax.Array:
 
 
 def object_at_goal(c: ArmContext) -> jax.Array:
-  """1 while the object is at the goal, as `env.success_distance` and the like say."""
+  """1 while the object is at the goal, by `env.success_distance` and `env.success_angle`."""
   return c.at_goal.astype(jnp.float32)
 
 

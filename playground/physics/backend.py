@@ -2,7 +2,7 @@
 
 `mjx.Data` carries 40-150 KB an environment, nearly all of it scratch that the next forward pass writes again. A
 `PhysicsData` holds only the simulator's state and the derived fields that the task reads; the rest is rebuilt from one
-template inside every step. So a state is small, complete (what is saved is what is needed to go on, bit for bit) and
+template inside every step. So a state is small, complete (it can be resumed, bit for bit) and
 the same for both backends.
 """
 
@@ -59,7 +59,7 @@ _ABSENT: Any = None  # a derived field that the task does not name
 class PhysicsData(struct.PyTreeNode):
   """One environment's simulator state, named as in `mujoco.MjData`; derived fields a task does not read are None.
 
-  `buffers` (Warp only, else None) is no part of the state: it says what the last step needed.
+  `buffers` (Warp only, else None) is no part of the state: it is the use of buffers in the last step.
 
   After a step the derived fields belong to the state before the last integration, `qpos` and `qvel` to the one after
   it (`mj_step` is forward, then integrate).

@@ -26,7 +26,7 @@ class CPhysics(Physics):
     """Takes a model and the names out of `DERIVED_FIELDS` that the task reads."""
     super().__init__(mj_model, derived=derived)
     self._c_model = copy.copy(mj_model)
-    # C MuJoCo starts an unstable simulation anew. Its numbers should show instead, as MJX's do.
+    # C MuJoCo would reset an unstable simulation. Its numbers should show instead, as in MJX.
     self._c_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     self._c_data = mujoco.MjData(self._c_model)
     self._lock = threading.Lock()  # programs may run at the same time

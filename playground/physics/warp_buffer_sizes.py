@@ -66,7 +66,7 @@ def measure_buffers(
     on_steps: is called with the number of policy steps that the rollout has done.
 
   Raises:
-    ConfigError: Warp is not installed, or some buffer that cannot be set overflowed.
+    ConfigError: Warp is not installed, or a buffer of fixed size overflowed.
   """
   rows, pairs, convex = max(njmax or 0, 32), 32, 1
   for _ in range(_TRIES):

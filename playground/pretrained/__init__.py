@@ -139,7 +139,7 @@ def add(run: Path, task: str, facts: Section) -> Path:
   Args:
     run: a run directory with `export/policy.onnx`.
     task: its task.
-    facts: what the card says beside the files' hashes.
+    facts: entries of the card beside the files' hashes.
 
   Returns:
     The folder.

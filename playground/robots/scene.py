@@ -165,7 +165,7 @@ def attach(spec: mujoco.MjSpec, part: str, *, frame: str = "", prefix: str = "")
   """
   where = spec.frame(frame) if frame else spec.worldbody.add_frame()
   keys = [(key.name, {field: list(getattr(key, field)) for field in _OF_KEYFRAMES}) for key in spec.keys]
-  # MuJoCo warns that a scene whose parts get no prefix may not be written as XML, which nobody does.
+  # MuJoCo warns that a scene whose parts get no prefix may not be written as XML, which is not needed.
   warning = mujoco.get_mju_user_warning()
   mujoco.set_mju_user_warning(lambda message: None)
   try:

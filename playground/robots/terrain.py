@@ -71,7 +71,7 @@ def add_terrain(spec: mujoco.MjSpec, name: str, parameters: Mapping[str, Any]) -
 
 
 def _add_floor(spec: mujoco.MjSpec, *classes: str, **shape: Any) -> None:
-  """Adds the ground's geom: what the robot's file says of the first of the default classes that it has."""
+  """Adds the ground's geom, with the first of the default classes that the robot's file has."""
   default = next((d for d in map(spec.find_default, classes) if d), spec.default)
   spec.worldbody.add_geom(default, name="floor", **shape)
 

@@ -1,4 +1,4 @@
-"""Where a run begins: anew, at the last good checkpoint of its own, or from another run's weights."""
+"""Plans the start of a run: a new one, from its own last intact checkpoint, or from another run's weights."""
 
 import contextlib
 import dataclasses

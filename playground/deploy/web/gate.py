@@ -127,7 +127,7 @@ class Gate:
     return msgspec.msgpack.encode(message)
 
   def _fits(self, message: _GuiUpdateMessage) -> bool:
-    """Whether a control can have the value; what menus are told their callbacks look up."""
+    """Whether a control can have the value; callbacks of menus look their value up."""
     handle = self.server.gui._gui_input_handle_from_uuid.get(message.uuid)  # viser has no public way from id to control
     value = message.updates.value
     if isinstance(handle, viser.GuiSliderHandle):

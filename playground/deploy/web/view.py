@@ -217,7 +217,7 @@ class View:
       )
       target, field_of_view = position - back, np.radians(self.scene.mj_model.cam_fovy[camera])
     for client in self._server.get_clients().values():
-      if client.camera.update_timestamp:  # it has told where it is
+      if client.camera.update_timestamp:  # it has reported its pose
         client.camera.up_direction, client.camera.position = up, position
         client.camera.look_at, client.camera.fov = target, float(field_of_view)
     self._camera = name

@@ -55,7 +55,7 @@ class Cartpole(SuiteTask):
 
 
 class CartpoleVision(Cartpole):
-  """Keeps the pole upright, made for learning from pixels: what is paid is what a glance shows, and a fall ends it.
+  """Keeps the pole upright, for learning from pixels: one image shows the reward, and a fall ends the episode.
 
   The reward of a step is 0.1 less small penalties (pole and cart off the middle, motion, action), so that 25 is the
   most of 250 steps. An episode ends when the pole lies, or the cart is 3 m out.

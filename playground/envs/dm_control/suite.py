@@ -23,7 +23,7 @@ Terms = dict[str, jax.Array]
 class SuiteTask(Env):
   """A task of the suite (paper, Appendix A): the action is `ctrl`.
 
-  A domain says how an episode starts, what is observed and what is rewarded. The terms of `env.rewards` are added to
+  A domain defines initial states, observations and rewards. The terms of `env.rewards` are added to
   that reward, those of `env.terminations` end an episode; they read `c.data`, `c.action` and `c.env.mj_model`.
 
   Attributes:
@@ -52,7 +52,7 @@ class SuiteTask(Env):
     self.geom = {model.geom(i).name: i for i in range(model.ngeom)}
 
   def scene(self, config: Any) -> mujoco.MjSpec:
-    """Returns the scene to compile: the domain's MJCF, changed as the config says."""
+    """Returns the scene to compile: the domain's MJCF, changed by the config."""
     del config
     return mujoco.MjSpec.from_file(str(Path(__file__).with_name(f"{self.domain}.xml")))
 

@@ -67,7 +67,7 @@ class PickCubeCartesian(ProgressTask, ArmTask):
     choose = lambda guide, own: jnp.where(guided, guide, own)
     qpos, ctrl = choose(self._guide_qpos, state.data.qpos), choose(self._guide_ctrl, state.data.ctrl)
     info = {"rng": rng, "current_pos": choose(self._guide_tip, state.info["current_pos"])}
-    # The fingers hold the cube because they were told to close: a late command must not let it fall.
+    # The fingers hold the cube because of a command to close: a delayed command must not drop it.
     info["action_history"] = choose(-1.0, state.info["action_history"])
     return state.replace(data=state.data.replace(qpos=qpos, ctrl=ctrl), info=state.info | info)
 
@@ -105,7 +105,7 @@ class PickCubeCartesian(ProgressTask, ArmTask):
 
 
 class PickCubeCartesianVision(PickCubeCartesian):
-  """Lifts a cube to the goal's height (paper, section IV-C and appendix C.6); `env.vision` says what is seen."""
+  """Lifts a cube to the goal's height (paper, section IV-C and appendix C.6); `env.vision` defines the images."""
 
   def goal_distance(self, c: ArmContext) -> jax.Array:
     return jnp.abs(c.object_to_goal[2])

@@ -25,7 +25,7 @@ class Reorient(HandTask):
 
   Within `success_threshold` of the goal the task pays the reward term `success`, once and not times `ctrl_dt`, and the
   goal turns on: it spins, slower and slower, to another orientation, at least `goal.min_turn` away. Its motion is that
-  of Playground 0.2.0; the paper says only that a new goal is at least 90 degrees from the last.
+  of Playground 0.2.0; the paper only states that a new goal is at least 90 degrees from the last.
 
   Metrics of an evaluation: `rotations` is the number of goals reached before failure, the cube dropped or no goal
   within `stuck_after` (the paper's real trials), `success_count` that of all goals reached, `success` whether there was
