@@ -155,7 +155,7 @@ class Rising(PointTask):
     return state.replace(info=state.info | {PRESERVE_INFO: {"level": info[PRESERVE_INFO]["level"] + 1}})
 
 
-@two_of_them
+@algorithms("ppo")
 def test_a_fresh_start_of_all_environments_keeps_what_outlasts_a_reset(config: Config) -> None:
   trainer = Trainer(Rising(), config, make_mesh(1))
   model: dict[str, Any] = {}

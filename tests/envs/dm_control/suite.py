@@ -14,7 +14,7 @@ FIGURES = {
   if path.stem != "looks"
 }  # domain to file
 # `make test-slow` compiles their physics.
-COSTLY = ("cheetah", "finger", "fish", "hopper", "humanoid", "swimmer", "walker")
+COSTLY = ("ball_in_cup", "cheetah", "finger", "fish", "hopper", "humanoid", "swimmer", "walker")
 DOMAIN = {env["name"]: domain for domain, file in FIGURES.items() for env in figures(file)["envs"]}  # of every task
 
 
