@@ -7,7 +7,7 @@ from playground.benchmark.report.public import at, is_ppo, public_curves
 from playground.catalog import Entry
 from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
 
-_HEADER = ("task", "status", "best run", "M steps", "PPO's budget", "runs (seeds)", "sampled", "mode")
+_HEADER = ("task", "status", "best run", "M steps", "default budget", "runs (seeds)", "sampled", "mode")
 _PUBLIC = ("best public PPO", "best public")  # at as many steps
 _BY_MODE = ("reppo", "fast_td3", "fast_sac")  # whose agent.deterministic_eval is true by default
 Row = dict[str, str]
