@@ -61,11 +61,11 @@ def candidates(line: str, parser: argparse.ArgumentParser) -> list[str]:
     return []
   program, *words, current = [Path(words[0]).name, *words[1:], *([""] if line[-1:].isspace() else [])]
   if program == "playground" and not words:
-    found: Iterable[str] = _commands(parser)
+    found: Iterable[str] = commands_of(parser)
   elif program == "playground-run" or words[:1] == ["train"]:
     found = _of_run(current, [word for word in words if "=" in word])
-  elif program == "playground" and words[0] in _commands(parser) and words[0] != "bench":
-    found = _of_command(_commands(parser)[words[0]], current, words[1:])
+  elif program == "playground" and words[0] in commands_of(parser) and words[0] != "bench":
+    found = _of_command(commands_of(parser)[words[0]], current, words[1:])
   else:
     found = []
   return sorted({word for word in found if word.startswith(current)})
@@ -79,7 +79,8 @@ def _split(line: str) -> list[str]:
     return line.split()
 
 
-def _commands(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
+def commands_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
+  """Returns the commands of `playground` by name."""
   (action,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
   return action.choices
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from playground import __version__, registry
+from playground.cli.completion import commands_of
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest, one_sentence
 from playground.limits import SEED, count
 from playground.pretrained import working_copy
@@ -40,8 +41,8 @@ def main() -> None:
   if len(sys.argv) > 1 and sys.argv[1] in _PROGRAMS:
     importlib.import_module(_PROGRAMS[sys.argv.pop(1)][0]).main()
   withhold_gl()
-  args = _arguments()
   try:
+    args = _arguments()
     trust(*args.trust)
     _check_numbers(args)
     code = args.command(args)
@@ -57,8 +58,10 @@ def main() -> None:
 
 
 def _arguments() -> argparse.Namespace:
-  """Parses the command line; overrides may also follow options."""
-  parser = _parser()
+  """Parses the command line; overrides may also follow options. Raises UnknownNameError for an unknown command."""
+  parser, name = _parser(), next(iter(sys.argv[1:]), "-")
+  if name not in (known := commands_of(parser)) and not name.startswith("-"):
+    raise UnknownNameError(f"playground {name} does not exist: choose from {', '.join(known)}.{nearest(name, known)}")
   args, rest = parser.parse_known_args()
   unknown = [text for text in rest if text.startswith("-") or "=" not in text or "overrides" not in args]
   if unknown:

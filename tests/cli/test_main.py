@@ -37,8 +37,9 @@ def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
   assert command("list") == 0
   lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
   assert lines[0] == "task suite robot observation action backend agent budget status return experiment"
-  start = "CartpoleBalance dm_control state 5 1 jax ppo 60 M solved 999.3 cartpole_balance"
-  assert start in lines and lines[-1].startswith(f"{len(lines) - 2} tasks.")
+  (line,) = (line for line in lines if line.startswith("CartpoleBalance "))
+  assert line.startswith("CartpoleBalance dm_control state 5 1 jax ppo 60 M solved 99")
+  assert lines[-1].startswith(f"{len(lines) - 2} tasks.")
   assert command("list", "go1", "--suite", "locomotion", "--backend", "jax", "--json") == 0
   rows = json.loads(capsys.readouterr().out)
   assert all("Go1" in row["task"] and row["robot"] == "go1" for row in rows) and len(rows) >= 4
@@ -147,6 +148,12 @@ def test_keys(command: Command, capsys: pytest.CaptureFixture[str], args: list[s
   out = " ".join(capsys.readouterr().out.split())
   for text in shown:
     assert text in out
+
+
+def test_an_unknown_command_is_answered_with_the_nearest(command: Command, capsys: pytest.CaptureFixture[str]):
+  assert command("lst") == 2
+  out, err = capsys.readouterr()
+  assert not out and err.startswith("error: playground lst does not exist") and "Did you mean 'list'?" in err
 
 
 def test_keys_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
