@@ -29,7 +29,7 @@ from playground.text import join
 ROOT = Path(__file__).parents[1]
 REFERENCE = "results/reference"
 NOTEBOOK = ROOT / "docs/first_policy.ipynb"
-# Pages of the API's reference: modules, and packages all of whose modules are meant.
+# Sections of the API's reference, a page a module: modules, and packages of which every module has a page.
 API = {
   "Tasks": ["registry", "envs.task", "envs.base", "physics.backend", "envs.wrappers", "rendering.vision"],
   "Parts of tasks": ["mdp"],
@@ -52,7 +52,7 @@ API = {
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
   """Puts the generated pages into the navigation."""
   assert config.nav is not None, "mkdocs.yml has one"
-  api = [{title: _uri("api", title)} for title in API]
+  api = [{title: [{name: _api_uri(name)} for name in names]} for title, names in _api().items()]
   terms = {"terms": [{kind: _uri("configs", f"terms {kind}")} for kind in MODULES]}
   config.nav.append({"Reference": [{"Python": api}, {"Configuration": [*_navigation(), terms]}]})
   return config
@@ -60,7 +60,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
   """Adds the generated pages."""
-  pages = {_uri("api", title): _api_page(title, modules) for title, modules in API.items()}
+  names = [name for names in _api().values() for name in names]
+  pages = {_api_uri(name): f"# {name}\n\n::: playground.{name}\n" for name in names}
   pages |= reference_pages() | {"first_policy.md": _notebook_page()}
   for uri, content in pages.items():
     files.append(File.generated(config, uri, content=content))
@@ -83,13 +84,19 @@ def _uri(folder: str, title: str) -> str:
   return f"reference/{folder}/{title.lower().replace(' ', '-').replace('/', '-')}.md"
 
 
-def _api_page(title: str, modules: list[str]) -> str:
-  names = []
-  for module in modules:
-    folder = ROOT / "playground" / module.replace(".", "/")
-    inside = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
-    names += [f"playground.{module}.{name}" for name in inside] or [f"playground.{module}"]
-  return f"# {title}\n\n" + "\n\n".join(f"::: {name}" for name in names) + "\n"
+def _api_uri(module: str) -> str:
+  return _uri("api", module.replace(".", " "))
+
+
+def _api() -> dict[str, list[str]]:
+  """The modules of each section of `API`."""
+  modules: dict[str, list[str]] = {title: [] for title in API}
+  for title, names in API.items():
+    for name in names:
+      folder = ROOT / "playground" / name.replace(".", "/")
+      inside = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
+      modules[title] += [f"{name}.{module}" for module in inside] or [name]
+  return modules
 
 
 def reference_pages() -> dict[str, str]:

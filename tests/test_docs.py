@@ -337,7 +337,7 @@ def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   assert "Warp: constraint rows of one environment" in page  # beside a field of EnvConfig
   pages = {kind: tmp_path / f"site/reference/configs/terms-{kind}.html" for kind in terms.MODULES}
   assert "feet_air_time" in pages["rewards"].read_text(encoding="utf-8") and all(map(Path.is_file, pages.values()))
-  page = (tmp_path / "site/reference/api/parts-of-tasks.html").read_text(encoding="utf-8")
+  page = (tmp_path / "site/reference/api/mdp-tolerance.html").read_text(encoding="utf-8")
   assert 'id="playground.mdp.tolerance.tolerance"' in page
 
 
