@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from playground.config.definitions import definition
 from playground.config.files import DELTAS
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.mdp.moved import check_not_moved
 from playground.mdp.options import OPTIONS, keys
+from playground.moved import check_not_moved
 from playground.settings import Plain, Section
 from playground.text import format_value, join, nearest_in
 

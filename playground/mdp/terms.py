@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 import jax
 
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.mdp.moved import renamed_function
 from playground.mdp.options import OPTIONS, is_model_field, keys
+from playground.moved import renamed_function
 from playground.settings import below, members, problem
 from playground.text import format_value
 from playground.trust import trusted_object
