@@ -69,7 +69,7 @@ def test_observations_never_mix_episodes(barkour: Any, monkeypatch: pytest.Monke
   monkeypatch.setattr(barkour.physics, "forward", lambda model, data: data)
   monkeypatch.setattr(barkour.physics, "step", step)
   monkeypatch.setattr(barkour, "episode_length", 3)
-  monkeypatch.setattr(barkour.terminations, "terms", [])
+  monkeypatch.setattr(barkour.terminations, "groups", {})
   env = wrap_for_training(barkour)
   state = env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
   first, seen, step_all = state.obs, [], jax.jit(env.step)
