@@ -6,10 +6,10 @@ set -euo pipefail
 out=${1:-results/walk}
 four_at_a_time="launcher.slots_per_gpu=4 launcher.mps=true"
 
-# G1, then T1, each alone on the GPU, for these have goals in minutes.
+# Each alone on the GPU, for these have goals in minutes. Keep the policies: those of seed 1 are lost.
 playground-run -m sweep=humanoids sweep_dir="$out/humanoids"
 
-# Goals: HumanoidRun 600, HumanoidStand 900, rough G1 and T1 19.
+# Goal: HumanoidRun 600.
 playground-run -m sweep=reppo_fast_td3 $four_at_a_time sweep_dir="$out/reppo_fast_td3"
 playground-run -m sweep=ppo_robust $four_at_a_time sweep_dir="$out/ppo_robust"
 

@@ -69,11 +69,23 @@ def test_env_and_agent_alone_pick_the_tuned_set():
   assert compose(["env=CartpoleSwingup", "tuned=null"]).agent.discounting == 0.99
 
 
-@pytest.mark.parametrize("chosen", ["env=HumanoidWalk", "experiment=humanoid_run"])
-def test_a_task_chooses_the_agent_that_learns_it_best(chosen: str):
+@pytest.mark.parametrize(
+  ("chosen", "tuned"),
+  [
+    ("env=HumanoidWalk", None),
+    ("experiment=humanoid_run", None),
+    ("experiment=g1_joystick", "reppo/G1JoystickFlatTerrain"),
+    ("env=T1JoystickRoughTerrain", "reppo/T1JoystickRoughTerrain"),
+  ],
+)
+def test_a_task_chooses_the_agent_that_learns_it_best(chosen: str, tuned: str | None):
   own, ppo = compose([chosen]), compose([chosen, "agent=ppo"])
-  assert (own.agent_name, own.choices["tuned"]) == ("reppo", None)
+  assert (own.agent_name, own.choices["tuned"]) == ("reppo", tuned)
   assert (ppo.agent_name, ppo.choices["tuned"]) == ("ppo", f"ppo/{ppo.choices['env']}")
+
+
+def test_a_variant_keeps_the_agent_that_is_measured_on_it():
+  assert [compose([f"env=AcrobotSwingup{kind}"]).agent_name for kind in ("", "Sparse")] == ["reppo", "ppo"]
 
 
 def test_a_task_without_a_tuned_set_has_the_agents_defaults(configs: Path):

@@ -126,7 +126,7 @@ def test_a_variant_without_a_set_of_its_own_takes_that_of_the_agent_it_is_built_
 
 @pytest.mark.parametrize("robot", ["G1", "T1"])
 @pytest.mark.parametrize("terrain", ["Flat", "Rough"])
-def test_the_humanoids_take_the_set_of_020_by_default(robot: str, terrain: str):
+def test_ppo_takes_the_set_of_020_for_the_humanoids(robot: str, terrain: str):
   """It makes five times the gradient steps of the paper's at three times the learning rate, and learns to walk."""
   task = f"{robot}Joystick{terrain}Terrain"
   ours, published = (compose([f"env={task}", f"agent={agent}"]).resolved["agent"] for agent in ("ppo", "ppo_v020"))
@@ -135,7 +135,7 @@ def test_the_humanoids_take_the_set_of_020_by_default(robot: str, terrain: str):
 
 
 def test_defaults_that_are_not_the_papers():
-  agent = lambda task: compose([f"env={task}"]).agent
+  agent = lambda task: compose([f"env={task}", "agent=ppo"]).agent
   assert agent("BerkeleyHumanoidJoystickFlatTerrain").learning_rate == 3e-4
   whole = (
     "SpotFlatTerrainJoystick",
