@@ -35,7 +35,7 @@ def test_the_committed_sets() -> None:
   assert set(sets) == {"cpu", "gpu"}
   agents = {text for each in sets["cpu"].values() for text in each.overrides if text.startswith("agent=")}
   assert agents == {"agent=ppo", "agent=sac", "agent=reppo", "agent=fast_td3", "agent=fast_sac"}
-  assert len(sets["gpu"]) == 10
+  assert len(sets["gpu"]) == 9
 
 
 @pytest.mark.slow
