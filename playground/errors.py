@@ -46,10 +46,15 @@ def one_sentence(error: Exception) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-  """Returns ' Did you mean X?' for a name that begins so, else for the closest, else those that begin alike."""
+  """Returns ' Did you mean X?' for a name that begins so, else for the closest, else those that begin alike.
+
+  Of names that are close, one that shares the first three quarters of the letters comes first.
+  """
   lowered = {k.lower(): k for k in known}
   begun = [k for k in lowered if len(name) > 3 and k.startswith(name.lower())]
-  match = begun or difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+  alike = [k for k in lowered if len(name) > 3 and k.startswith(name[: 3 * len(name) // 4].lower())]
+  close = lambda names: difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
+  match = begun or close(alike) or close(lowered)
   if match:
     return f" Did you mean {lowered[match[0]]!r}?"
   alike = [lowered[k] for k in lowered if len(name) > _ALIKE and k.startswith(name[:_ALIKE].lower())]

@@ -304,6 +304,7 @@ def test_composing_needs_no_jax():
 
 ERRORS = {
   "env=Go1Joystic": ["env=Go1Joystic does not exist", "that `playground list` shows", "'Go1JoystickFlatTerrain'?"],
+  "env=Go1Joystik": ["Did you mean 'Go1Joystick"],  # Op3Joystick has more letters in common
   "experiment=quickstar": [
     "experiment=quickstar",
     "that `playground keys experiment` shows",

@@ -149,5 +149,5 @@ def group_entries(env: Env) -> dict[str, str]:
   sizes = env.observation_size
   entries = list(sizes) if isinstance(sizes, Mapping) else ["state"]
   if any(entry.startswith(PIXELS) for entry in entries):
-    raise ConfigError("RSL-RL gets no pictures from here: leave env.vision.enable=false.")
+    raise ConfigError("RSL-RL gets no images from here: leave env.vision.enable=false.")
   return {"policy": "state", "critic": PRIVILEGED if PRIVILEGED in entries else "state"}

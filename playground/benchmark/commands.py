@@ -109,9 +109,9 @@ class Breakdown(OfTasks):
 class Pixels(OfTasks):
   """Time of a step from pixels, as in the paper: state alone, with images, with inference, with training."""
 
-  sizes: Annotated[Sequence[int], counts(1), "sides of the pictures"] = (32, 64, 128, 256)
+  sizes: Annotated[Sequence[int], counts(1), "sides of the images"] = (32, 64, 128, 256)
   num_envs: Annotated[Sequence[int], counts(1), "numbers of environments"] = (1024,)
-  compared: Annotated[bool, "up to pictures in steps of 1/60 s, as the paper compares simulators; for Cartpole"] = False
+  compared: Annotated[bool, "up to images in steps of 1/60 s, as the paper compares simulators; for Cartpole"] = False
 
   name = "pixels"
 
@@ -123,7 +123,7 @@ class Pixels(OfTasks):
   def check(self) -> None:
     super().check()
     if not self.agent.startswith("ppo"):
-      raise ConfigError(f"agent={self.agent} reads no pictures: pixels is of agent=ppo.")
+      raise ConfigError(f"agent={self.agent} reads no images: pixels is of agent=ppo.")
     if self.compared and self.chosen() != ["CartpoleBalanceVision"]:
       raise ConfigError("compared=true is of CartpoleBalanceVision alone: leave tasks= and suite= away.")
     for task in self.chosen():

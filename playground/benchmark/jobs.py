@@ -182,6 +182,6 @@ def run_jobs(measurements: Sequence[Measurement], table: Table, facts: Mapping[s
   if code >= 128:
     return code
   if left:
-    rest = "name what is left in tasks=, for rerun=true begins anew" if plan.rerun else rows.again
+    rest = "name what is left in tasks=, because rerun=true starts over" if plan.rerun else rows.again
     print(f"The time was up: {rest}.")
   return 1 if failed else 3 if left else 0

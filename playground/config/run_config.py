@@ -112,7 +112,7 @@ def from_dict(resolved: Section, overrides: Sequence[str] = ()) -> RunConfig:
   if "randomization" in resolved:
     raise ConfigError(
       "This configuration is of version 0.1, whose tasks had env.reward and randomization.terms: use that version, or "
-      "train anew."
+      "train again."
     )
   if missing := [key for key in ("name", "choices", *SECTIONS, *SCALARS) if key not in resolved]:
     raise ConfigError(f"This is not the configuration of a run: it lacks {', '.join(missing)}.")

@@ -128,7 +128,7 @@ def check_saved_job(name: str, overrides: Iterable[str]) -> None:
   """
   for text in overrides:
     if is_of_command(text) or split([text])[0]:
-      raise ConfigError(f"Job {name} in sweep.yaml says {text}, which only a command line can: start the sweep anew.")
+      raise ConfigError(f"Job {name} in sweep.yaml says {text}, which only a command line can: start a new sweep.")
 
 
 def combinations(*sets: Sequence[str]) -> list[list[str]]:

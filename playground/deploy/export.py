@@ -83,7 +83,7 @@ def _yaml(contract: Contract) -> str:
 def _summary(contract: Contract, count: int, error: float, micros: np.ndarray) -> str:
   policy, rate = contract["policy"], contract["rate_hz"]
   shapes = [row["shape"][1:] for row in policy["inputs"]]
-  seen = [f"{s[0]} numbers" if len(s) == 1 else f"pictures of {' x '.join(map(str, s))}" for s in shapes]
+  seen = [f"{s[0]} numbers" if len(s) == 1 else f"images of {' x '.join(map(str, s))}" for s in shapes]
   sizes = f"{' and '.join(seen)} in, {policy['action_size']} out"
   return (
     f"{contract['task']}, {contract['origin']['steps']:,} steps trained: {sizes}\n"

@@ -22,7 +22,7 @@ _AS_THE_TASK_DRAWS, _RESET = 259, 257  # backspace, enter
 _CLOSING = 5.0  # s for a window to close
 _HELP = (
   "Keys: up and down go, left and right turn, comma and period go sideways, backspace leaves commands to the task, "
-  "enter begins anew. Double-click a body, then hold ctrl and drag with the right button to push it."
+  "enter resets. Double-click a body, then hold ctrl and drag with the right button to push it."
 )
 
 

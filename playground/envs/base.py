@@ -188,7 +188,7 @@ def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:
   if impl not in ("jax", "warp"):
     raise ConfigError(f"env.impl={impl!r} must be one of auto, jax, warp.")
   if renders and impl != "warp":
-    raise ConfigError(f"env.impl={impl} renders no pictures, which env.vision.enable=true asks for: leave it auto.")
+    raise ConfigError(f"env.impl={impl} renders no images, which env.vision.enable=true asks for: leave it auto.")
   if impl == "warp":
     instead = "leave env.vision.enable=false" if renders else "set env.impl=jax"
     try:

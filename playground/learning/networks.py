@@ -73,20 +73,20 @@ class Actor:
     self.estimated_obs_key: str = getattr(config, "estimated_obs_key", "")
     if self.estimated_obs_key and not (self.pixel_sizes and hidden_layer_sizes):
       raise ConfigError(
-        f"agent.network.estimated_obs_key={self.estimated_obs_key!r} is estimated from pictures by the first layer of "
+        f"agent.network.estimated_obs_key={self.estimated_obs_key!r} is estimated from images by the first layer of "
         "agent.network.policy_hidden_layer_sizes: this run lacks one of them."
       )
     vectors = [key for key in sizes if key not in self.pixel_sizes]
     for name in ("policy_obs_key", "value_obs_key", "estimated_obs_key"):
       key, optional = getattr(config, name, ""), bool(self.pixel_sizes) or name == "estimated_obs_key"
       if key not in vectors and not (key == "" and optional):
-        what = "an entry of the task's observation" + " that is no picture" * bool(self.pixel_sizes)
+        what = "an entry of the task's observation" + " that is no image" * bool(self.pixel_sizes)
         entries = ", ".join(vectors) + "." + nearest(key, vectors)
         raise ConfigError(f"agent.network.{name}={key!r} must be {what}: {entries}")
     if self.estimated_obs_key and self.estimated_obs_key == config.policy_obs_key:
       raise ConfigError(
         f"agent.network.estimated_obs_key={self.estimated_obs_key!r} is what the actor reads: estimate another entry, "
-        'or have it read pictures alone (agent.network.policy_obs_key="").'
+        'or have it read images alone (agent.network.policy_obs_key="").'
       )
     self.obs_limit: float | None = getattr(config, "clip_observations", None)
     self.precision = precision
@@ -320,7 +320,7 @@ class SoftActorCritic(Actor):
 def refuse_pictures(obs_size: ObservationSize, agent: str) -> None:
   """Raises ConfigError for a task with images, which this agent does not read."""
   if isinstance(obs_size, Mapping) and any(key.startswith(PIXELS) for key in obs_size):
-    raise ConfigError(f"agent={agent} reads no pictures: choose agent=ppo, or env.vision.enable=false.")
+    raise ConfigError(f"agent={agent} reads no images: choose agent=ppo, or env.vision.enable=false.")
 
 
 def normalize(obs: Mapping[str, jax.Array], normalizer: Normalizer | None) -> dict[str, jax.Array]:

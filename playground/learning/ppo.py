@@ -80,7 +80,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     networks = ActorCritic(env.observation_size, env.action_size, config.network, network_precision)
     if config.augment_pixels and not networks.pixel_sizes:
       raise ConfigError(
-        f"agent.augment_pixels={config.augment_pixels} shifts pictures, and the task has none: set it to 0."
+        f"agent.augment_pixels={config.augment_pixels} shifts images, and the task has none: set it to 0."
       )
     super().__init__(config, networks)
     self.mirror: Mirror | None = _mirror(env, networks) if config.mirror_augmentation else None
@@ -297,7 +297,7 @@ def _mirror(env: Env, networks: ActorCritic) -> Mirror:
   """Returns the task's mirror; raises ConfigError if it has none."""
   try:
     if networks.pixel_sizes:
-      raise ConfigError("pictures are not mirrored.")
+      raise ConfigError("images are not mirrored.")
     return mirror_of(env)
   except ConfigError as error:
     raise ConfigError(f"agent.mirror_augmentation=true: {error}") from None

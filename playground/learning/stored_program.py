@@ -112,7 +112,9 @@ class StoredProgram:
   def discard(self, error: Exception) -> UnusableProgramError:
     """Removes the file; returns an error with the reason."""
     self.path.unlink(missing_ok=True)
-    return UnusableProgramError(f"The stored program {self.path} was removed: {first_line(error)}. Tracing anew.")
+    return UnusableProgramError(
+      f"The stored program {self.path} was removed: {first_line(error)}. The program is traced again."
+    )
 
   def save(self, functions: Mapping[str, LoweredFunction]) -> None:
     """Writes the functions, and removes the programs that have not been used for longest. Raises OSError."""

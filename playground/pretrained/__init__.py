@@ -92,7 +92,7 @@ def check_task(folder: Path, saved: Section, today: Section) -> None:
     if _without_noise(saved.get(key)) != _without_noise(today.get(key)):
       raise CheckpointError(
         f"The pretrained policy {folder.name} does not fit its task any more: env.{key} has changed since it was "
-        f"trained; train anew with playground-run env={folder.name}."
+        f"trained; train again with playground-run env={folder.name}."
       )
 
 

@@ -62,7 +62,7 @@ class BatchRenderer:
       UnknownNameError: a camera or kind that does not exist.
     """
     if physics.impl != "warp":
-      raise ConfigError(f"env.impl={physics.impl} cannot render pictures of a batch: set env.impl=warp.")
+      raise ConfigError(f"env.impl={physics.impl} cannot render images of a batch: set env.impl=warp.")
     names = camera_names(physics.mj_model)
     for camera in view.cameras:
       if camera not in names:
@@ -72,7 +72,7 @@ class BatchRenderer:
       if kind not in _KINDS:
         raise UnknownNameError(f"Kind {kind!r} is unknown: choose from {', '.join(_KINDS)}.{nearest(kind, _KINDS)}")
     if not view.cameras or not view.kinds:
-      raise ConfigError("Nothing to render: name a camera and a kind of picture.")
+      raise ConfigError("Nothing to render: name a camera and a kind of image.")
     self.view = view
     self._physics = physics
     self._contexts: dict[tuple[object, ...], list[Context]] = {}

@@ -231,8 +231,8 @@ class RunCallbacks:
       tune = f"playground tune-buffers {self._config.choices['env']} --run {self._run_dir.path}"
       self._progress.print(
         f"{overflows:.0f} of {taken // self._env.action_repeat:,} actions needed more than Warp's buffers hold, and "
-        f"lost contacts or constraints: `{tune}` says how large env.njmax and the like should be, once a checkpoint "
-        "is there."
+        f"lost contacts or constraints: `{tune}` measures the sizes that env.njmax and its "
+        "companions need, once there is a checkpoint."
       )
 
   def _check_numbers(self, step: int, taken: int, metrics: Metrics, captured: Step | None) -> None:

@@ -106,7 +106,7 @@ class RunDirectory:
     if self.config_path.exists() or self.checkpoints.exists():
       raise CheckpointError(
         f"run_dir={self.path} already holds a run: give resume={self.path} to continue it, or another run_dir= "
-        f"(with init_from={self.path} to start anew from its weights)."
+        f"(with init_from={self.path} to start a new run from its weights)."
       )
 
   @property

@@ -241,8 +241,8 @@ def cut_short(
   if seen >= episode_length or not any(event.reset for event in events):
     return []
   return [
-    f"Training sees the first {seen} of an episode's {episode_length} control steps: then all environments start "
-    f"afresh (agent.num_resets_per_eval={agent.num_resets_per_eval}; fewer, or more steps, let episodes go on)."
+    f"Training covers the first {seen} of an episode's {episode_length} control steps: then all environments are reset "
+    f"(agent.num_resets_per_eval={agent.num_resets_per_eval}; fewer resets or more steps cover more of an episode)."
   ]
 
 

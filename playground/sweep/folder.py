@@ -263,7 +263,7 @@ class SweepDirectory:
       if lock is None:
         raise CheckpointError(
           f"{self.path} is being run by {lock_holder(self.path / 'sweep.lock')}: `playground sweep status {self.path}` "
-          "shows how it stands, sweep_dir=<path> starts the same jobs anew."
+          "shows how it stands, sweep_dir=<path> starts the same jobs again."
         )
       yield
 

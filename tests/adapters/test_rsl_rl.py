@@ -145,5 +145,5 @@ def test_pictures_are_refused() -> None:
     def observation_size(self) -> dict[str, tuple[int, ...]]:
       return {"state": (2,), "pixels/view": (8, 8, 3)}
 
-  with pytest.raises(ConfigError, match="RSL-RL gets no pictures from here"):
+  with pytest.raises(ConfigError, match="RSL-RL gets no images from here"):
     group_entries(Camera())

@@ -126,7 +126,7 @@ def test_the_time_is_kept_and_rows_so_far_stay(tmp_path: Path, capsys: pytest.Ca
   assert "0 failed, 2 left" in said and "the same command measures the rest" in said
   again = Plan(**{**vars(plan), "minutes": 1e-9, "rerun": True})
   assert run_jobs([job("train", "T")], table, FACTS, again) == 3
-  assert "name what is left in tasks=, for rerun=true begins anew" in capsys.readouterr().out
+  assert "name what is left in tasks=, because rerun=true starts over" in capsys.readouterr().out
 
 
 def test_workers_are_spread_over_gpus(tmp_path: Path):

@@ -41,7 +41,7 @@ def test_a_task_without_a_camera_is_refused() -> None:
 @pytest.mark.parametrize(
   ("options", "message"),
   [
-    ({"agent": "sac"}, "agent=sac reads no pictures: pixels is of agent=ppo"),
+    ({"agent": "sac"}, "agent=sac reads no images: pixels is of agent=ppo"),
     ({"sizes": (64, 0)}, r"sizes=\[64, 0\] must be a list of whole numbers from 1"),
     ({"num_envs": ()}, "num_envs= is empty"),
     ({"compared": True, "tasks": ("PandaPickCubeCartesianVision",)}, "compared=true is of CartpoleBalanceVision alone"),

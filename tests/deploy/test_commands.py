@@ -73,7 +73,7 @@ def test_a_policy_that_sees(command: Command, tmp_path: Path, capsys: pytest.Cap
   UntrainedRun(tmp_path / "run", "CartpoleBalance", *settings, scale=0.1).save(STEPS)
   assert command("export", str(tmp_path / "run"), "--out", str(tmp_path)) == 0
   out = " ".join(capsys.readouterr().out.split())
-  assert "pictures of 16 x 20 x 3 and 5 numbers in, 1 out" in out and "same actions on 1000 observations" in out
+  assert "images of 16 x 20 x 3 and 5 numbers in, 1 out" in out and "same actions on 1000 observations" in out
   contract = yaml.safe_load((tmp_path / "policy.yaml").read_text())
   assert [(row["name"], row["entry"]) for row in contract["policy"]["inputs"]] == [
     ("pixels_fixed", "pixels/fixed"), ("obs", "state"),

@@ -124,7 +124,7 @@ def test_shifts_move_a_trajectory_as_one_and_repeat_edges() -> None:
     ({"value_obs_key": "pixels/eye"}, r"must be an entry .* that is no picture: state, privileged_state\.$"),
     ({"estimated_obs_key": "stat"}, r"estimated_obs_key='stat' must be an entry.*Did you mean 'state'"),
     ({"estimated_obs_key": "state"}, "estimated_obs_key='state' is what the actor reads: estimate another entry"),
-    ({"estimated_obs_key": "state", "policy_hidden_layer_sizes": ()}, "from pictures by the first .* lacks one"),
+    ({"estimated_obs_key": "state", "policy_hidden_layer_sizes": ()}, "from images by the first .* lacks one"),
     ({"cnn": dataclasses.replace(TINY, strides=(2, 2))}, "must have one entry for each layer"),
     ({"cnn": dataclasses.replace(TINY, global_pool="mean")}, r"cnn.global_pool='mean' must be one of none, avg"),
     ({"cnn": dataclasses.replace(TINY, activation="rel")}, r"cnn.activation='rel'.*Did you mean 'relu'"),
@@ -138,9 +138,9 @@ def test_what_cannot_be(settings: dict[str, Any], message: str) -> None:
 def test_no_pictures_no_empty_key_and_none_for_sac() -> None:
   with pytest.raises(ConfigError, match="policy_obs_key='' must be an entry"):
     ActorCritic(5, 2, NetworkConfig(policy_obs_key=""))
-  with pytest.raises(ConfigError, match="estimated_obs_key='state' is estimated from pictures"):
+  with pytest.raises(ConfigError, match="estimated_obs_key='state' is estimated from images"):
     ActorCritic(5, 2, NetworkConfig(estimated_obs_key="state"))
-  with pytest.raises(ConfigError, match="agent=sac reads no pictures: choose agent=ppo"):
+  with pytest.raises(ConfigError, match="agent=sac reads no images: choose agent=ppo"):
     SoftActorCritic(SIZES, 2, SoftNetworkConfig())
 
 
@@ -179,7 +179,7 @@ def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: py
 
 def test_only_pictures_can_be_shifted() -> None:
   with pytest.raises(
-    ConfigError, match=r"^agent\.augment_pixels=4 shifts pictures, and the task has none: set it to 0\.$"
+    ConfigError, match=r"^agent\.augment_pixels=4 shifts images, and the task has none: set it to 0\.$"
   ):
     Trainer(PointTask(), dataclasses.replace(SMALL_PPO, augment_pixels=4), make_mesh(1))
 
@@ -196,7 +196,7 @@ def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
   logits, estimate = nets.logits_and_estimate(policy, obs)
   np.testing.assert_array_equal(logits, nets.logits(policy, obs))
   other = obs | {"state": obs["state"] + 1}
-  np.testing.assert_array_equal(estimate, nets.logits_and_estimate(policy, other)[1])  # from pictures alone
+  np.testing.assert_array_equal(estimate, nets.logits_and_estimate(policy, other)[1])  # from images alone
 
   log = []
   for _ in range(10):

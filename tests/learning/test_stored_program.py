@@ -55,7 +55,7 @@ def test_what_is_loaded_computes_the_same_and_takes_buffers_over(stored: StoredP
 @pytest.mark.parametrize("damage", [lambda content: content[:-1], lambda content: b"", lambda content: content[::-1]])
 def test_a_damaged_file_is_removed_and_said(stored: StoredProgram, damage: Callable[[bytes], bytes]):
   stored.path.write_bytes(damage(stored.path.read_bytes()))
-  with pytest.raises(UnusableProgramError, match=r"one\.program was removed: .*\. Tracing anew\.$"):
+  with pytest.raises(UnusableProgramError, match=r"one\.program was removed: .*\. The program is traced again\.$"):
     stored.load()
   assert stored.load() is None and not stored.path.exists()
 

@@ -129,7 +129,7 @@ def test_settings_that_cannot_be(seeing: Any, settings: dict[str, Any], message:
 def test_only_warp_renders() -> None:
   assert choose_impl("auto", "jax", renders=True) == "warp"
   load = partial(registry.load, "CartpoleBalance")
-  with pytest.raises(ConfigError, match=r"env.impl=jax renders no pictures.*leave it auto"):
+  with pytest.raises(ConfigError, match=r"env.impl=jax renders no images.*leave it auto"):
     load(overrides={"vision.enable": True, "vision.camera": "fixed", "impl": "jax"})
 
 

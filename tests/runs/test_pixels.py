@@ -41,6 +41,6 @@ def test_mistakes_are_said_before_anything_is_made(tmp_path: Path) -> None:
   run = f"run_dir={tmp_path / 'run'}"
   with pytest.raises(ConfigError, match=r"env.vision.camera=fix is no camera.*Did you mean 'fixed'"):
     train(compose([*RUN, run, "env.vision.camera=fix"]))
-  with pytest.raises(ConfigError, match="agent=sac reads no pictures"):
+  with pytest.raises(ConfigError, match="agent=sac reads no images"):
     train(compose(["env=CartpoleBalanceVision", "debug=fast", "hardware=cpu", "agent=sac", run]))
   assert not (tmp_path / "run").exists()

@@ -223,7 +223,7 @@ def test_a_second_start_traces_nothing_and_ends_the_same(whole: Path, cache: Pat
   program.write_bytes(program.read_bytes()[:-1])
   damaged = tmp_path / "damaged"
   assert start(damaged, cache).wait(300) == 0
-  assert f"The stored program {program} was removed: it is damaged. Tracing anew." in " ".join(
+  assert f"The stored program {program} was removed: it is damaged. The program is traced again." in " ".join(
     damaged.with_suffix(".log").read_text().split()
   )
   assert_same_result(damaged, whole)
@@ -487,4 +487,4 @@ def test_a_run_whose_fresh_starts_end_every_episode_early_says_so() -> None:
   assert "agent.num_resets_per_eval=10" in short
   assert "the first 140 of" in said()[0]  # as many as in playground 0.2.0
   assert said("agent.num_resets_per_eval=1") == []
-  assert said("agent.num_resets_per_eval=0", "agent.num_timesteps=1e6") == []  # nothing starts afresh
+  assert said("agent.num_resets_per_eval=0", "agent.num_timesteps=1e6") == []  # nothing is reset

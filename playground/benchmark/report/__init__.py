@@ -29,7 +29,7 @@ class Options:
 
   out: Annotated[str, "folder of the page"] = "results/benchmarks"
   rows: Annotated[Sequence[str], "folders whose CSVs it is made of"] = ROWS
-  pages: Annotated[str | None, "instead: folder of the result pages (docs) whose tables of runs to write anew"] = None
+  pages: Annotated[str | None, "instead: folder of the result pages (docs) whose tables of runs to rewrite"] = None
 
 
 def run(options: Options) -> int:

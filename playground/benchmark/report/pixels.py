@@ -8,7 +8,7 @@ from playground.benchmark.report.sections import Notes, nothing
 from playground.paper import paper_table
 from playground.reporting.page import Block, Heading, Table, Text
 
-SEEN = {"episodes": "state", "pixels": "+ pictures", "inference": "+ inference", "update": "+ training"}
+SEEN = {"episodes": "state", "pixels": "+ images", "inference": "+ inference", "update": "+ training"}
 PARTS = ("physics", "rendering", "inference", "policy update")  # what each of them adds, as the paper calls it
 MEMORY = "used_memory_gib"
 PAPER = ("paper, Madrona", "64", "1024")  # who, width of the images, environments
@@ -48,7 +48,7 @@ def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   yield Text("Where the time of a step of one environment goes: microseconds, and the share of a step that trains.")
   yield Table([*sizes, *PARTS, "device", "setting"], shares)
   yield Text(
-    "The paper's bars, 1024 environments with pictures. Simulators are compared in control steps of 1/60 s: "
+    "The paper's bars, 1024 environments with images. Simulators are compared in control steps of 1/60 s: "
     "`playground-bench pixels compared=true sizes=80,128,224,256`."
   )
   for r in paper_table("pixel_benchmark_upstream"):

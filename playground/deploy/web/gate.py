@@ -6,10 +6,12 @@ of requests and messages, in the places that `websockets` has for it.
 """
 
 import asyncio
+import contextlib
 import gzip
 import hmac
 import html
 import http
+import io
 import ipaddress
 import secrets
 import socket
@@ -155,7 +157,8 @@ class Gate:
 
     websockets.asyncio.server.serve = guarded
     try:
-      server = viser.ViserServer(host, port, label=self._title, verbose=False)
+      with contextlib.redirect_stdout(io.StringIO()):  # its banner, which has no option, would name no token
+        server = viser.ViserServer(host, port, label=self._title, verbose=False)
     finally:
       websockets.asyncio.server.serve = serve
     if not began:

@@ -27,7 +27,7 @@ AXES: tuple[tuple[str, Key, Key], ...] = (
   ("turn, rad/s", "J", "L"),
 )
 _KEYS = """
-| Key | |
+| Key | Action |
 |---|---|
 | I K | command: forward, back |
 | U O | command: left, right |
@@ -42,7 +42,7 @@ _KEYS = """
 | W A S D, Q E, arrows, mouse | move the camera |
 | ctrl K | all commands |
 
-| Gamepad | |
+| Gamepad | Action |
 |---|---|
 | left stick | command: forward, left |
 | right stick | command: turn |
@@ -64,7 +64,7 @@ class Panel:
   """
 
   def __init__(self, server: viser.ViserServer, session: Session):
-    """Adds them."""
+    """Adds the controls to the page."""
     self._server, self._gui, self._session = server, server.gui, session
     self._status = self._gui.add_markdown("")
     tabs = self._gui.add_tab_group()
@@ -85,7 +85,7 @@ class Panel:
     )
 
   def close(self) -> None:
-    """Lets go of the gamepads."""
+    """Stops listening to gamepads."""
     self._gamepads.close()
 
   def draw(self) -> None:
@@ -96,7 +96,7 @@ class Panel:
       f"{player.seconds:.1f} s, return {player.episode_return:.2f}",
     ]
     if player.takes_commands:
-      who = "the task's" if player.command is None else "yours"
+      who = "automatic" if player.command is None else "yours"
       lines.append(f"command {' / '.join(f'{value:.2f}' for value in player.task_command)} ({who})")
     if (seconds := self.recorder.seconds) is not None:
       lines.append(f"**recording {seconds:.1f} s**")
@@ -144,10 +144,12 @@ class Panel:
       self.paused.on_update(lambda _: setattr(session, "paused", self.paused.value))
       self._add_key("Pause", "space", self._toggle_pause)
       self.step = self._add_button("Step", "N", self._step)
-      self.speed = self._gui.add_slider("Speed", 0.05, 2.0, 0.05, 1.0, hint="simulated seconds in one")
+      self.speed = self._gui.add_slider("Speed", 0.05, 2.0, 0.05, 1.0, hint="simulated seconds per second")
       self.speed.on_update(lambda _: setattr(session, "speed", self.speed.value))
       most = max(0.5, session.push_speed)
-      self.push_speed = self._gui.add_slider("Push, m/s", 0.1, most, 0.1, 0.5, hint="which the robot gains at once")
+      self.push_speed = self._gui.add_slider(
+        "Push, m/s", 0.1, most, 0.1, 0.5, hint="added to the robot's velocity at once"
+      )
       self.push = self._add_button("Push", "P", self._push)
       self.reset = self._add_button("Reset", "R", session.reset)
       self.record = self._add_button("Record", "V", lambda: self.recorder.toggle())

@@ -16,7 +16,9 @@ _SECONDS = 10.0  # that a chart shows
 _POINTS = 250  # on a line, at most
 _LINES = 20  # in a chart, at most
 _DECIMALS = 6  # uPlot's ticks overflow on ranges near the smallest numbers
-_HEIGHT = 110  # pixels of a chart
+_HEIGHT = 120  # pixels of a chart
+# Pixels of an axis and between its numbers: with uPlot's own a chart this low has one number.
+_AXES: tuple[viser.uplot.Axis, ...] = ({"size": 26, "space": 60}, {"size": 52, "space": 16})
 _REWARDS, _OBSERVATIONS, _ACTIONS, _NOTHING = "Reward terms", "Observations", "Actions", "Nothing"
 Values = Callable[[Player], np.ndarray]
 
@@ -74,6 +76,7 @@ class Plots:
       (viser.uplot.Series(label="s"), *lines),
       title=title,
       scales={"x": viser.uplot.Scale(time=False)},
+      axes=_AXES,
       legend=viser.uplot.Legend(show=False),
       height=_HEIGHT,
       padding=(8, 24, 0, 0),  # the topmost number would be cut

@@ -18,13 +18,13 @@ _NEAR = 2.5  # m, the largest distance of the camera from a robot that walks: a 
 _FROM = np.array([0.8, -0.8, 0.4])  # direction of the camera
 _UP = np.array([0.0, 0.0, 1.0])
 _FIELD_OF_VIEW = np.radians(60)  # of the free camera, vertical
-# Colours of zenith, horizon, floor and its squares, on a light and on a dark page.
+# Colours of zenith, horizon, and the floor's light and dark squares, on a light and on a dark page.
 _COLORS = {
-  False: ((120, 160, 210), (232, 239, 247), (205, 212, 222), (176, 186, 200)),
-  True: ((14, 19, 30), (56, 66, 84), (62, 68, 80), (50, 56, 68)),
+  False: ((120, 160, 210), (232, 239, 247), (205, 212, 222), (150, 162, 180)),
+  True: ((14, 19, 30), (56, 66, 84), (66, 72, 84), (44, 50, 62)),
 }
 _SIDE, _COUNT = 0.5, 80  # m, of a square of the floor; squares in a row
-_BELOW = 0.01  # m, of the floor under its squares: nearer ones flicker
+_BELOW = 0.1  # m, of the plane behind the squares' edge under them: a nearer one hides them where depth is coarse
 _APART = 0.06  # m, between the robot and the arrows above it
 _ARROWS = {"commanded": (40, 160, 90), "actual": (40, 90, 200)}  # velocities, green and blue
 _SHOWN_AT_FIRST = {"velocity": True, "contacts": False, "follow": True, "dark": False}
@@ -79,9 +79,9 @@ class View:
     self._pose(player)
     for handle, position in self._copies:
       handle.batched_positions = np.delete(places, scene.env_idx, 0) + position
-    if self._floor is not None:
-      step = 2 * _SIDE
-      self._floor.position = (*(np.round(data.xpos[self._root, :2] / step) * step), self._floor.position[2])
+    step = 2 * _SIDE
+    for squares in self._squares:
+      squares.position = (*(np.round(data.xpos[self._root, :2] / step) * step), squares.position[2])
     self._draw_velocity(player)
     self._move_cameras()
 
@@ -128,7 +128,7 @@ class View:
     self._walks = walks(model)
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     self._root = int(model.jnt_bodyid[free[0]]) if len(free) else 0
-    self._floor, self._grids = None, []
+    self._squares, self._grids = [], []
     self._add_floor(model)
     self._places = np.zeros((number, 3))
     if not (model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD).any():  # on a terrain they stand where they are
@@ -147,23 +147,25 @@ class View:
     self._server.initial_camera.position = center + (min(distance, _NEAR) if self._walks else distance) * _FROM
 
   def _add_floor(self, model: mujoco.MjModel) -> None:
-    """Makes a plane of the world an opaque floor with squares."""
+    """Draws a plane of the world as light and dark squares, and makes mjviser's plane their background."""
     planes = np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_bodyid == 0))
     for plane in planes:  # the names that mjviser gives them
       grid = self._server.scene.get_handle_by_name(f"/fixed_bodies/world/{model.geom(plane).name or None}")
       if isinstance(grid, viser.GridHandle):
         grid.position = grid.position - np.array([0.0, 0.0, _BELOW])
-        grid.plane_opacity, grid.cell_thickness, grid.section_thickness = 1.0, 0.0, 0.0
+        grid.plane_opacity, grid.cell_thickness, grid.section_thickness, grid.shadow_opacity = 1.0, 0.0, 0.0, 0.0
         self._grids.append(grid)
     if len(planes):
-      self._floor = self._server.scene.add_mesh_simple(
-        "/fixed_bodies/squares",
-        *_squares(),
-        cast_shadow=False,
-        receive_shadow=0.3,
-        side="double",
-        position=(0.0, 0.0, float(model.geom_pos[planes[0], 2])),
-      )
+      for odd in (False, True):
+        squares = self._server.scene.add_mesh_simple(
+          f"/fixed_bodies/squares/{'dark' if odd else 'light'}",
+          *_squares(odd),
+          cast_shadow=False,
+          receive_shadow=0.3,
+          side="double",
+          position=(0.0, 0.0, float(model.geom_pos[planes[0], 2])),
+        )
+        self._squares.append(squares)
 
   def _add_copies(self) -> list[tuple[viser.BatchedGlbHandle, np.ndarray]]:
     """Draws what is fixed to the world once more for each other environment; mjviser draws it once.
@@ -190,12 +192,12 @@ class View:
 
   def _paint(self) -> None:
     """Colours sky and floor, and the page's panels."""
-    zenith, horizon, floor, squares = _COLORS[self.shown["dark"]]
+    zenith, horizon, *floor = _COLORS[self.shown["dark"]]
     self._server.scene.set_background_image(_sky(zenith, horizon))
     for grid in self._grids:
-      grid.plane_color = floor
-    if self._floor is not None:
-      self._floor.color = squares
+      grid.plane_color = tuple(np.mean(floor, 0).astype(int).tolist())
+    for squares, color in zip(self._squares, floor, strict=False):  # a scene without a plane has no squares
+      squares.color = color
     dark = self.shown["dark"]
     self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium", dark_mode=dark)
 
@@ -288,10 +290,10 @@ def _sky(zenith: tuple[int, int, int], horizon: tuple[int, int, int]) -> np.ndar
   return np.repeat((1 - share) * zenith + share * horizon, 2, axis=1).astype(np.uint8)
 
 
-def _squares() -> tuple[np.ndarray, np.ndarray]:
-  """Vertices and faces of every second square of a chessboard about the origin."""
+def _squares(odd: bool) -> tuple[np.ndarray, np.ndarray]:
+  """Vertices and faces of a chessboard's even or odd squares about the origin."""
   x, y = (axis.ravel() for axis in np.meshgrid(*[np.arange(-_COUNT // 2, _COUNT // 2)] * 2))
-  corners = np.stack([x, y], -1)[(x + y) % 2 == 0][:, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+  corners = np.stack([x, y], -1)[(x + y) % 2 == odd][:, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
   vertices = np.pad(corners.reshape(-1, 2) * _SIDE, ((0, 0), (0, 1)))
   first = 4 * np.arange(len(corners))[:, None, None]
   return vertices, (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
