@@ -95,7 +95,7 @@ def config_dict(values: Section | ConfigDict) -> TaskConfig:
 
 
 def in_order_of(first: object, values: object) -> Plain:
-  """`values` with the keys of `first` first, in their order there; mappings within likewise."""
+  """Returns `values`, and the mappings inside, with the keys of `first` first and in the order of `first`."""
   if not isinstance(values, Mapping | ConfigDict) or not isinstance(first, Mapping | ConfigDict):
     return values
   names = [*(name for name in first if name in values), *(name for name in values if name not in first)]

@@ -1,7 +1,7 @@
 """The tables of the result pages and the grids of the gallery, from results/reference/ and the catalogue.
 
 A page is written by hand except for the text between two comments, which `playground-bench report pages=docs` replaces.
-Each suite has a page with a row for each task and one with every run, where tasks that are not learnt come first.
+Each suite has a page with a row for each task and one with every run, where open tasks come first.
 """
 
 import re
@@ -25,7 +25,7 @@ RUNS_BEGIN, RUNS_END = GENERATED.format("runs"), "<!-- end of runs -->"
 GALLERY = "gallery.md"
 GRID_BEGIN, GRID_END = GENERATED.format("grid {}"), "<!-- end of grid -->"
 _GRID_WIDTH = 4  # loops in a row
-_TITLES = {"open": "Not learnt yet", "learning": "Learning", "solved": "Solved"}
+_TITLES = {"open": "Open", "learning": "Learning", "solved": "Solved"}
 # Settings that have columns of their own.
 _BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env=\w+| \(learning\)")
 _SHORT = {"agent.": "", "curriculum.": ""}

@@ -23,8 +23,8 @@ class TabletopTask(Task):
   `success_angle` of its turn where that is given, when the episode ends; `position_error_cm` is how far it is then.
 
   Attributes:
-    object: name of the body that `c.object_pos` and its like are of; None where the config names none.
-    gripper: name of the site at the tip of the gripper, likewise.
+    object: name of the body of `c.object_pos` and its companions; None if the config names none.
+    gripper: name of the site at the tip of the gripper; None if the config names none.
   """
 
   context = ArmContext
