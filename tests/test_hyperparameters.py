@@ -7,10 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from playground import registry
 from playground.config import RunConfig, compose, options
 from playground.config.files import config_roots, lineage
+from playground.learning.hyperparameters import config_class
+from playground.settings import defaults
+from tests.test_limits import leaves
 
 TABLES = Path(__file__).parents[1] / "benchmarks/paper"
 SOURCES = {"ppo_paper": "paper", "ppo_v020": "upstream_head", "sac": "paper", "sac_v020": "upstream_head"}
@@ -171,6 +175,23 @@ def test_a_tuned_set_belongs_to_an_agent_and_a_task(option: str):
   assert agent in options("agent")
   listed = {name for source in SOURCES for name in rows(source)}  # some are yet to come
   assert task in {*registry.names(), *listed, *FOR_ANY_TASK}
+
+
+def agent_values(option: str) -> Iterator[dict[str, Any]]:
+  """The agent's settings by dotted key of the files that a tuned set is built on, then its own."""
+  content = yaml.safe_load((config_roots()[0] / "tuned" / f"{option}.yaml").read_text()) or {}
+  for base in content.get("defaults", []):
+    if base != "_self_":
+      yield {key: value for values in agent_values(base.removeprefix("/tuned/")) for key, value in values.items()}
+  yield dict(leaves(content.get("agent", {}), ""))
+
+
+@pytest.mark.parametrize("option", options("tuned"))
+def test_a_tuned_set_holds_what_differs(option: str):
+  *bases, own = agent_values(option)
+  cls = config_class(lineage("agent", option.partition("/")[0], config_roots())[-1])
+  below = dict(leaves(defaults(cls), "")) | {key: value for values in bases for key, value in values.items()}
+  assert not {key: value for key, value in own.items() if below[key] == value}
 
 
 def test_the_pandas_experiment_from_pixels_has_a_set_of_its_own_and_the_task_alone_the_papers():
