@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import importlib
 from collections.abc import Callable, Mapping
-from typing import ClassVar, Generic, Self, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from playground.learning.networks import Actor, Normalizer
 from playground.learning.replay import Replay, ReplayBuffer
 from playground.learning.rollout import Environments
 from playground.pytree import PyTree
+from playground.settings import check
 
 Metrics = dict[str, jax.Array]
 
@@ -94,12 +95,6 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
       logged: there was nothing to learn from yet.
     """
 
-  def with_settings(self, values: Mapping[str, jax.Array]) -> Self:
-    """Returns the same algorithm with other values, each [], of settings that `config.traced` names."""
-    other = copy.copy(self)
-    other.config = dataclasses.replace(self.config, **values)
-    return other
-
   def new_policy(self, key: jax.Array) -> Policy:
     """Returns new parameters, and statistics of no observations."""
     return Policy(self.networks.init(key), self.networks.init_normalizer())
@@ -114,11 +109,6 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
     deterministic = self.config.deterministic_eval if deterministic is None else deterministic
     return self.networks.act(policy.params.policy, normalizer, obs, key, deterministic)
 
-  def other_acts(self) -> dict[str, Callable[..., jax.Array]]:
-    """Returns the act function that `deterministic_eval` does not choose, by name in metrics.csv (mode, sampled)."""
-    mode = not self.config.deterministic_eval
-    return {"mode" if mode else "sampled": functools.partial(self.act, deterministic=mode)} if self.samples else {}
-
 
 AnyAlgorithm = Algorithm[AgentConfig, Actor, AlgorithmState]
 
@@ -127,11 +117,26 @@ def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None
   """Imports and builds the algorithm of a config.
 
   Raises:
-    ConfigError: sizes that do not fit each other, or networks that do not fit the task.
+    ConfigError: an invalid value, sizes that do not fit each other, or networks that do not fit the task.
   """
+  check(config, "agent")
   module, _, name = config.algorithm.partition(":")
   make: Callable[..., AnyAlgorithm] = getattr(importlib.import_module(module), name)
   return make(env, config, network_precision)
+
+
+def with_settings(algorithm: AnyAlgorithm, values: Mapping[str, jax.Array]) -> AnyAlgorithm:
+  """Returns the same algorithm with other values, each [], of settings that `config.traced` names."""
+  other = copy.copy(algorithm)
+  other.config = dataclasses.replace(algorithm.config, **values)
+  return other
+
+
+def other_acts(algorithm: AnyAlgorithm) -> dict[str, Callable[..., jax.Array]]:
+  """Returns the act function that `deterministic_eval` does not choose, by name in metrics.csv (mode, sampled)."""
+  mode = not algorithm.config.deterministic_eval
+  act = functools.partial(algorithm.act, deterministic=mode)
+  return {"mode" if mode else "sampled": act} if algorithm.samples else {}
 
 
 def gradient_step(

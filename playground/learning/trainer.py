@@ -15,7 +15,7 @@ from playground.envs.wrappers import PRESERVE_INFO, ModelFields, wrap_for_traini
 from playground.errors import ConfigError
 from playground.hardware.distributed import is_multiprocess
 from playground.hardware.mesh import AXIS, device_memory, for_agents, gather_on_mesh, jit_on_mesh, put, take_agents
-from playground.learning.algorithm import AlgorithmState, Metrics, Policy, build_algorithm
+from playground.learning.algorithm import AlgorithmState, Metrics, Policy, build_algorithm, with_settings
 from playground.learning.checkpoints import Checkpoint
 from playground.learning.hyperparameters import AgentConfig
 from playground.learning.replay import REPLAY_SPEC, Replay
@@ -265,7 +265,7 @@ class Trainer:
     self, key: jax.Array, model: ModelFields, policy: Policy | None, settings: dict[str, jax.Array]
   ) -> TrainState:
     key, algorithm_key, env_key = jax.random.split(key, 3)
-    algorithm = self.algorithm.with_settings(below("agent", settings)).init(algorithm_key, policy)
+    algorithm = with_settings(self.algorithm, below("agent", settings)).init(algorithm_key, policy)
     env_state = self._reset_environments(env_key, model, settings)
     capture = NonfiniteCapture.empty(env_state, self.env.action_size, model)
     return _train_state(algorithm, key, env_state, capture, settings)
@@ -304,7 +304,7 @@ class Trainer:
     key, shared = jax.random.split(state.key)
     env = self.env.with_settings(below("env", state.settings))
     envs = Environments(state.env_state, state.capture, model, {}, env)
-    algorithm, envs, metrics = self.algorithm.with_settings(below("agent", state.settings)).train_step(
+    algorithm, envs, metrics = with_settings(self.algorithm, below("agent", state.settings)).train_step(
       state.algorithm.replace(replay=state.replay), envs, jax.random.fold_in(shared, jax.lax.axis_index(AXIS))
     )
     metrics = {"learned": jnp.ones(())} | metrics | jax.lax.psum(envs.sums, AXIS)

@@ -15,7 +15,7 @@ from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import ending_together, is_main, leave, noting_loss, preflight, share, wait_for_all
 from playground.hardware.setup import Hardware, setup
-from playground.learning.algorithm import Policy
+from playground.learning.algorithm import Policy, other_acts
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
 from playground.learning.hyperparameters import AgentConfig
@@ -168,8 +168,8 @@ def prepare(
   events = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
   plan.notices += cut_short(agent, env.episode_length, events, trainer.steps_per_update)
   num_recorded = min(config.video.episodes, agent.num_eval_envs // trainer.num_devices) * config.video.enable
-  other_acts = trainer.algorithm.other_acts()
-  evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, trainer.mesh, num_recorded, other_acts)
+  others = other_acts(trainer.algorithm)
+  evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, trainer.mesh, num_recorded, others)
   stored = stored_program(config, trainer, hardware, from_policy=plan.policy is not None)
   return Training(env, drawn, trainer, events, evaluate, draw, stored)
 

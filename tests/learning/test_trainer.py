@@ -1,6 +1,7 @@
 """Training as a whole, with every algorithm, on a task that compiles in seconds."""
 
 import dataclasses
+import inspect
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 from playground.envs.base import State
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.hardware.mesh import make_mesh
+from playground.learning.algorithm import Algorithm, other_acts
 from playground.learning.evaluation import make_evaluator
 from playground.learning.loop import CompiledFunctions, Loop, compile_program, schedule
 from playground.learning.trainer import Trainer, trainer_settings
@@ -46,7 +48,7 @@ two_of_them = algorithms("ppo", "sac")  # where each compiles a trainer of its o
 @cache
 def built(config: Config, **events: Any) -> tuple[Trainer, CompiledFunctions]:
   trainer = point_trainer(config, **events)
-  others = trainer.algorithm.other_acts()
+  others = other_acts(trainer.algorithm)
   evaluate = make_evaluator(trainer.env.unwrapped, trainer.act, config.num_eval_envs, trainer.mesh, 1, others)
   return trainer, compile_program(trainer, evaluate, lambda: ({}, {}))
 
@@ -63,6 +65,12 @@ def run(
   marks = schedule(updates, 3, 1, max(5, updates // 20))
   loop = Loop(trainer, program, marks, seeds=[seed], callbacks=[callbacks])
   return loop.run(*(resumed or (loop.init(), None)))
+
+
+def test_the_interface_of_an_algorithm_is_small() -> None:
+  methods = [name for name, _ in inspect.getmembers(Algorithm, inspect.isfunction) if not name.startswith("_")]
+  assert len(methods) <= 5
+  assert Algorithm.__abstractmethods__ == {"init", "train_step"}
 
 
 @pytest.mark.parametrize(
@@ -207,7 +215,7 @@ def test_agents_of_one_program_end_as_they_do_alone(config: Config) -> None:
   settings = [trainer_settings(each, env.settings_of(Weighted(weight).config)) for each, weight, _ in agents]
 
   def compiled(trainer: Trainer) -> CompiledFunctions:
-    evaluate = make_evaluator(env, trainer.act, config.num_eval_envs, trainer.mesh, 1, trainer.algorithm.other_acts())
+    evaluate = make_evaluator(env, trainer.act, config.num_eval_envs, trainer.mesh, 1, other_acts(trainer.algorithm))
     return compile_program(trainer, evaluate, lambda: ({}, {}))
 
   expected, single = [], Trainer(env, config, make_mesh(1))
