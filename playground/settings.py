@@ -18,8 +18,9 @@ import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
-from playground.errors import UnknownNameError, nearest
+from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.limits import Limit
+from playground.text import format_value, join, wrong_type
 
 T = TypeVar("T")
 Plain = Any  # mappings, lists and scalars inside each other, as YAML has them; they are checked where they are read
@@ -93,6 +94,32 @@ def build(cls: type[T], values: Section, key: str = "") -> T:
     if (inner := nested(hints[name])) and isinstance(value, Mapping):
       fields[name] = build(inner, value, key and f"{key}.{name}")
   return cls(**fields)
+
+
+def check(config: object, key: str = "") -> None:
+  """Checks all values of a settings class, as composing does: choices, texts and limits; null is not checked.
+
+  Args:
+    config: an instance.
+    key: where it is, such as agent.
+
+  Raises:
+    ConfigError: the first invalid value.
+  """
+  for name, setting in settings(type(config)).items():
+    if "*" not in name and (value := functools.reduce(getattr, name.split("."), config)) is not None:
+      check_value(join(key, name), value, setting)
+
+
+def check_value(key: str, value: object, setting: Setting) -> None:
+  """Raises ConfigError, which names the key, the value and what is allowed, for a value that a setting refuses."""
+  if setting.choices and value not in setting.choices:
+    allowed = f"{', '.join(setting.choices)}.{nearest(str(value), setting.choices)}"
+    raise ConfigError(f"{key}={format_value(value)} is unknown: choose from {allowed}")
+  if (depth := setting.text_depth) is not None and not is_text(value, depth):
+    raise wrong_type(key, value, TEXTS[depth] + " (put quotes around a number)" * (depth == 0))
+  if setting.limit is not None and not setting.limit.allows(value):
+    raise ConfigError(f"{key}={format_value(value)} must be {setting.limit}.")
 
 
 def nested(hint: object) -> type | None:

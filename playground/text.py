@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping
 
-from playground.errors import nearest
+from playground.errors import ConfigError, nearest
 
 
 def format_value(value: object) -> str:
@@ -22,6 +22,11 @@ def quoted(value: object) -> str:
   """
   text = re.sub(r"(\\*)('|$)", lambda match: match[1] * 2 + match[2].replace("'", "\\'"), str(value))
   return "'" + text.replace("${", "\\${") + "'"
+
+
+def wrong_type(key: str, value: object, allowed: str) -> ConfigError:
+  """Returns the error for a value of a wrong type."""
+  return ConfigError(f"{key}={format_value(value)} has the wrong type: it must be {allowed}.")
 
 
 def first_line(error: Exception) -> str:

@@ -5,7 +5,7 @@ from typing import TypeVar
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.limits import Limit
-from playground.settings import Setting, settings
+from playground.settings import Setting, check, settings
 from playground.text import format_value
 
 T = TypeVar("T")
@@ -50,12 +50,9 @@ def parse(command: str, options: type[T], arguments: Sequence[str]) -> T:
 
 def check_limits(options: object) -> None:
   """Raises ConfigError for numbers outside their limits, and for empty lists."""
-  for name, setting in settings(type(options)).items():
-    value = getattr(options, name)
-    if setting.default and value == ():
-      raise ConfigError(f"{name}= is empty: name at least one, or leave it away.")
-    if setting.limit and value is not None and not setting.limit.allows(value):
-      raise ConfigError(f"{name}={format_value(value)} must be {setting.limit}.")
+  if empty := [name for name, one in settings(type(options)).items() if one.default and getattr(options, name) == ()]:
+    raise ConfigError(f"{empty[0]}= is empty: name at least one, or leave it away.")
+  check(options)
 
 
 def help_of(options: type) -> list[str]:

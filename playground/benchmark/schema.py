@@ -13,7 +13,7 @@ from playground.errors import ConfigError
 COLUMNS = {
   "benchmark": "the command, such as throughput, together, startup, topology, chain, compare, learning or golden",
   "task": "the task's name, of a chain the experiment's",
-  "agent": "ppo, ppo_paper or sac",
+  "agent": "the option of agent, such as ppo, ppo_paper or sac",
   "who": "ours, or the peer's name and version",
   "setting": "what differs from the task's own configuration, as overrides, and what the benchmark varies",
   "seed": "of the training; empty where a number belongs to all seeds",

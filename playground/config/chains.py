@@ -20,10 +20,9 @@ from pathlib import Path
 from playground.config.files import options
 from playground.config.overrides import Override, parse
 from playground.config.run_options import CurriculumConfig
-from playground.config.schema import wrong_type
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
 from playground.settings import Section, defaults
-from playground.text import format_value
+from playground.text import format_value, wrong_type
 
 _FIELDS = ("num_timesteps", "overrides")
 _SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # groups and sections that a stage may set

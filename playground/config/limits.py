@@ -5,11 +5,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 
 from playground.config.definitions import chosen_names, definition
-from playground.config.schema import is_of_terms, wrong_type
+from playground.config.schema import is_of_terms
 from playground.envs.options import sees
-from playground.errors import ConfigError, nearest
+from playground.errors import ConfigError
 from playground.limits import Limit
-from playground.settings import TEXTS, Plain, Section, is_text
+from playground.settings import Plain, Section, check_value
 from playground.text import format_value, join
 
 _XLA_SWITCH = re.compile(r"--xla_\w+(=(true|false|-?\d+(\.\d+)?))?")
@@ -35,15 +35,11 @@ def check_limits(resolved: Section) -> None:
 
 
 def _check(key: str, value: object, names: Mapping[str, object]) -> None:
-  shown, setting = f"{key}={format_value(value)}", definition(key, names)
-  if setting and setting.choices and value not in setting.choices:
-    near = nearest(str(value), setting.choices)
-    raise ConfigError(f"{shown} is unknown: choose from {', '.join(setting.choices)}.{near}")
-  if setting and (depth := setting.text_depth) is not None and not is_text(value, depth):
-    raise wrong_type(key, value, TEXTS[depth] + " (put quotes around a number)" * (depth == 0))
-  limit = (setting and setting.limit) or (Limit().each if _numbers(value) else None)
-  if limit is not None and not limit.allows(value):
-    raise ConfigError(f"{shown} must be {limit}.")
+  setting = definition(key, names)
+  if setting is not None:
+    check_value(key, value, setting)
+  if (setting is None or setting.limit is None) and _numbers(value) and not Limit().each.allows(value):
+    raise ConfigError(f"{key}={format_value(value)} must be {Limit().each}.")
 
 
 def _check_order(node: Section, key: str) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
 from playground.limits import SHARE, at_least_0, count
 
@@ -17,7 +17,9 @@ class WandbConfig:
   group: Annotated[str | None, "runs of one group are shown together"] = None
   name: Annotated[str | None, "the run's name; null is that of the run directory"] = None
   tags: Annotated[Sequence[str], "words to find the run by"] = ()
-  mode: Annotated[str, "auto is online if logged in, else offline; or online, offline, disabled"] = "auto"
+  mode: Annotated[Literal["auto", "online", "offline", "disabled"], "auto is online if logged in, else offline"] = (
+    "auto"
+  )
   upload: Annotated[bool, "whether the policy, videos and plots are uploaded when the run ends"] = False
 
 
@@ -50,7 +52,8 @@ class VideoConfig:
   height: Annotated[int, count(1, 8192), "pixels"] = 480
   camera: Annotated[str | None, "one of the model's; null is a view of the whole scene"] = None
   visuals: Annotated[
-    str, "primitives, or menagerie: the robot's meshes, from the package mujoco-menagerie (legged robots)"
+    Literal["primitives", "menagerie"],
+    "menagerie is the robot's meshes, of the package mujoco-menagerie (with legs)",
   ] = "primitives"
 
 

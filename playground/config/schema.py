@@ -5,11 +5,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from playground.config.definitions import definition
 from playground.config.files import DELTAS
-from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.errors import UnknownNameError, nearest
 from playground.mdp.options import OPTIONS, keys
 from playground.moved import check_not_moved
 from playground.settings import Plain, Section
-from playground.text import format_value, join, nearest_in
+from playground.text import format_value, join, nearest_in, wrong_type
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", list: "a list"}
 
@@ -88,11 +88,6 @@ def fit(value: Plain, default: Plain, names: Mapping[str, object], key: str = ""
     raise wrong_type(key, value, f"{allowed}, as its default {format_value(default)} is")
   kind: Plain = type(default)
   return kind(value) if isinstance(default, int | float) else value
-
-
-def wrong_type(key: str, value: object, allowed: str) -> ConfigError:
-  """Returns the error for a value of a wrong type."""
-  return ConfigError(f"{key}={format_value(value)} has the wrong type: it must be {allowed}.")
 
 
 def _fits(value: object, default: object) -> bool:

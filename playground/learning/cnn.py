@@ -8,7 +8,7 @@ from flax import linen
 from jax.typing import DTypeLike
 
 from playground.envs.base import PIXELS
-from playground.errors import ConfigError, nearest
+from playground.errors import ConfigError
 from playground.learning.hyperparameters import CNNConfig
 
 Activation = Callable[[jax.Array], jax.Array]
@@ -24,16 +24,11 @@ _POOLS: dict[str, Activation] = {
 }
 
 
-def check_cnn(config: CNNConfig, activations: Mapping[str, Activation]) -> None:
-  """Raises ConfigError for layers that do not fit each other, and for unknown names."""
+def check_cnn(config: CNNConfig) -> None:
+  """Raises ConfigError for layers that do not fit each other."""
   lengths = {len(config.channels), len(config.kernels), len(config.strides)}
   if len(lengths) != 1 or not lengths.isdisjoint({0}):
     raise ConfigError("agent.network.cnn.channels, kernels and strides must have one entry for each layer.")
-  choices = (("activation", config.activation, activations), ("global_pool", config.global_pool, _POOLS))
-  for name, value, known in choices:
-    if value not in known:
-      near = nearest(value, known)
-      raise ConfigError(f"agent.network.cnn.{name}={value!r} must be one of {', '.join(known)}.{near}")
 
 
 class CNN(linen.Module):

@@ -21,7 +21,12 @@ ENTRY_POINTS = "playground.agents"
 ELSEWHERE = {"rsl_rl_ppo": " RSL-RL trains through its own runner: docs/rsl-rl.md."}  # agents of earlier versions
 _MOST = 2**31 - 1  # transitions on a device: they are drawn by int32
 
-
+# Settings of several classes.
+ActivationName = Literal["swish", "relu", "elu", "tanh", "gelu"]
+Activation = Annotated[ActivationName, "of the hidden layers"]
+Discounting = Annotated[float, SHARE, "discount of one policy step"]
+RewardScaling = Annotated[float, positive(), "factor on rewards"]
+ActorSizes = Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"]
 PolicyObsKey = Annotated[str, "observation group that the actor reads"]
 ValueObsKey = Annotated[str, "observation group that the critic reads; privileged_state for an asymmetric pair"]
 
@@ -84,9 +89,9 @@ class OnPolicyConfig(AgentConfig):
   num_minibatches: Annotated[int, count(1, 100_000), "minibatches of an epoch"] = 32
   num_updates_per_batch: Annotated[int, count(1, 100_000), "epochs over the collected trajectories"] = 4
   learning_rate: Annotated[float, positive(1), "of Adam"] = 3e-4
-  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
+  discounting: Discounting = 0.99
   gae_lambda: Annotated[float, SHARE, "decay of advantages (GAE), or of λ-returns, over later steps"] = 0.95
-  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
+  reward_scaling: RewardScaling = 1.0
   init_at_random_ep_len: Annotated[
     bool, "whether a reset gives environments random ages, so that a batch holds all parts of episodes"
   ] = False
@@ -103,9 +108,9 @@ class OffPolicyConfig(AgentConfig):
   batch_size: Annotated[int, count(1, 2**24), "transitions of one gradient step"] = 512
   grad_updates_per_step: Annotated[int, count(1, 100_000), "gradient steps for each step of all environments"] = 8
   num_steps: Annotated[int, count(1, 100), "policy steps whose rewards a target holds before the critic's value"] = 1
-  discounting: Annotated[float, SHARE, "discount of one policy step"] = 0.99
+  discounting: Discounting = 0.99
   tau: Annotated[float, SHARE, "how far the target critics move towards the critics after each critic update"] = 0.005
-  reward_scaling: Annotated[float, positive(), "factor on rewards"] = 1.0
+  reward_scaling: RewardScaling = 1.0
   min_replay_size: Annotated[int, count(0, 2**40), "transitions collected before the first gradient step"] = 8192
   max_replay_size: Annotated[
     int, count(1, 2**40), "transitions kept over all devices, the newest; a run prints their memory"
@@ -142,9 +147,11 @@ class CNNConfig:
   channels: Annotated[Sequence[int], SIZES, "of each layer"] = (16, 32)
   kernels: Annotated[Sequence[int], SIZES, "pixels, square, of each layer"] = (5, 3)
   strides: Annotated[Sequence[int], SIZES, "pixels, of each layer"] = (2, 2)
-  activation: Annotated[str, "of each layer: elu, relu, swish, tanh and more"] = "elu"
+  activation: Annotated[ActivationName, "of each layer"] = "elu"
   max_pool: Annotated[bool, "whether each layer is followed by the maximum of 2 x 2 pixels"] = True
-  global_pool: Annotated[str, "of the last layer: none (all of it), avg, max, spatial_softmax"] = "none"
+  global_pool: Annotated[Literal["none", "avg", "max", "spatial_softmax"], "of the last layer; none is all of it"] = (
+    "none"
+  )
   normalize_channels: Annotated[
     bool, "whether each channel of an image is scaled to mean 0 and standard deviation 1"
   ] = False
@@ -154,15 +161,9 @@ class CNNConfig:
 class NetworkConfig:
   """Sizes and inputs of actor and critic, two separate MLPs (Brax's names and defaults)."""
 
-  policy_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"] = (32, 32, 32, 32)
-  value_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the critic's hidden layers"] = (
-    256,
-    256,
-    256,
-    256,
-    256,
-  )
-  activation: Annotated[str, "of the hidden layers"] = "swish"
+  policy_hidden_layer_sizes: ActorSizes = (32, 32, 32, 32)
+  value_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the critic's hidden layers"] = (256,) * 5
+  activation: Activation = "swish"
   policy_obs_key: Annotated[
     str, 'observation group that the actor reads; "" reads images alone, where env.vision gives any'
   ] = "state"
@@ -171,9 +172,10 @@ class NetworkConfig:
   clip_observations: Annotated[
     float | None, positive(), "largest input of actor and critic, after normalisation; null: it is not clipped"
   ] = None
-  value_dtype: Annotated[str, "of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere"] = (
-    "auto"
-  )
+  value_dtype: Annotated[
+    Literal["auto", "bfloat16", "float32"],
+    "of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere",
+  ] = "auto"
   cnn: Annotated[CNNConfig, "of actor and critic each, for images"] = dataclasses.field(default_factory=CNNConfig)
 
 
@@ -185,7 +187,7 @@ class SoftNetworkConfig:
     256,
     256,
   )
-  activation: Annotated[str, "of the hidden layers"] = "relu"
+  activation: Activation = "relu"
   policy_network_layer_norm: Annotated[bool, "whether the actor has layer normalisation"] = False
   q_network_layer_norm: Annotated[bool, "whether the critics have layer normalisation"] = True
   policy_obs_key: PolicyObsKey = "state"
@@ -288,9 +290,9 @@ class SACConfig(OffPolicyConfig):
 class REPPONetworkConfig:
   """Sizes and inputs of REPPO's actor and critic."""
 
-  hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"] = (512, 512)
+  hidden_layer_sizes: ActorSizes = (512, 512)
   q_hidden_layer_size: Annotated[int, count(1, 65536), "units of each of the critic's hidden layers"] = 512
-  activation: Annotated[str, "of the actor's hidden layers"] = "swish"
+  activation: Annotated[ActivationName, "of the actor's hidden layers"] = "swish"
   min_std: Annotated[float, positive(), "smallest standard deviation of actions before squashing"] = 0.1
   policy_obs_key: PolicyObsKey = "state"
   value_obs_key: ValueObsKey = "state"
@@ -340,9 +342,9 @@ class REPPOConfig(OnPolicyConfig):
 class C51NetworkConfig:
   """Sizes and inputs of an actor and twin distributional critics; the defaults are FastTD3's."""
 
-  policy_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"] = (512, 256, 128)
+  policy_hidden_layer_sizes: ActorSizes = (512, 256, 128)
   q_hidden_layer_sizes: Annotated[Sequence[int], SIZES, "units of each critic's hidden layers"] = (1024, 512, 256)
-  activation: Annotated[str, "of the hidden layers"] = "relu"
+  activation: Activation = "relu"
   layer_norm: Annotated[bool, "whether the hidden layers, of actor and critics, are normalised"] = False
   policy_output_scale: Annotated[float, at_least_0(), "standard deviation of the actor's last weights at first"] = 0.01
   policy_obs_key: PolicyObsKey = "state"
@@ -400,7 +402,7 @@ class FastSACNetworkConfig(C51NetworkConfig):
   """Sizes and inputs of FastSAC's actor and twin critics."""
 
   q_hidden_layer_sizes: Sequence[int] = (768, 384, 192)
-  activation: str = "swish"
+  activation: ActivationName = "swish"
   layer_norm: bool = True
   policy_output_scale: float = 0.0
   min_log_std: Annotated[

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,9 @@ from jax.typing import DTypeLike
 
 from playground.envs.base import PIXELS, Observation
 from playground.errors import ConfigError, nearest
-from playground.learning.cnn import ESTIMATOR, PixelNetwork, check_cnn
+from playground.learning.cnn import ESTIMATOR, Activation, PixelNetwork, check_cnn
 from playground.learning.hyperparameters import (
+  ActivationName,
   C51NetworkConfig,
   CNNConfig,
   NetworkConfig,
@@ -25,7 +27,7 @@ from playground.learning.hyperparameters import (
 )
 from playground.pytree import PyTree
 
-ACTIVATIONS = {"swish": linen.swish, "relu": linen.relu, "elu": linen.elu, "tanh": linen.tanh, "gelu": linen.gelu}
+ACTIVATIONS: dict[str, Activation] = {name: getattr(linen, name) for name in get_args(ActivationName)}
 
 Normalizer = running_statistics.RunningStatisticsState
 ObservationSize = int | Mapping[str, tuple[int, ...]]
@@ -65,9 +67,6 @@ class Actor:
     Raises:
       ConfigError: unknown activation, or an observation group that the task does not have.
     """
-    if config.activation not in ACTIVATIONS:
-      allowed = ", ".join(ACTIVATIONS) + "." + nearest(config.activation, ACTIVATIONS)
-      raise ConfigError(f"agent.network.activation={config.activation!r} must be one of {allowed}")
     sizes = obs_size if isinstance(obs_size, Mapping) else {"state": (obs_size,)}
     self.pixel_sizes = {key: sizes[key] for key in sorted(sizes) if key.startswith(PIXELS)}
     self.estimated_obs_key: str = getattr(config, "estimated_obs_key", "")
@@ -178,7 +177,7 @@ class Actor:
     return self.pixel_sizes | ({key: self.obs_sizes[key]} if key else {})
 
   def _on_pixels(self, cnn: CNNConfig, sizes: Sequence[int], output_size: int, **how: PyTree) -> PixelNetwork:
-    check_cnn(cnn, ACTIVATIONS)
+    check_cnn(cnn)
     return PixelNetwork(cnn, ACTIVATIONS[cnn.activation], tuple(sizes), self.activation, output_size, **how)
 
   def _seen(self, obs: Mapping[str, jax.Array], key: str) -> tuple[dict[str, jax.Array], jax.Array | None]:
@@ -233,8 +232,6 @@ class ActorCritic(Actor):
 
   def __init__(self, obs_size: ObservationSize, action_size: int, config: NetworkConfig, precision: str | None = None):
     """Builds the networks; see `Actor` for the arguments and errors."""
-    if config.value_dtype not in ("auto", "bfloat16", "float32"):
-      raise ConfigError(f"agent.network.value_dtype={config.value_dtype!r} must be one of auto, bfloat16, float32.")
     super().__init__(obs_size, action_size, config.policy_hidden_layer_sizes, config, precision)
     auto = "bfloat16" if jax.default_backend() == "gpu" else "float32"
     self.value_dtype = auto if config.value_dtype == "auto" else config.value_dtype

@@ -1,6 +1,6 @@
 """The critic is Brax's value network, in float32 or with bfloat16 activations."""
 
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +9,18 @@ import pytest
 from brax.training.agents.ppo import networks as brax_networks
 from flax import linen
 
+from playground.config import compose, format_value
 from playground.errors import ConfigError
+from playground.learning.algorithm import build_algorithm
+from playground.learning.hyperparameters import PPOConfig
 from playground.learning.networks import ActorCritic, NetworkConfig
+from playground.settings import build
+from tests.dummy import Point
 
 SIZES = (64, 64, 64)
 
 
-def critic(dtype: str) -> tuple[ActorCritic, Any]:
+def critic(dtype: Literal["auto", "bfloat16", "float32"]) -> tuple[ActorCritic, Any]:
   networks = ActorCritic(5, 2, NetworkConfig((8,), SIZES, value_dtype=dtype))
   return networks, networks.init(jax.random.PRNGKey(3)).value
 
@@ -43,8 +48,27 @@ def test_bfloat16_is_near_and_keeps_parameters_in_float32() -> None:
     assert jnp.linalg.norm(near - grad) < 0.03 * jnp.linalg.norm(grad)
 
 
-def test_dtype_follows_the_device_and_unknown_ones_are_refused() -> None:
+def test_dtype_follows_the_device() -> None:
   networks, _ = critic("auto")
   assert networks.value_dtype == ("bfloat16" if jax.default_backend() == "gpu" else "float32")
-  with pytest.raises(ConfigError, match=r"value_dtype='half' must be one of"):
-    critic("half")
+
+
+@pytest.mark.parametrize(
+  ("config", "message"),
+  [
+    (
+      {"network": {"value_dtype": "half"}},
+      "agent.network.value_dtype=half is unknown: choose from auto, bfloat16, float32",
+    ),
+    ({"network": {"activation": "rel"}}, "agent.network.activation=rel is unknown: .* Did you mean 'relu'"),
+    ({"network": {"cnn": {"global_pool": "mean"}}}, "network.cnn.global_pool=mean is unknown: choose from none, avg"),
+    ({"network": {"cnn": {"activation": "rel"}}}, "network.cnn.activation=rel is unknown: .* Did you mean 'relu'"),
+    ({"network": {"policy_hidden_layer_sizes": [8, 0]}}, r"sizes=\[8, 0\] must be a list of whole numbers from 1 to"),
+    ({"discounting": 1.5}, "agent.discounting=1.5 must be a number from 0 to 1"),
+  ],
+)
+def test_python_and_the_command_line_refuse_the_same_values(config: dict[str, Any], message: str) -> None:
+  with pytest.raises(ConfigError, match=message):
+    build_algorithm(Point(), build(PPOConfig, config), None)
+  with pytest.raises(ConfigError, match=message):
+    compose(["env=CartpoleBalance", "agent=ppo", *(f"agent.{key}={format_value(x)}" for key, x in config.items())])
