@@ -133,6 +133,15 @@ def below(key: str, values: Mapping[str, T]) -> dict[str, T]:
   return {name.removeprefix(f"{key}."): value for name, value in values.items() if name.startswith(f"{key}.")}
 
 
+def select(values: Plain, key: str) -> Plain:
+  """Returns the value at a dotted key of nested mappings and lists, None if there is none."""
+  for part in key.split("."):
+    values = (
+      values[int(part)] if isinstance(values, list) else values.get(part) if isinstance(values, Mapping) else None
+    )
+  return values
+
+
 def plain(value: Plain, finite: bool = False) -> Plain:
   """Returns a value (dataclass, ConfigDict, tuple, path, array, …) as the dicts, lists and scalars of YAML and JSON.
 

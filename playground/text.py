@@ -3,6 +3,8 @@
 import re
 from collections.abc import Iterable, Mapping
 
+import yaml
+
 from playground.errors import ConfigError, nearest
 
 
@@ -27,6 +29,26 @@ def quoted(value: object) -> str:
 def wrong_type(key: str, value: object, allowed: str) -> ConfigError:
   """Returns the error for a value of a wrong type."""
   return ConfigError(f"{key}={format_value(value)} has the wrong type: it must be {allowed}.")
+
+
+class _Dumper(yaml.SafeDumper):
+  """Quotes text that OmegaConf would read as a number, such as 1e3, which PyYAML alone leaves bare."""
+
+
+def _represent_text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
+  try:
+    float(text)
+  except ValueError:
+    return dumper.represent_str(text)
+  return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="'")
+
+
+_Dumper.add_representer(str, _represent_text)
+
+
+def dump_yaml(values: object) -> str:
+  """Returns plain dicts, lists and scalars as YAML, which reads back the same."""
+  return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 def first_line(error: Exception) -> str:

@@ -21,6 +21,7 @@ from playground.config.run_options import ProfileConfig, TrackingConfig, VideoCo
 from playground.errors import ConfigError, UnknownNameError
 from playground.hardware.options import DistributedConfig
 from playground.learning.hyperparameters import config_class
+from playground.runs.run_dir import RunDirectory
 from playground.settings import plain
 from tests.sampling import some
 
@@ -241,6 +242,14 @@ def test_overrides_are_what_hydra_takes():
     *("experiment=quickstart", "agent.num_timesteps=1000000", "~tuned", "seed=2", "run_dir='a b'"),
   )
   assert compose(run.overrides).resolved == run.resolved
+
+
+@pytest.mark.parametrize("name", ["a word", "1e3", "${oc.env:HOME}", "ü: [", "2024-01-01", "null", "1_0"])
+def test_saved_text_reads_back(name: str, tmp_path: Path):
+  """A commit such as 1e3 is text for PyYAML and a number for OmegaConf."""
+  resolved = {**compose([]).resolved, "name": name}
+  run = RunDirectory.create(tmp_path / "run", resolved)
+  assert config.load(run.config_path).name == run.config["name"] == name
 
 
 def test_saved_configuration_reads_back(tmp_path: Path):

@@ -21,7 +21,6 @@ from hydra.errors import HydraException
 
 from playground import __version__
 from playground.cli.header import header
-from playground.cli.help import print_help
 from playground.config import (
   RunConfig,
   command_lines,
@@ -137,6 +136,8 @@ def _downloaded(override: str) -> str:
 def _help(keys: Sequence[str], overrides: Sequence[str]) -> int:
   """Prints our page, or what a key means."""
   if not keys:
+    from playground.cli.help import print_help  # imports rich
+
     print_help()
     return 0
   if len(keys) > 1:

@@ -8,19 +8,21 @@ from typing import NamedTuple
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override as HydraOverride
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
 
 from playground.config.files import DELTAS, config_roots, groups, listed_options, options
 from playground.config.schema import is_of_terms
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.learning.hyperparameters import ELSEWHERE
-from playground.settings import Section
+from playground.settings import Section, select
 from playground.text import format_value, quoted
 
 DEFAULT_EXPERIMENT = "quickstart"
 # With any of these on the command line, the default experiment is not added.
 _CHOOSES_A_RUN = {"experiment", "env", "agent", "robot", "curriculum", "resume"}
-_SHORT = {"terrain": "env.scene.terrain", "visuals": "video.visuals"}  # keys that may be written without their section
+SHORT_KEYS = {
+  "terrain": "env.scene.terrain",
+  "visuals": "video.visuals",
+}  # written without their section
 
 _OF_SWEEPS = {"sweep", "sweep_dir", "on_error", "launcher", "search"}
 
@@ -92,7 +94,7 @@ def parse(text: str, roots: Sequence[Path]) -> Override:
     UnknownNameError: no such option.
   """
   name, equals, value = text.partition("=")
-  text = _SHORT.get(name, name) + equals + value
+  text = SHORT_KEYS.get(name, name) + equals + value
   parsed = parse_with_hydra(text)
   text, key = parsed.input_line or text, parsed.key_or_group
   if parsed.is_sweep_override():
@@ -116,14 +118,13 @@ def group_overrides(overrides: Iterable[Override]) -> list[str]:
 
 def canonical(overrides: Iterable[Override], resolved: Section) -> list[str]:
   """Returns overrides in Hydra's form, for disabled groups and for numbers."""
-  config = OmegaConf.create(dict(resolved))
   lines = []
   for override in overrides:
     adds = "++" if is_of_terms(override.key) else ""  # Hydra refuses a term that no file has
     if override.is_group:
       lines += group_overrides([override])
     elif isinstance(override.value, int | float):
-      lines.append(f"{adds}{override.key}={format_value(OmegaConf.select(config, override.key))}")
+      lines.append(f"{adds}{override.key}={format_value(select(resolved, override.key))}")
     else:
       lines.append(f"{adds}{override.text.lstrip('+')}")
   return lines

@@ -23,7 +23,7 @@ from playground.errors import ConfigError
 from playground.hardware.options import HardwareConfig
 from playground.learning.hyperparameters import AgentConfig, read_config
 from playground.settings import Plain, Section, build
-from playground.text import first_line, format_value
+from playground.text import dump_yaml, first_line, format_value
 
 if TYPE_CHECKING:
   from rich.tree import Tree
@@ -147,14 +147,12 @@ def load(path: Path) -> RunConfig:
 
 def to_yaml(config: RunConfig) -> str:
   """The resolved configuration as YAML, which `load` reads."""
-  return values_to_yaml(config.resolved)
+  return dump_yaml(config.resolved)
 
 
 def values_to_yaml(values: object) -> str:
   """A section or a single value of a configuration as YAML."""
-  return (
-    OmegaConf.to_yaml(OmegaConf.create(dict(values))) if isinstance(values, Mapping) else format_value(values) + "\n"
-  )
+  return dump_yaml(values) if isinstance(values, Mapping) else format_value(values) + "\n"
 
 
 def tree(config: RunConfig) -> "Tree":

@@ -16,6 +16,7 @@ from playground.files import lock_holder, locking, numbered, read_json, write_js
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
 from playground.settings import Plain, Section, plain
+from playground.text import dump_yaml
 
 _RETURNS = ("final_return", "final_sampled_return", "final_mode_return", "best_return")
 _NUMBERS_OF_SUMMARY = (*_RETURNS, "best_step", "steps", "steps_per_second", "wall_clock_s")
@@ -76,9 +77,9 @@ class RunDirectory:
     """Writes the resolved `config` and the command line's `overrides`; raises CheckpointError if that fails."""
     with _writing(self.path):
       self.path.mkdir(parents=True, exist_ok=True)
-      write_text(self.overrides_path, yaml.safe_dump(list(overrides), sort_keys=False))
+      write_text(self.overrides_path, dump_yaml(list(overrides)))
       # Last, because this file makes the folder a run: an interrupted creation can be repeated.
-      write_text(self.config_path, yaml.safe_dump(plain(config), sort_keys=False))
+      write_text(self.config_path, dump_yaml(plain(config)))
 
   @classmethod
   def open(cls, path: str | Path) -> "RunDirectory":

@@ -14,12 +14,13 @@ from typing import Literal
 import yaml
 
 from playground.config import RunConfig, format_value, is_of_command
+from playground.config.overrides import SHORT_KEYS
 from playground.errors import CheckpointError, ConfigError, nearest
 from playground.files import is_locked, lock_holder, locking, read_json, write_json, write_text
 from playground.runs.csv_tracker import RETURN
 from playground.runs.run_dir import RunDirectory, now
-from playground.settings import Plain
-from playground.text import first_line
+from playground.settings import Plain, select
+from playground.text import dump_yaml, first_line
 
 Status = Literal["queued", "submitted", "running", "finished", "failed", "timeout", "preempted", "killed"]
 ENDED = ("finished", "failed", "timeout", "preempted", "killed")
@@ -78,10 +79,8 @@ def _value(config: RunConfig, key: str) -> Plain:
   """Returns a job's value of a key or group."""
   if key in config.choices:
     return config.choices[key]
-  node: Plain = config.resolved
-  for part in {"terrain": "env.scene.terrain", "visuals": "video.visuals"}.get(key, key).split("."):
-    node = node[int(part)] if isinstance(node, list) else node.get(part) if isinstance(node, Mapping) else None
-  return format_value(node) if isinstance(node, list | Mapping) else node
+  value = select(config.resolved, SHORT_KEYS.get(key, key))
+  return format_value(value) if isinstance(value, list | Mapping) else value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,7 +269,7 @@ class SweepDirectory:
   def _write(self) -> None:
     content = dataclasses.asdict(self) | {"cwd": str(self.cwd)}
     del content["path"]
-    write_text(self.path / "sweep.yaml", yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+    write_text(self.path / "sweep.yaml", dump_yaml(content))
 
 
 def _check(content: Plain) -> None:
