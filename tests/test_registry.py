@@ -16,6 +16,7 @@ from ml_collections import ConfigDict
 import playground
 from playground import registry, trust
 from playground.config import compose
+from playground.envs.wrappers import wrap_for_evaluation
 from playground.errors import ConfigError, UnknownNameError
 from playground.randomization import Randomizer
 from tests.processes import WITHOUT_WARP
@@ -276,9 +277,10 @@ def test_every_key_is_read_and_a_step_keeps_the_states_structure(overrides: list
   assert env.mj_model.ncam  # for env.vision
   env.physics = env.physics.without_dynamics()
   settings = env.settings_of(config)  # as arguments: no branch in Python may depend on one
-  state = jax.eval_shape(lambda key, values: env.with_settings(values).reset(key), jax.random.PRNGKey(0), settings)
-  step = lambda state, action, values: env.with_settings(values).step(state, action)
-  after = jax.eval_shape(step, state, jnp.zeros(env.action_size), settings)
+  episodes = lambda values: wrap_for_evaluation(env.with_settings(values))
+  keys, actions = jax.random.split(jax.random.PRNGKey(0), 2), jnp.zeros((2, env.action_size))
+  state = jax.eval_shape(lambda keys, values: episodes(values).reset(keys), keys, settings)
+  after = jax.eval_shape(lambda state, values: episodes(values).step(state, actions), state, settings)
   assert jax.tree.structure(after) == jax.tree.structure(state)
   assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
   # The robot's description serves many tasks, none of which needs all of it; a task without a camera has no picture.

@@ -167,12 +167,13 @@ class Episode(Wrapper):
       return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done), most, used), None
 
     was_done = state.info["episode_done"]
+    kinds = {k: kind for k, kind in self.env.summaries.items() if k in state.metrics}
     if self.repeat == 1:
       after = self.env.step(state, action, model)
       reward, ended = after.reward, after.done
     else:
       unused = jax.tree.map(jnp.zeros_like, state.data.buffers)
-      least = {k: jnp.full_like(state.metrics[k], -jnp.inf) for k, kind in self.env.summaries.items() if kind == "max"}
+      least = {k: jnp.full_like(state.metrics[k], -jnp.inf) for k, kind in kinds.items() if kind == "max"}
       start = (state, jnp.zeros_like(state.reward), jnp.zeros_like(state.done), least, unused)
       (after, reward, ended, most, used), _ = jax.lax.scan(repeat, start, None, self.repeat)
       after = after.replace(data=after.data.replace(buffers=used), metrics=after.metrics | most)
@@ -182,7 +183,6 @@ class Episode(Wrapper):
     done = jnp.where(timed_out, 1.0, ended)
     sums = {k: jnp.where(was_done > 0, 0.0, v) for k, v in state.info["episode_metrics"].items()}
     values = {"sum_reward": reward, "length": jnp.full_like(reward, self.repeat)} | after.metrics
-    kinds: Mapping[str, str] = self.env.summaries
     totals = {k: _SUMMARIES[kinds.get(k, "sum")](old, values[k], steps / self.repeat) for k, old in sums.items()}
     totals |= {k: jnp.where(after.info["nonfinite"] > 0, sums[k], totals[k]) for k in kinds}
     info = after.info | {
