@@ -1,6 +1,7 @@
 """`playground show <task>`: prints observations, rewards, terminations, commands, events, hyperparameters."""
 
 import inspect
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from rich.text import Text
 from playground import registry
 from playground.config import RunConfig, compose, format_value
 from playground.errors import ConfigError
-from playground.mdp.options import is_model_field
+from playground.mdp.options import MODEL_FIELD, is_model_field
 from playground.settings import Plain, Section
 from playground.text import first_docstring_line
 
@@ -161,13 +162,13 @@ def _events(events: Section | None) -> Iterator[Row]:
     if entry is None:
       continue
     term = bind_one("events", f"env.events.{name}", name, entry)
-    enabled = {"mode": term.options.mode, "enabled": "" if term.options.enabled else "no"}
+    row = _row(term) | {"mode": term.options.mode, "enabled": "" if term.options.enabled else "no"}
     if is_model_field(name, entry):
       drawn = term().describe()
       what = f"{drawn['field']} {drawn['target']}: {drawn['operation']} {drawn['draw']}"
-      yield {"name": name, "function": "model_field", "params": what, **enabled}
-    else:
-      yield _row(term) | enabled
+      source = function_and_source(term.func, term.func.__name__)
+      row |= {"params": what, "what": "", "function": f"{MODEL_FIELD} {source}"}
+    yield row
 
 
 def function_and_source(func: Callable[..., object], known: str = "") -> str:
@@ -175,7 +176,9 @@ def function_and_source(func: Callable[..., object], known: str = "") -> str:
   target = inspect.unwrap(func)
   path = Path(inspect.getsourcefile(target) or "?")
   depth = target.__module__.count(".") + (2 if path.stem == "__init__" else 1)
-  place = f"{'/'.join(path.parts[-depth:])}:{inspect.getsourcelines(target)[1]}"
+  lines = inspect.getsourcelines(sys.modules[target.__module__])[0]
+  assigned = (i for i, text in enumerate(lines, 1) if text.startswith(f"{target.__name__} = "))  # as a helper's result
+  place = f"{'/'.join(path.parts[-depth:])}:{next(assigned, inspect.getsourcelines(target)[1])}"
   return place if target.__name__ == known else f"{target.__qualname__} {place}"
 
 

@@ -158,10 +158,7 @@ class StepContext:
   def carried(self, name: str) -> jax.Array:
     """Returns an entry of `info`; raises ConfigError if the task does not have it."""
     if name not in self.info:
-      raise ConfigError(
-        f"A term of env.rewards or env.observations reads info[{name!r}], which this task does not have: it needs a "
-        "command or an event that writes it."
-      )
+      raise ConfigError(f"it reads info[{name!r}], which this task does not have; a command or an event must write it.")
     return self.info[name]
 
   def sensor(self, name: str) -> jax.Array:

@@ -118,7 +118,7 @@ class LeggedRobot(Robot):
 
   def _present(self, key: str, found: np.ndarray) -> np.ndarray:
     if not found.size:
-      raise ConfigError(f"env.robot.{key} is empty or missing, but a reward or termination of env needs it.")
+      raise ConfigError(f"env.robot.{key} is empty or missing.")
     return found
 
   def contact(self, data: PhysicsData) -> jax.Array:

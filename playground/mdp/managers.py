@@ -61,12 +61,15 @@ class RewardManager(_Manager):
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns weight * value of each term, by name, each shape []."""
-    return {term.name: term.options.weight * _when(term.options.when, c, term(c)) for term in self.terms}
+    return {term.name: term.options.weight * _value(term, c) for term in self.terms}
 
 
-def _when(condition: Mapping[str, float] | None, c: StepContext, value: jax.Array) -> jax.Array:
-  for name, bound in (condition or {}).items():
-    speed = jnp.linalg.norm(c.command)
+def _value(term: Term, c: StepContext) -> jax.Array:
+  """The value of a reward term, 0 where its `when` is not met."""
+  value = term(c)
+  for name, bound in (term.options.when or {}).items():
+    with term.reading(c):
+      speed = jnp.linalg.norm(c.command)
     value = value * (speed > bound if name == "command_above" else speed < bound)
   return value
 

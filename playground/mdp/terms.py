@@ -66,14 +66,17 @@ class Term(NamedTuple):
   instance: Any = None
 
   def __call__(self, *args: Any) -> Any:
-    with self._reading(*args):
+    with self.reading(*args):
       return self.func(*args, **self.params)
 
   @contextlib.contextmanager
-  def _reading(self, *args: Any) -> Iterator[None]:
-    """Raises ConfigError where the term reads what the task, its robot or its context, of `args`, does not have."""
+  def reading(self, *args: Any) -> Iterator[None]:
+    """Raises ConfigError, with the term's key, where it reads what the task, robot or context in `args` lacks."""
     try:
       yield
+    except ConfigError as error:
+      has_key = str(error).startswith(tuple(f"env.{kind}." for kind in MODULES))  # of a term that this one reads
+      raise error if has_key else type(error)(f"{self.key}: {error}") from None
     except AttributeError as error:
       parts = [part for arg in args for part in (arg, getattr(arg, "env", arg), getattr(arg, "robot", arg))]
       if not any(error.obj is part for part in parts):
@@ -83,7 +86,7 @@ class Term(NamedTuple):
   def instantiate(self, env: Any) -> "Term":
     """Returns the same term with an instance of its class, bound to a task."""
     instance = self()
-    with self._reading(env):
+    with self.reading(env):
       instance.bind(env)
     return self._replace(instance=instance)
 
@@ -165,10 +168,9 @@ def bind_one(kind: str, key: str, name: str, entry: Any) -> Term:
   func = find(kind, given_func or name, key)
   params = check_params(func, entry.get("params") or {}, f"{key}.params", _LEADING[kind])
   hints = typing.get_type_hints(options, include_extras=True)
+  values = {field: plain(entry.get(field)) for field in options._fields}
   given = {
-    field: _checked(f"{key}.{field}", plain(entry[field]), hints[field])
-    for field in options._fields
-    if entry.get(field) is not None
+    field: _checked(f"{key}.{field}", value, hints[field]) for field, value in values.items() if value not in (None, {})
   }
   return Term(name, key, func, params, options(**given))
 
@@ -213,9 +215,9 @@ def check_params(func: Callable[..., Any], given: Any, key: str, skip: int = 1) 
 
 
 def plain(value: Any) -> Any:
-  """Mappings as dicts, lists as tuples."""
+  """Mappings as dicts without their null entries, lists as tuples."""
   if hasattr(value, "items"):
-    return {name: plain(entry) for name, entry in value.items()}
+    return {name: plain(entry) for name, entry in value.items() if entry is not None}
   return tuple(plain(entry) for entry in value) if isinstance(value, list | tuple) else value
 
 

@@ -42,7 +42,9 @@ def _numbers(config: Mapping[str, Any], kind: str, term: Term) -> Iterator[tuple
   if kind == "rewards" and config.get("reward_total") != "product":
     yield f"{term.key}.weight", term.options.weight
   if kind == "observations":
-    yield from ((f"{term.key}.noise.{name}", size) for name, size in term.options.noise.items() if name != "same_as")
+    yield from (
+      (f"{term.key}.noise.{name}", size) for name, size in (term.options.noise or {}).items() if name != "same_as"
+    )
   # Another package's function may decide by a number what it computes.
   if kind in ("commands", "events") and term.func.__module__ == MODULES[kind]:
     arguments = inspect.signature(term.func).parameters

@@ -1,8 +1,10 @@
 """`playground`: list, show, and what the other commands hand over."""
 
 import json
+import re
 import sys
 import types
+from pathlib import Path
 from subprocess import run
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 
 from playground.cli.main import main
 from playground.errors import CheckpointError
+from playground.mdp import observations
 from tests.command import Command, caller
 
 
@@ -85,6 +88,7 @@ def test_list_needs_no_jax():
         *("fell_over limit 0.0 The world z of", "upvector_below playground/mdp/terminations.py:"),
         *("velocity max [1.5, 0.8, 1.2], resample_s 5.0", "VelocityWalk playground/mdp/commands.py:"),
         *("events (randomization: go1)", "payload startup body_mass trunk: add uniform(-1, 1) model_field"),
+        "model_field playground/mdp/events.py:",
         *("reset_root_xy reset distance 0.5 Moves", "push interval no velocity [0.0, 3.0]"),
         *("ppo (tuned/ppo/Go1JoystickFlatTerrain.yaml)", "network.policy_hidden_layer_sizes [512, 256, 128]"),
       ],
@@ -113,6 +117,15 @@ def test_show(command: Command, capsys: pytest.CaptureFixture[str], args: list[s
   out = " ".join(capsys.readouterr().out.split())
   for text in shown:
     assert text in out
+
+
+def test_show_names_the_line_of_a_term_that_a_helper_makes(command: Command, capsys: pytest.CaptureFixture[str]):
+  assert command("show", "Go1JoystickFlatTerrain") == 0
+  out = capsys.readouterr().out
+  lines = Path(observations.__file__).read_text(encoding="utf-8").splitlines()
+  for name in ("gyro", "actuator_force", "last_contact"):
+    (line,) = (i for i, text in enumerate(lines, 1) if text.startswith(f"{name} ="))
+    assert re.search(rf"^ +{name} .* playground/mdp/observations\.py:{line} *$", out, re.M), name
 
 
 def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):

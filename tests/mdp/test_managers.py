@@ -59,8 +59,27 @@ def test_rewards_that_cannot_be(entry: Any, message: str) -> None:
 def test_a_term_that_needs_what_the_task_does_not_have() -> None:
   c = context()
   del c.info["command"]  # pyright: ignore[reportIndexIssue]
-  with pytest.raises(ConfigError, match=r"reads info\['command'\], which this task does not have"):
+  with pytest.raises(
+    ConfigError, match=r"^env\.rewards\.constant: .*reads info\['command'\], which this task does not have"
+  ):
     RewardManager({"constant": {"weight": 1, "when": {"command_above": 1}}}).compute(c)
+
+
+def test_an_error_within_a_term_names_the_term() -> None:
+  c, section = context(), {"low": {"func": "base_height_below", "params": {"limit": 0.2}}}
+
+  def find_joints(name: str) -> np.ndarray:
+    raise UnknownNameError(f"joints={name!r} matches no joint of the robot.")
+
+  c.robot.find_joints = find_joints
+  with pytest.raises(UnknownNameError, match=r"^env\.rewards\.hip_deviation_l1: joints='hip_rolls' matches no joint"):
+    RewardManager({"hip_deviation_l1": {"weight": 1}}).compute(c)
+  manager = TerminationManager({"hips": {"func": "playground.mdp.rewards:hip_deviation_l1"}} | section)
+  c.env.terminations = manager  # pyright: ignore[reportAttributeAccessIssue]
+  with pytest.raises(
+    UnknownNameError, match=r"^env\.terminations\.hips: joints='hip_rolls'"
+  ):  # once, of the inner term
+    RewardManager({"is_terminated": {"weight": 1}}).compute(c)
 
 
 def test_any_termination_ends_the_episode() -> None:
@@ -162,6 +181,13 @@ def test_gaussian_noise() -> None:
   noise = draws(noise={"gaussian": 0.2}) - [0.5, -0.5]
   np.testing.assert_allclose(noise.std(0), 0.2, rtol=0.1)
   assert noise.max() > 0.5
+
+
+def test_null_removes_a_kind_of_noise_or_a_condition() -> None:
+  np.testing.assert_array_equal(draws(noise={"uniform": None, "gaussian": 0.2}), draws(noise={"gaussian": 0.2}))
+  np.testing.assert_array_equal(draws(noise={"uniform": None}), draws())
+  section = {"still": {"func": "constant", "weight": 1, "when": {"command_below": 0.1, "command_above": None}}}
+  assert values((0.0, 0.0, 0.0), **section) == {"still": 1.0}
 
 
 def test_noise_comes_before_clip_and_scale() -> None:
