@@ -11,11 +11,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import pytest
+import yaml
 from ml_collections import ConfigDict
 
 import playground
 from playground import registry, trust
-from playground.config import compose
+from playground.config import compose, config_roots, options
+from playground.config.files import lineage
 from playground.envs.wrappers import wrap_for_evaluation
 from playground.errors import ConfigError, UnknownNameError
 from playground.randomization import Randomizer
@@ -38,6 +40,17 @@ def test_names():
   assert registry.names("GO1") == [name for name in names if name.startswith("Go1")]
   assert registry.names("nothing") == []
   assert tuple(names) == registry.ALL_ENVS
+
+
+def test_a_task_inherits_from_two_files_at_most():
+  """A family file, or a task that it varies with its family file; each file from one other at most."""
+  root = config_roots()[:1]
+  for name in options("env", root):
+    files = lineage("env", name, root)
+    assert len(files) <= 3, files
+    for path in (root[0] / f"env/{file}.yaml" for file in files):
+      defaults = (yaml.safe_load(path.read_text()) or {}).get("defaults", [])
+      assert sum(isinstance(entry, str) and entry != "_self_" for entry in defaults) <= 1, path
 
 
 def test_config_is_a_fresh_unlocked_copy():
