@@ -117,9 +117,6 @@ class PushCube(NoForward, push.PushCube):
     super().__init__(config)
     self.arm_spread = push.ARM_SPREAD * JOINT_RANGE
 
-  def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
-    return super().first_info(data, key, model)
-
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> Any:
     state = super().reset(rng, model)
     return state.replace(

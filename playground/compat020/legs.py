@@ -1,5 +1,6 @@
 """Robots on legs as in Playground 0.2.0: what its upstream bugs compute (docs/differences.md)."""
 
+import copy
 import dataclasses
 from typing import Any
 
@@ -73,17 +74,12 @@ class PushNominalMass(PushByForce):
   """As `PushByForce`, in proportion to the mass before randomisation."""
 
   def mass(self, model: mjx.Model) -> jax.Array:
-    del model
     return super().mass(self.env.mjx_model)
 
 
 @dataclasses.dataclass
-class PushNominalMassRegularly(PushByForceRegularly):
+class PushNominalMassRegularly(PushNominalMass, PushByForceRegularly):
   """As `PushByForceRegularly`, in proportion to the mass before randomisation."""
-
-  def mass(self, model: mjx.Model) -> jax.Array:
-    del model
-    return super().mass(self.env.mjx_model)
 
 
 @dataclasses.dataclass
@@ -117,7 +113,8 @@ class H1Joystick(Joystick):
   """The H1's tasks, which misread the contact of its feet in their steps, not at reset."""
 
   def post_step(self, data: Any, info: Any, action: jax.Array) -> Any:
-    stepping = _with_context(self, MisreadContext)
+    stepping: Any = copy.copy(self)
+    stepping.context = MisreadContext
     return super(H1Joystick, stepping).post_step(data, info, action)
 
 
@@ -126,11 +123,3 @@ class Footstand(Stand):
 
   def watched_feet(self, config: Any) -> list[str]:
     return list(config.robot.feet)[:2]
-
-
-def _with_context(env: Any, context: type) -> Any:
-  import copy
-
-  other = copy.copy(env)
-  other.context = context
-  return other

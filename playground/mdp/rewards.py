@@ -202,11 +202,6 @@ def root_height_ratio(c: LeggedContext, target: Positive) -> jax.Array:
   return jnp.clip(c.data.qpos[2] / target, 0.0, 1.0)
 
 
-def base_drift_l2(c: LeggedContext) -> jax.Array:
-  """v_x² + v_y² + w_z², the root's velocity in the world frame and its turning about its own z."""
-  return jnp.square(c.data.qvel[jnp.array([0, 1, 5])]).sum()
-
-
 def self_contact(c: LeggedContext) -> jax.Array:
   """1 while the robot's parts touch each other as `self_contact` of its YAML lists."""
   return c.robot.touching(c.data, "self_contact").any().astype(jnp.float32)
@@ -237,7 +232,7 @@ def pose_l2_by_command(c: LeggedContext) -> jax.Array:
 
 
 def pose_exp_when_still(c: LeggedContext, sharpness: Positive) -> jax.Array:
-  """exp(-sharpness |q - default|²) while the command is to stand still, else 1."""
+  """exp(-sharpness |q - default|²) while the command asks to stand still, else 1."""
   return jnp.exp(-sharpness * jnp.square(c.joint_pos_rel).sum() * c.still)
 
 
@@ -413,7 +408,7 @@ def site_body_distance_tolerance(c: ArmContext, site: str, body: str, bound: AtL
 
 
 def no_contact(c: ArmContext, geom: str) -> jax.Array:
-  """1 while none of the contact sensors of a geom (`floor`, `table`, ...) sees a contact."""
+  """1 while none of the contact sensors of a geom (`floor`, `table`, ...) reports a contact."""
   return 1 - c.robot.touching(c.data, geom).any().astype(jnp.float32)
 
 

@@ -56,7 +56,6 @@ CASES: list[tuple[str, dict[str, Any], float]] = [
   ("base_height_expm1", {"target": 0.25}, np.exp(0.25) - 1),
   ("root_height_ratio", {"target": 0.4}, 0.5),
   ("root_height_ratio", {"target": 0.1}, 1.0),
-  ("base_drift_l2", {}, 0.01 + 0.04 + 0.09),
   ("self_contact", {}, 1.0),
   ("pose_l2", {}, POSE),
   ("pose_exp", {}, np.exp(-POSE)),
