@@ -35,12 +35,12 @@ from playground.mdp.options import MODEL_FIELD, is_model_field
 from playground.mdp.terms import bind_one
 from playground.text import format_value
 
-# Whose rows a field has, by the prefix of its name: kind of object, where the prefix is not its name.
+# The kind of object that has a row in a field, by the prefix of the field's name.
 _PREFIXES = {"cam": "camera", "mat": "material", "jnt": "joint", "dof": "joint", "qpos": "joint"}
 _PREFIXES |= {name: name for name in ("geom", "body", "site", "actuator", "tendon", "pair", "light")}
 _COUNTERS = {"actuator": "nu", "dof": "njnt", "qpos": "njnt"}  # of objects, where it is not n<prefix>
-# What stands in two fields: (field, column, sign) of each. A servo pulls with gain * ctrl + bias * q, so its position
-# gain is in both with opposite signs; a body that is denser has more inertia in proportion.
+# Quantities in several fields: (field, column, sign) of each. A servo pulls with gain * ctrl + bias * q, so its
+# position gain is in both with opposite signs; a body that is denser has more inertia in proportion.
 _LINKED: dict[str, tuple[tuple[str, int | None, float], ...]] = {
   "actuator_kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)),
   "body_density": (("body_mass", None, 1.0), *(("body_inertia", axis, 1.0) for axis in range(3))),
@@ -70,7 +70,7 @@ class _Slot(NamedTuple):
 
 
 class _Draw(NamedTuple):
-  """A term on a model: `shape` is what is drawn for, `slots` where it goes."""
+  """A term on a model: the `shape` of its draw, and the `slots` that it changes."""
 
   term: ModelField
   slots: tuple[_Slot, ...]
@@ -129,7 +129,7 @@ class Randomizer:
     return jax.vmap(self.sample)(keys)
 
   def describe(self) -> list[dict[str, str]]:
-    """One row per term for people: `ModelField.describe`, and how many values are drawn."""
+    """Returns one row per term for people: `ModelField.describe`, and the number of values drawn."""
     return [draw.term.describe() | {"values": str(draw.count)} for draw in self._draws]
 
 
@@ -170,7 +170,7 @@ def domain_randomizer(
 
 
 def _bind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> _Draw:
-  """Finds the entries of the model that a term means."""
+  """Finds the entries of the model that a term changes."""
   fields = [*_randomizable(mj_model), *_LINKED]
   if term.field not in fields:
     raise UnknownNameError(
@@ -199,7 +199,7 @@ def _bind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> _Draw:
 
 
 def _check_kind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> None:
-  """Raises ConfigError where an operation or distribution does not go with the field."""
+  """Raises ConfigError where an operation or distribution does not fit the field."""
   values = getattr(mj_model, term.field, None)
   is_switch = values is not None and values.dtype == bool
   if is_switch != (term.distribution == "bernoulli") or (is_switch and term.operation != "set"):
@@ -211,7 +211,7 @@ def _check_kind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> None:
 
 
 def _turn(row: jax.Array, by: jax.Array) -> jax.Array:
-  """A direction [3] or quaternion [4] after a turn by a rotation vector, rad, in the frame that it is given in."""
+  """Turns a direction [3] or quaternion [4] by a rotation vector, rad, in the same frame."""
   angle = jnp.linalg.norm(by)
   half = jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sinc(angle / (2 * jnp.pi)) / 2 * by])
   return rotate(row, half) if len(row) == 3 else quat_mul(half, row)
@@ -230,7 +230,7 @@ def _prefix(field: str) -> str:
 
 
 def _rows(mj_model: mujoco.MjModel, term: ModelField, key: str) -> np.ndarray:
-  """Rows of a term's field that belong to its target."""
+  """Returns the rows of a term's field that belong to its target."""
   prefix = _prefix(term.field)
   kind, count = _PREFIXES[prefix], getattr(mj_model, _COUNTERS.get(prefix, f"n{prefix}"))
   starts, end = np.arange(count), count

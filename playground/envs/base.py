@@ -1,4 +1,4 @@
-"""What a task is: a pure `reset` and `step` for one environment, and the calls a step is made of."""
+"""The base of all tasks: a pure `reset` and `step` of one environment, and the parts of a step."""
 
 import abc
 import copy
@@ -22,7 +22,7 @@ PIXELS = "pixels/"  # prefix of image groups of an observation: [height, width, 
 
 
 class State(struct.PyTreeNode):
-  """What a task carries from one control step to the next.
+  """The state of an environment between two control steps.
 
   Attributes:
     data: simulator state.
@@ -31,7 +31,7 @@ class State(struct.PyTreeNode):
     reward: scalar reward of the step just taken.
     done: scalar 0/1 float, the episode ended in this step.
     metrics: scalars logged each step; the key set is the same at reset and step.
-    info: whatever else the task carries (random key, command, histories); the key set is fixed after reset.
+    info: the other entries of the state (random key, command, histories); the key set is fixed after reset.
   """
 
   data: PhysicsData
@@ -50,7 +50,7 @@ class Env(abc.ABC):
   so it can be run on recorded data.
   """
 
-  spec: mujoco.MjSpec | None = None  # the scene as it was composed, where a task keeps it: to draw it otherwise
+  spec: mujoco.MjSpec | None = None  # the composed scene, if the task keeps it: videos may change its geoms
   # How an episode's values of a metric become one number for the log: `sum` (unless named here), `mean`, `max` or
   # `last`. A success in any step is a `max`, one that must hold at the end a `last`, an error in metres a `mean`.
   summaries: ClassVar[Mapping[str, str]] = {}
@@ -59,7 +59,7 @@ class Env(abc.ABC):
   # Entries of `info` that belong to an episode: `AutoReset` sets them back to their values after reset. The others
   # (random key, command, gait, times of pushes) outlast an auto-reset.
   episode_info: ClassVar[tuple[str, ...]] = ()
-  # Attributes that manage terms, named as their part of the config: numbers there are settings of the programs.
+  # Names of the managers, which are those of their sections: numbers there may be arguments of compiled programs.
   managers: ClassVar[tuple[str, ...]] = ()
   # Whether `redraw(info, key)` draws entries of `info` for an episode that an auto-reset starts from a stored state.
   redraws: bool = False
@@ -96,7 +96,7 @@ class Env(abc.ABC):
     """Returns the state after a step, from the physics after it, the info before it and the action that was applied."""
 
   def pre_step(self, state: State) -> State:
-    """Acts on the physics from outside before the step (pushes); by default nothing."""
+    """Applies events to the physics before the step (pushes); by default none."""
     return state
 
   def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
@@ -124,7 +124,7 @@ class Env(abc.ABC):
     if not values:
       return self
     other = copy.copy(self)
-    vars(other).pop("jitted", None)  # which has our own values
+    vars(other).pop("jitted", None)  # has the values of this task
     for name in self.managers:
       setattr(other, name, getattr(self, name).with_settings(values))
     return other
@@ -148,9 +148,9 @@ class Env(abc.ABC):
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:
-    """What each observation entry is made of, in order: part name to length ("state" for a flat observation).
+    """The terms of each observation group, in order: name to length. A flat observation is the group "state".
 
-    A part that has the name of another entry is that entry.
+    A term that has the name of another group stands for that group.
     """
     return {}
 

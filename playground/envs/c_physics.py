@@ -1,15 +1,15 @@
-"""Any task in plain C MuJoCo, as it is."""
+"""Any task on C MuJoCo."""
 
 from playground.envs.base import Env
 from playground.physics.c_mujoco import CPhysics
 
 
 def on_c_physics(env: Env) -> Env:
-  """Has a task simulated by C MuJoCo; call it before the task is first used.
+  """Makes C MuJoCo simulate a task; call it before the task is first used.
 
-  What a task sees (`env.vision`) is rendered by MuJoCo-Warp all the same, of C MuJoCo's states.
+  MuJoCo-Warp still renders the images of `env.vision`, from the states of C MuJoCo.
   """
   task = env.unwrapped
   task.physics = CPhysics(task.mj_model, derived=task.derived)
-  task.redraws = False  # it simulates the model as it is
+  task.redraws = False  # C MuJoCo takes no randomised model
   return env

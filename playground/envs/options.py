@@ -16,7 +16,7 @@ _DELAY = Limit(0, 1000, whole=True, form="list", length=2, rising=True)
 
 @dataclasses.dataclass(frozen=True)
 class VisionConfig:
-  """Settings of what a camera sees as the observation pixels/<camera> (docs/vision.md)."""
+  """Settings of the images of a camera, the observation pixels/<camera> (docs/vision.md)."""
 
   enable: Annotated[bool, "whether the task observes pixels"] = False
   camera: Annotated[str | None, "name of one of the model's cameras"] = None
@@ -215,7 +215,7 @@ class TaskKeys:
 
 
 def sees(env: Mapping[str, Any]) -> bool:
-  """Whether a task of this `env` config sees through a camera."""
+  """Whether a task of this `env` config observes images."""
   return "vision" in env and env["vision"]["enable"]
 
 

@@ -122,7 +122,7 @@ def partners(robot: LeggedRobot, names: tuple[str, ...]) -> np.ndarray:
 
 
 def _other_side(name: str, pairs: Mapping[str, str]) -> str:
-  """A name with its beginning or end exchanged for that of the other side."""
+  """Returns a name with its beginning or end replaced by that of the other side."""
   for left, right in pairs.items():
     for this, other in ((left, right), (right, left)):
       if name.startswith(this):
@@ -133,7 +133,7 @@ def _other_side(name: str, pairs: Mapping[str, str]) -> str:
 
 
 def _of_term(term: Term, size: int, joints: np.ndarray, feet: np.ndarray) -> np.ndarray:
-  """The matrix that turns a term's vector of `size` into its mirror image, shape [size, size]."""
+  """Returns the matrix that turns a term's vector of `size` into its mirror image, shape [size, size]."""
   kind: MirrorKind | None = getattr(term.func, "mirror", None)
   if kind is None:
     raise ConfigError(
@@ -157,5 +157,5 @@ def _check_options(term: Term, whole: np.ndarray) -> None:
 
 
 def _repeated(matrix: np.ndarray, size: int) -> np.ndarray:
-  """The matrix for a vector of `size` that holds a vector several times, one after the other."""
+  """Returns the matrix for a vector of `size` that repeats the vector of `matrix`."""
   return np.kron(np.eye(size // len(matrix)), matrix)

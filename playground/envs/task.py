@@ -45,8 +45,8 @@ class InitialState(struct.PyTreeNode):
 class Task(Env):
   """A robot in a scene whose rewards, observations, terminations, commands and events are terms of its config.
 
-  A subclass builds the scene, defines its robot (`make_robot`) and how an action becomes `ctrl`; where it carries
-  more from step to step than actions, commands and events do, it adds that in `first_info` and `next_info`.
+  A subclass builds the scene, its robot (`make_robot`), and turns actions into `ctrl`. `first_info` and `next_info`
+  return the entries of `info` of its own.
 
   Attributes:
     robot: the robot's constants.
@@ -102,7 +102,7 @@ class Task(Env):
     """Returns the `ctrl` that an episode starts with where no reset event sets it."""
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
-    """Returns what the task carries besides actions, commands and events at the start of an episode."""
+    """Returns the entries of `info` of the task itself at the start of an episode."""
     return {}
 
   def next_info(self, c: StepContext, key: jax.Array) -> dict[str, Any]:
@@ -123,7 +123,7 @@ class Task(Env):
     return model.tree_replace(info[_MODEL_FIELDS]) if self.redraws else model  # pyright: ignore[reportReturnType]
 
   def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
-    """Returns `info` with what a new episode draws."""
+    """Returns `info` with the model fields that a new episode draws."""
     return info | {_MODEL_FIELDS: self._episode_models.sample(key)} if self.redraws else info
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:

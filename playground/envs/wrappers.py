@@ -1,4 +1,4 @@
-"""From one task to a batch that trains for ever: vectorise, guard the numbers, limit episodes, reset.
+"""Wrappers that make a batch of one task: vectorise, guard the numbers, limit episodes, reset.
 
 Each wrapper takes and returns batches of `State` (leading axis N). A randomised model travels as an argument: a dict
 from field name ("geom_friction", dotted for nested ones) to values with leading axis N, or None for the task's own.
@@ -19,7 +19,7 @@ ModelFields = Mapping[str, jax.Array]
 # `info` keys that wrappers own; a fresh reset of a task never touches them.
 EPISODE_KEYS = ("steps", "truncation", "episode_done", "episode_metrics")
 PREFIX = "AutoResetWrapper_"
-PRESERVE_INFO = PREFIX + "preserve_info"  # what a task puts here survives a full reset (a curriculum's level, say)
+PRESERVE_INFO = PREFIX + "preserve_info"  # entries in it survive a full reset (the level of a curriculum)
 FINAL_OBS = "final_obs"
 MAX_VALUE = 1e10  # MuJoCo's own limit for positions and velocities (mjMAXVAL)
 MAX_VELOCITY = 1e3  # m/s, rad/s: no robot moves so, and one such state among millions ruins a critic and its optimiser
@@ -32,7 +32,7 @@ def where_done(done: jax.Array, new: Any, old: Any) -> Any:
 
 
 class Wrapper:
-  """Passes everything on to the environment it wraps."""
+  """Passes every call to the environment that it wraps."""
 
   def __init__(self, env: Any):
     self.env = env
@@ -46,7 +46,7 @@ class Wrapper:
   def __getattr__(self, name: str) -> Any:
     if name.startswith("__"):
       raise AttributeError(name)
-    if hasattr(type(self), name):  # a property of ours that failed: its own error, not the task's value in its place
+    if hasattr(type(self), name):  # a property of the wrapper that failed: raises its error
       return object.__getattribute__(self, name)
     return getattr(self.env, name)
 
@@ -105,7 +105,7 @@ class FiniteGuard(Wrapper):
     zeros = jax.tree.map(jnp.zeros_like, (after.reward, after.metrics))
     reward, metrics = where_done(bad, zeros, (after.reward, after.metrics))
     obs, info = where_done(bad, (state.obs, state.info), (after.obs, after.info))
-    if "rng" in info:  # time goes on: the same draws again would lead to the same place
+    if "rng" in info:  # or the next step would repeat the same draws
       info = info | {"rng": after.info["rng"]}
     return after.replace(
       obs=obs,
@@ -126,7 +126,7 @@ def _is_finite(state: State) -> jax.Array:
   return finite
 
 
-# One more value of an episode: (so far, new, how many with it) -> so far.
+# Reductions of the values of an episode: (so far, new, number including it) -> so far.
 _SUMMARIES: dict[str, Callable[[jax.Array, jax.Array, jax.Array], jax.Array]] = {
   "sum": lambda old, new, n: old + new,
   "mean": lambda old, new, n: old + (new - old) / n,
@@ -267,7 +267,7 @@ def wrap_for_training(env: Env, *, full_reset: bool = False) -> AutoReset:
 
 
 def wrap_for_evaluation(env: Env) -> Episode:
-  """As for training, but an episode that ends stays ended."""
+  """Wraps as for training, but an episode that ends stays ended."""
   return Episode(FiniteGuard(Vectorize(env)), env.episode_length, env.action_repeat)
 
 

@@ -1,8 +1,8 @@
-"""Command terms: what a policy is asked to do, and gaits.
+"""Command terms: velocities to track, and gaits.
 
 A command is a class whose fields are the term's `params`. `bind(env)` looks names up once; `reset(key)` returns the
-entries of `info` that an episode starts with, `step(c, key)` those for the next step. They outlast an auto-reset: an
-episode that ends starts the time of its command over, but keeps the command.
+entries of `info` that an episode starts with, `step(c, key)` those for the next step. They outlast an auto-reset: the
+next episode keeps the command and draws a new time for it.
 """
 
 import dataclasses
@@ -74,7 +74,7 @@ class _VelocityCommand:
 
 @dataclasses.dataclass
 class UniformVelocity(_VelocityCommand):
-  """Draws all components uniformly; some commands are to stand still.
+  """Draws all components uniformly; some commands ask to stand still.
 
   Attributes:
     zero_probability: of standing still.
@@ -92,7 +92,7 @@ class UniformVelocity(_VelocityCommand):
 
 @dataclasses.dataclass
 class VelocityWalk(_VelocityCommand):
-  """Changes some components at a time and often sets them to zero, so that moving on one axis alone is practised.
+  """Changes some components at a time and often sets them to zero, so that policies practise moving on one axis.
 
   (Playground 0.2.0, joysticks of Go1 and Apollo.)
 
@@ -113,7 +113,7 @@ class VelocityWalk(_VelocityCommand):
 
 @dataclasses.dataclass
 class Gait:
-  """When each foot is to be in the air, and how high.
+  """Phases of the feet: when each should be in the air, and how high.
 
   A foot's phase runs from -pi, where it leaves the floor, over 0, where it is highest, to pi, where it is back. Writes
   `phase` (rad [feet]), `phase_dt` (rad in a control step), `gait` (index of the mode), `gait_freq` (Hz) and, if it is
@@ -123,7 +123,7 @@ class Gait:
     modes: gaits of the robot's YAML, one of which an episode has.
     frequency: range of the steps' frequency, one value for an episode, Hz.
     foot_height: range of the highest swing of the feet, one value for an episode, m; None draws none.
-    rest_when_still: all feet stay on the floor while the command is to stand still.
+    rest_when_still: all feet stay on the floor while the command asks to stand still.
   """
 
   modes: Sequence[str]
@@ -161,7 +161,7 @@ class Gait:
 
 
 def is_still(command: jax.Array) -> jax.Array:
-  """Whether a velocity command is to stand still, bool: its norm is at most 0.01."""
+  """Returns whether a velocity command asks to stand still, bool: its norm is at most 0.01."""
   return jnp.linalg.norm(command) <= 0.01
 
 

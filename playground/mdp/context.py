@@ -1,4 +1,4 @@
-"""What the functions of terms read: a robot's constants, and one environment after one control step."""
+"""The arguments of terms: a robot's constants, and one environment after one control step."""
 
 import functools
 import re
@@ -31,7 +31,7 @@ class Robot:
   """
 
   def __init__(self, mj_model: mujoco.MjModel, joints: Sequence[str], sensors: Mapping[str, Any] | None = None):
-    """Looks names up; `sensors` are those that terms read for the model's, or for several of them behind each other.
+    """Looks up names; `sensors` maps a name that terms read to a sensor of the model, or to several in a row.
 
     Raises:
       ConfigError: the model has no sensor of that name, or a list of sensors is empty.
@@ -100,7 +100,7 @@ class StepContext:
     env: the task: its model and control step `dt`.
     robot: the robot's constants.
     data: the physics after the step.
-    info: what the task carries, as it stood during the step.
+    info: the `info` of the task during the step.
     action: the action just applied, shape [action_size].
     dt: time since the step before, s; 0 at the start of an episode.
   """

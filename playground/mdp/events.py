@@ -1,4 +1,4 @@
-"""Event terms: all that acts on a simulation from outside.
+"""Event terms: changes of a simulation from outside.
 
 - mode `startup`, func `model_field`: a field of the model, drawn once an environment; in mode `reset` in each episode.
 - mode `reset`: a function `(key, env, initial, **params) -> initial` changes the state that an episode starts with.
@@ -73,7 +73,7 @@ def reset_cube_pose(
 def reset_fallen(
   key: jax.Array, env: "Task", initial: "InitialState", probability: Share, height: AtLeast0
 ) -> "InitialState":
-  """Drops the robot, with this probability: from a height (m), turned anyhow, joint angles uniform in their ranges."""
+  """Drops the robot, with this probability: from a height (m), in any orientation, at any joint angles."""
   drop_key, turn_key, joints_key = jax.random.split(key, 3)
   quat = jax.random.normal(turn_key, (4,))
   quat = quat / (jnp.linalg.norm(quat) + 1e-6)
@@ -112,8 +112,8 @@ def reset_goal_uniform(
 ) -> "InitialState":
   """Draws the goal's position U[low, high), m, then raised to `at_least`, and turns it by U[0, turn) rad.
 
-  The entries of the turn's axis are uniform, so that it points rather to a cube's corners, as in Playground 0.2.0, for
-  which the published settings are.
+  The entries of the turn's axis are uniform, so it points to the corners of a cube more often than to its faces, as in
+  Playground 0.2.0, on which the published settings were tuned.
   """
   place_key, axis_key, angle_key = jax.random.split(key, 3)
   goal = _uniform_vector(place_key, low, high, 3)
@@ -152,7 +152,7 @@ class ModelField:
     distribution: `uniform`, `log_uniform` or `normal`; of a switch `bernoulli`.
     column: column, or columns, of a two-dimensional field; None is all.
     shared: one draw for all entries, instead of one for each.
-    axis: of `rotate`, ranges of the axis's x, y and z before it has length 1; None is any direction alike.
+    axis: of `rotate`, ranges of the axis's x, y and z before it is normalised; None is uniform over all directions.
   """
 
   field: str
@@ -205,13 +205,13 @@ class ModelField:
 
 @dataclasses.dataclass
 class PushByForce:
-  """Pushes the root body with a force, a half sine in time, from time to time; strengths and times are an episode's.
+  """Pushes the root body with a force, a half sine in time, at intervals; each episode draws strength and times.
 
   Writes `pushing` (whether a push is under way in this step), `push_force` and the counters `push_wait`, `push_time`.
 
   Attributes:
     velocity: range of the strength, m/s: the force's peak is 0.5 * mass * velocity / duration, so that the body gains
-      velocity / pi (Playground 0.2.0, with which this range goes).
+      velocity / pi (as in Playground 0.2.0, whose ranges these are).
     duration_s: range, s.
     interval_s: range of the time between two pushes, s.
   """
@@ -332,7 +332,7 @@ class PushObjectByWrench(PushByForceRegularly):
 
 @dataclasses.dataclass
 class PushBySettingVelocity:
-  """Adds to the root's horizontal velocity, at one interval in an episode, each time in another direction.
+  """Adds a horizontal velocity in a random direction to the root's, at an interval that each episode draws.
 
   Writes `push_step`, `push_interval_steps`, `push` (the direction of a push in this step, else 0) and `pushing`.
 

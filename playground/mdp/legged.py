@@ -17,7 +17,7 @@ from playground.physics.backend import PhysicsData, mjx
 
 
 class LeggedRobot(Robot):
-  """A robot on legs, of which the model has what its YAML (`configs/robot/`) names.
+  """A robot on legs, whose YAML (`configs/robot/`) names the parts of its model.
 
   The first joint is the free one of the base; actuators stand in the order of the other joints.
 
@@ -37,11 +37,11 @@ class LeggedRobot(Robot):
   qvel = slice(6, None)
 
   def __init__(self, mj_model: mujoco.MjModel, config: Any):
-    """Looks the names of `env.robot` up.
+    """Looks up the names of `env.robot`.
 
     Raises:
-      ConfigError: the model lacks one, its joints come in another order, or a list has not one entry for each foot or
-        joint.
+      ConfigError: the model lacks one, its joints come in another order, or a list does not have one entry for each
+        foot or joint.
     """
     joints = [mj_model.joint(i).name for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
@@ -79,7 +79,7 @@ class LeggedRobot(Robot):
     return jnp.array(self.mj_model.key_qpos[self.find("key", name)])
 
   def add_contact_group(self, name: str, sensors: Sequence[str]) -> None:
-    """Gives contact sensors a name that `touching` knows."""
+    """Names a group of contact sensors for `touching`."""
     self.contact_groups[name] = self._addresses(sensors, name)
 
   def _addresses(self, sensors: Sequence[str], key: str) -> np.ndarray:
@@ -131,7 +131,7 @@ class LeggedRobot(Robot):
 
 
 def _check_lengths(config: Any) -> None:
-  """Raises ConfigError where a list of `env.robot` has not one entry for each foot or for each joint."""
+  """Raises ConfigError where a list of `env.robot` does not have one entry for each foot or joint."""
   if not config.feet:
     raise ConfigError("env.robot.feet must name one foot or more.")
   own = config.get("target_range") or {}
@@ -179,7 +179,7 @@ class LeggedContext(StepContext):
 
   @property
   def still(self) -> jax.Array:
-    """Whether the command is to stand still, bool."""
+    """Whether the command asks to stand still, bool."""
     return is_still(self.command)
 
   @property

@@ -152,7 +152,7 @@ class ObservationManager(_Manager):
       value = value + drawn[str(size)]
     elif kind is not None:
       pattern = self._level * _per_element(f"{term.name}.noise.{kind}", size, value.size)
-      # A level of 0 computes nothing, and a setting (an array of JAX) is none unless the level of all noise is.
+      # Noise of 0 is not computed. A setting of the program, an array of JAX, is 0 only if the noise level is.
       if self._level and (isinstance(pattern, jax.Array) or pattern.any()):
         uniform = kind == "uniform"
         draw = jax.random.uniform(key, value.shape) * 2 - 1 if uniform else jax.random.normal(key, value.shape)
@@ -205,7 +205,7 @@ def _bind_observation(group: str, name: str, entry: Any, noisy: list[str]) -> Te
 
 
 def _per_element(name: str, numbers: Any, size: int) -> np.ndarray | jax.Array:
-  """A number or a list of numbers for each of `size` elements; a shorter list repeats. Raises ConfigError."""
+  """Returns a number or a list of numbers for each of `size` elements; a shorter list repeats. Raises ConfigError."""
   count = np.size(numbers)
   if size % count:
     raise ConfigError(f"env.observations: {name} has {count} numbers, which do not divide its {size} elements.")
@@ -217,15 +217,15 @@ def _is_actor(group: str, term: Term) -> bool:
 
 
 def _depth(term: Term) -> int:
-  """How many values of a term are kept."""
+  """Returns the number of values that the buffer of a term holds."""
   delay = term.options.delay
   return term.options.history + (delay[1] if delay else 0)
 
 
 def _look_back(term: Term, value: jax.Array, key: jax.Array, buffer: jax.Array | None) -> tuple[jax.Array, jax.Array]:
-  """A term's late value or its history, and the buffer for the next step."""
+  """Returns a term's delayed value or its history, and the buffer for the next step."""
   delay, depth = term.options.delay, _depth(term)
-  if buffer is None:  # a delayed sensor has read the start for long; a history has no past
+  if buffer is None:  # a delay begins with the first value, a history with zeros
     buffer = delays.start(value, depth) if delay else jnp.zeros((depth, *value.shape), value.dtype)
   buffer = delays.push(buffer, value)
   if not delay:
@@ -250,9 +250,9 @@ class CommandManager(_Manager):
 
 
 class EventManager(_Manager):
-  """What acts on the simulation from outside: on its start state and while it runs (groups `reset` and `interval`).
+  """Events, which change the initial state (group `reset`) and act on the running simulation (group `interval`).
 
-  Model fields of mode `startup` are the trainers' (`playground.randomization`), which hand them to `reset` and `step`.
+  Trainers draw the model fields of mode `startup` (`playground.randomization`) and pass them to `reset` and `step`.
   """
 
   def __init__(self, section: Mapping[str, Any], env: Any):

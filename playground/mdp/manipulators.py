@@ -32,7 +32,7 @@ class Manipulator(Robot):
   """
 
   def __init__(self, mj_model: mujoco.MjModel, keyframe: str, joints: str = ".*", sensors: Any = None):
-    """Looks the names up; `joints` is a regular expression of the names of the joints, free ones excepted."""
+    """Looks up the names; `joints` is a regular expression of the names of the joints, free ones excepted."""
     hinges = [i for i in range(mj_model.njnt) if mj_model.jnt_type[i] != mujoco.mjtJoint.mjJNT_FREE]
     self.joint_ids = np.array([i for i in hinges if re.fullmatch(joints, mj_model.joint(i).name)])
     super().__init__(mj_model, [mj_model.joint(i).name for i in self.joint_ids], sensors)
@@ -71,7 +71,7 @@ class ArmRobot(Manipulator):
     return slice(start, start + 3)
 
   def touching(self, data: PhysicsData, geom: str) -> jax.Array:
-    """Returns which of the contact sensors of a geom see a contact, bool, shape [sensors]; raises UnknownNameError."""
+    """Returns which contact sensors of a geom report a contact, bool, shape [sensors]; raises UnknownNameError."""
     self.find("geom", geom, "a term")
     return data.sensordata[contact_addresses(self.mj_model, geom)] > 0
 
@@ -86,7 +86,7 @@ class Hand(Manipulator):
   """
 
   def __init__(self, mj_model: mujoco.MjModel, config: Any):
-    """Looks the names of `env.robot` up."""
+    """Looks up the names of `env.robot`."""
     super().__init__(mj_model, "home", sensors=config.sensors)
     self.has_servos = mj_model.nu == len(self.joint_names)
     self.cube: int = mj_model.body("cube").id

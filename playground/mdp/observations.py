@@ -1,9 +1,9 @@
-"""Observation terms, beside what a step context has (`playground.mdp.terms`).
+"""Observation terms, besides the properties of a step context (`playground.mdp.terms`).
 
 Sensors, site poses and actuator forces are one physics step older than `qpos` and `qvel`, as MuJoCo leaves them. The
 first line of a docstring goes into `policy.yaml`: it gives frame, unit and [length]. An orientation is two rows of a
-rotation matrix, without the quaternion's double cover. A hand's actor sees the cube's tracked pose, `sensed_*`; the
-other terms are exact.
+rotation matrix, without the quaternion's double cover. A hand's actor observes the cube's tracked pose, `sensed_*`;
+the other terms are exact.
 """
 
 import zlib
@@ -133,7 +133,7 @@ def body_axes(c: ArmContext, body: str, turn_noise: AtLeast0 = 0.0) -> jax.Array
 
 
 def _turned(c: ArmContext, axes: jax.Array, max_angle: float, name: str) -> jax.Array:
-  """The last two rows of axes that a tracker sees, turned at random by up to `max_angle` rad; shape [2, 3]."""
+  """The last two rows of axes as a tracker measures them, turned at random by up to `max_angle` rad; shape [2, 3]."""
   max_angle = max_angle * c.env.config.noise_level
   if max_angle:
     key = jax.random.fold_in(c.info["rng"], zlib.crc32(name.encode()))

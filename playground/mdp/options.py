@@ -31,7 +31,7 @@ class RewardOptions(NamedTuple):
 
   Attributes:
     weight: factor on the function's value; a term of weight 0 is left out.
-    when: `{command_above: x}` or `{command_below: x}`: else, by the norm of the command, the term is 0.
+    when: `{command_above: x}` or `{command_below: x}`, of the norm of the command; otherwise the term is 0.
   """
 
   weight: float

@@ -12,7 +12,7 @@ _INJECTED_REACH = 0.5  # m
 
 
 def uniform_quat(key: jax.Array) -> jax.Array:
-  """An orientation, all equally likely, shape [4] (Shoemake 1992)."""
+  """Draws an orientation, all equally likely, shape [4] (Shoemake 1992)."""
   u, v, w = jax.random.uniform(key, (3,))
   v, w = 2 * jnp.pi * v, 2 * jnp.pi * w
   inner, outer = jnp.sqrt(1 - u), jnp.sqrt(u)
@@ -20,20 +20,20 @@ def uniform_quat(key: jax.Array) -> jax.Array:
 
 
 def turn_at_random(key: jax.Array, quat: jax.Array, max_angle: float | jax.Array) -> jax.Array:
-  """`quat` [4] turned about an axis in any direction by an angle that is uniform in [0, `max_angle`) rad."""
+  """Turns `quat` [4] about an axis in any direction by an angle U[0, `max_angle`) rad."""
   axis_key, angle_key = jax.random.split(key)
   axis = normalize(jax.random.normal(axis_key, (3,)))
   return quat_mul(axis_angle_to_quat(axis, jax.random.uniform(angle_key) * max_angle), quat)
 
 
 def angle_between(quat: jax.Array, goal: jax.Array) -> jax.Array:
-  """The smallest angle that turns `quat` into `goal`, rad in [0, pi], shape []."""
+  """Returns the smallest angle that turns `quat` into `goal`, rad in [0, pi], shape []."""
   difference = normalize(quat_mul(quat, quat_inv(goal)))
   return 2 * jnp.arcsin(jnp.minimum(norm(difference[1:]), 1.0))
 
 
 def two_rows(quat: jax.Array) -> jax.Array:
-  """The last two rows of the rotation matrix, shape [6]: an orientation without the quaternion's double cover."""
+  """Returns the last two rows of the rotation matrix, shape [6]: without the double cover of a quaternion."""
   return quat_to_mat(quat).ravel()[3:]
 
 

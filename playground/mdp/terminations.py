@@ -79,7 +79,7 @@ def site_out_of_bounds(c: ArmContext, site: str, low: Bounds, high: Bounds) -> j
 
 
 def illegal_contact(c: ArmContext, geoms: Sequence[str]) -> jax.Array:
-  """A contact sensor of one of the geoms sees a contact."""
+  """A contact sensor of one of the geoms reports a contact."""
   return jnp.concatenate([c.robot.touching(c.data, geom) for geom in geoms]).any()
 
 

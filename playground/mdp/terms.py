@@ -12,7 +12,7 @@ rewards:
 
 Every public function or class of the modules in `MODULES` is registered under its name (a class under its name in
 snake_case). Its keyword arguments are the term's `params`, its docstring is the term's help. An observation term may
-also name what a step context has (`CONTEXTS`): `gravity`, or `site_pos` with `params: {site: gripper}`.
+also name a property or method of a step context (`CONTEXTS`): `gravity`, or `site_pos` with `params: {site: gripper}`.
 """
 
 import contextlib
@@ -42,12 +42,12 @@ CONTEXTS = {
   "playground.mdp.legged": ("LeggedContext",),
   "playground.mdp.manipulators": ("ArmContext", "HandContext"),
 }
-# How many leading arguments of a function are no parameters: the context; key, task and state of reset events.
+# Number of leading arguments that are not parameters: the context; key, task and initial state of reset events.
 _LEADING = {"rewards": 1, "observations": 1, "terminations": 1, "commands": 0, "events": 3}
 
 
 class Term(NamedTuple):
-  """A term whose function is found and whose parameters are checked.
+  """A term with its function and its checked parameters.
 
   Attributes:
     name: its name in the config.
@@ -95,7 +95,7 @@ class Term(NamedTuple):
     own = below(self.key.removeprefix("env."), values)
     params, noise = below("params", own), below("noise", own)
     options = {name: value for name, value in own.items() if "." not in name} | ({"noise": noise} if noise else {})
-    instance = copy.copy(self.instance)  # what `bind` found included
+    instance = copy.copy(self.instance)  # with what its `bind` looked up
     for name, value in params.items() if instance is not None else ():
       setattr(instance, name, value)
     return self._replace(params=self.params | params, options=self.options._replace(**options), instance=instance)
@@ -116,7 +116,7 @@ def registered(kind: str) -> dict[str, Callable[..., Any]]:
 
 
 def _of_contexts() -> dict[str, Callable[..., Any]]:
-  """Functions that read the properties and methods of `CONTEXTS`, as a subclass may define them, by name."""
+  """Returns functions that read the properties and methods of `CONTEXTS`, by name; a subclass may override them."""
   found: dict[str, Callable[..., Any]] = {}
   for module, classes in CONTEXTS.items():
     for member in (m for cls in classes for m in vars(getattr(importlib.import_module(module), cls)).values()):
@@ -229,7 +229,7 @@ def annotation(func: Callable[..., Any], argument: inspect.Parameter) -> Any:
 
 
 def _checked(key: str, value: Any, hint: Any) -> Any:
-  """Returns a value, whole numbers as floats where the annotation says float; raises ConfigError if it must not be."""
+  """Returns a value, whole numbers as floats where the annotation says float; raises ConfigError if it is invalid."""
   if typing.get_origin(hint) is typing.Literal and value not in (known := typing.get_args(hint)):
     raise UnknownNameError(f"{key}={value!r} is unknown: choose from {', '.join(known)}.{nearest(str(value), known)}")
   if wanted := problem(value, hint):

@@ -13,7 +13,7 @@ Sigmoid = Callable[[jax.Array, float], jax.Array]
 
 
 def _cut(distance: jax.Array, fall: Callable[[jax.Array], jax.Array]) -> jax.Array:
-  """`fall` of a scaled distance, 0 from a scaled distance of 1 on."""
+  """Returns `fall` of a scaled distance, and 0 from a scaled distance of 1 on."""
   return jnp.where(jnp.abs(distance) < 1, fall(distance), 0.0)
 
 

@@ -1,8 +1,8 @@
-"""Numbers of terms that compiled programs take as arguments: another value compiles nothing, and agents may differ.
+"""Numbers of terms that compiled programs take as arguments: a new value compiles nothing, and agents may differ.
 
 They are the weights of rewards, the noise of observations, and those parameters of this package's commands and of its
-reset and interval events that are numbers or ranges. A 0 stays a constant, for what it switches off is not computed;
-so do the weights of `reward_total: product`, which goes by their signs.
+reset and interval events that are numbers or ranges. A 0 stays a constant, so that its term is not computed. The
+weights of `reward_total: product` stay constants, as their signs decide the formula.
 """
 
 import inspect

@@ -1,9 +1,8 @@
-"""Physics on MJX: advances the few fields that a task keeps between steps.
+"""Physics on MJX: advances the few fields that a task stores between steps.
 
 `mjx.Data` carries 40-150 KB an environment, nearly all of it scratch that the next forward pass writes again. A
-`PhysicsData` holds only the simulator's state and the derived fields that the task reads; the rest is rebuilt from one
-template inside every step. So a state is small, complete (it can be resumed, bit for bit) and
-the same for both backends.
+`PhysicsData` holds only the simulator's state and the derived fields that the task reads; each step rebuilds the rest
+from one template. So a state is small, complete (a resumed run is exact bit for bit) and the same for both backends.
 """
 
 import contextlib
@@ -23,7 +22,7 @@ from playground.physics.warp_kernels import KernelBuild, cancel_prestart, quiet_
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
 
-# What follows forward dynamics in a step.
+# Integrators: the part of a step that follows forward dynamics.
 _INTEGRATE = {
   mujoco.mjtIntegrator.mjINT_EULER: mjx.euler,
   mujoco.mjtIntegrator.mjINT_RK4: mjx.rungekutta4,
@@ -31,11 +30,11 @@ _INTEGRATE = {
 }
 
 WORLDS = "worlds"  # the axis of the batch of environments, for `jax.vmap(axis_name=...)`: Warp's buffers grow with it
-_FEW = 64  # a batch smaller than this gets the buffers of so many environments: its mean may be above the average
+_FEW = 64  # smaller batches get the buffers of so many environments, since their mean may be above the average
 
 
 class BufferUse(struct.PyTreeNode):
-  """What the last control step needed of Warp's buffers, the most of any of its physics steps; each shape [].
+  """The use of Warp's buffers in the last control step, the most of any of its physics steps; each shape [].
 
   Attributes:
     constraints: constraint rows of the environment (`njmax` bounds them).
@@ -48,7 +47,7 @@ class BufferUse(struct.PyTreeNode):
   overflow: jax.Array
 
   def join(self, other: "BufferUse") -> "BufferUse":
-    """What two physics steps needed."""
+    """Returns the use of two physics steps."""
     constraints, contacts = (jnp.maximum(getattr(self, k), getattr(other, k)) for k in ("constraints", "contacts"))
     return BufferUse(constraints, contacts, self.overflow | other.overflow)
 
@@ -97,9 +96,9 @@ class PhysicsData(struct.PyTreeNode):
 
 
 _FIELDS = [field for field in dataclasses.fields(PhysicsData) if field.name != "buffers"]
-# What the next step depends on: everything else in `mjx.Data` follows from these.
+# The next step depends on these fields only: everything else in `mjx.Data` follows from them.
 STATE_FIELDS = tuple(field.name for field in _FIELDS if field.default is dataclasses.MISSING)
-# What observations, rewards and terminations may read besides.
+# Fields that observations, rewards and terminations may read besides.
 DERIVED_FIELDS = tuple(field.name for field in _FIELDS if field.default is None)
 
 
@@ -126,12 +125,12 @@ class Physics:
     self.mj_model = mj_model
     self.impl = impl
     self.derived = derived
-    self._forward = mjx.forward if impl == "warp" else jax.jit(mjx.forward)  # most of all tracing: done once
+    self._forward = mjx.forward if impl == "warp" else jax.jit(mjx.forward)  # most of the time of tracing: traced once
     self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, _device(), impl=impl)
     self._buffers = buffers
 
   def without_dynamics(self) -> "Physics":
-    """The same, but `forward` computes nothing: for `jax.eval_shape`, which then takes a fraction of the time."""
+    """Returns the same with a `forward` that computes nothing: `jax.eval_shape` takes a fraction of the time."""
     still = copy.copy(self)
     still._forward = lambda model, data: data
     return still
@@ -153,7 +152,7 @@ class Physics:
     return self._keep(self.present(model, data))
 
   def present(self, model: mjx.Model, data: PhysicsData) -> mjx.Data:
-    """MJX's own data of the present state, all that follows from it computed."""
+    """Returns MJX's own data of the present state, with all derived fields."""
     return self._forward(model, self._full(data))
 
   def step(self, model: mjx.Model, data: PhysicsData, ctrl: jax.Array, num_substeps: int) -> PhysicsData:
@@ -166,7 +165,7 @@ class Physics:
         return after
       return after.replace(buffers=data.buffers.join(after.buffers))
 
-    if self.impl == "warp":  # computes all of them anyway, and holds memory of its own for each place it is called at
+    if self.impl == "warp":  # computes all of them anyway, and allocates memory for each call site
       return jax.lax.scan(lambda data, _: (advance(data, self.derived), None), data, None, num_substeps)[0]
     # Only the last substep's derived fields are read, so the others need not compute them (sensors, say): 9 % faster
     # training of the Go1 on an H200, for four seconds more of compiling.

@@ -1,7 +1,7 @@
-"""Physics in plain C MuJoCo, behind the same two operations as MJX's.
+"""Physics in C MuJoCo, behind the same two operations as MJX's.
 
-It is the other simulator that a policy is tried in before a robot, and it needs no compiling. A batch is stepped one
-environment after another on one core, so it is for looking, not for training.
+Policies are tried in this second simulator before they run on a robot. It needs no compiling. It steps the environments
+of a batch one after another on one core, so it is for evaluation, not for training.
 """
 
 import copy

@@ -1,4 +1,4 @@
-"""How large Warp's buffers must be for a task: the most that a policy makes it need."""
+"""Measures the sizes that Warp's buffers need for a task and a policy."""
 
 import dataclasses
 import math
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from playground.errors import ConfigError
 from playground.physics.backend import BufferUse
 
-ROOM = 1.25  # buffers are advised to be so much larger than what was needed
+ROOM = 1.25  # factor of the advised sizes on the measured ones
 _TRIES = 12
 _REPORTS = 50  # of the progress of a rollout, which takes minutes on a CPU
 _CCD = 1 << 4  # mujoco_warp's OverflowType.CCD
@@ -23,7 +23,7 @@ State = Any
 
 @dataclasses.dataclass(frozen=True)
 class BufferSizes:
-  """What a task needed of Warp's buffers.
+  """The use of Warp's buffers by a task.
 
   Attributes:
     constraints: constraint rows of one environment.
@@ -123,5 +123,5 @@ def _roll(
 
 
 def _rows(constraints: int) -> int:
-  """That many constraint rows with some room, a multiple of 4."""
+  """Returns a number of constraint rows with some room, a multiple of 4."""
   return 4 * math.ceil(constraints * ROOM / 4)

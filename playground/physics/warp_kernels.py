@@ -60,7 +60,7 @@ def _start() -> subprocess.Popen[str]:
   return subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe, text=True)
 
 
-def _tell(process: subprocess.Popen[str], job: dict[str, Any]) -> None:
+def _send(process: subprocess.Popen[str], job: dict[str, Any]) -> None:
   assert process.stdin is not None
   with contextlib.suppress(BrokenPipeError), process.stdin as pipe:  # `wait` reports why it failed
     json.dump(job, pipe)
@@ -83,14 +83,14 @@ class KernelBuild:
     self._folder = tempfile.TemporaryDirectory(prefix="playground-")
     path = Path(self._folder.name, "model.mjb")
     mujoco.mj_saveModel(mj_model, str(path), None)
-    facts = f"{njmax} {warp.get_device()} {warp.get_device().arch} {mujoco.__version__}"
-    key = hashlib.sha256(path.read_bytes() + facts.encode()).hexdigest()[:16]
+    versions = f"{njmax} {warp.get_device()} {warp.get_device().arch} {mujoco.__version__}"
+    key = hashlib.sha256(path.read_bytes() + versions.encode()).hexdigest()[:16]
     # In the folder of Warp's version, so that clearing Warp's cache clears this with it.
     self._marker = Path(str(warp.config.kernel_cache_dir), f"playground_{key}")
     self._process: subprocess.Popen[str] | None = None
     if not self._marker.exists():
       self._process = _prestarted.pop() if _prestarted else _start()
-      _tell(self._process, {"model": str(path), "njmax": njmax, "cache": str(self._marker.parents[1])})
+      _send(self._process, {"model": str(path), "njmax": njmax, "cache": str(self._marker.parents[1])})
     cancel_prestart()
 
   def wait(self) -> str | None:
@@ -168,8 +168,8 @@ def _main() -> None:
   with gc_paused(stays=True):
     for name in _NEEDS:
       importlib.import_module(name)
-  if told := sys.stdin.read():
-    job = json.loads(told)
+  if text := sys.stdin.read():
+    job = json.loads(text)
     os.environ["WARP_CACHE_PATH"] = job["cache"]  # to which Warp adds its version
     compile_all(mujoco.MjModel.from_binary_path(job["model"]), job["njmax"], len(os.sched_getaffinity(0)))
 

@@ -1,4 +1,4 @@
-"""Scenes: one robot's MJCF, the ground it stands on, and what lights it.
+"""Scenes: one robot's MJCF, the ground it stands on, and lights.
 
 A robot's file (`robots/<name>/<name>.xml`) holds the robot alone, written as it stands when only its feet collide, and
 the solver's options. A few conventions let this file work for all of them:

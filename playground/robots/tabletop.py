@@ -2,7 +2,7 @@
 
 A part's file (`robots/<name>/*.xml`, `robots/props/*.xml`) holds that part alone, with default classes of its own. The
 arm's file also holds the solver's options and a frame `flange` for the gripper. Bodies come in the order in which parts
-are attached, the world's own geoms before all; keyframes and sensors speak of the whole scene and are added last.
+are attached, the world's own geoms first; keyframes and sensors belong to the whole scene and are added last.
 """
 
 from collections.abc import Callable
@@ -70,7 +70,7 @@ def _panda_single_cube() -> mujoco.MjSpec:
 
 
 def _panda_single_cube_camera() -> mujoco.MjSpec:
-  """A red cube to pick up, a white strip where it may lie, a camera that sees both, one light, materials to draw."""
+  """A red cube to pick up, a white strip where it may lie, a camera on both, one light, materials to draw."""
   spec = _panda()
   for i in range(10):
     white, blue, alpha = 1 - 0.1 * i / 9, 1 - 0.08 * i / 9, 1 - 0.05 * i
@@ -93,7 +93,7 @@ def _panda_single_cube_camera() -> mujoco.MjSpec:
 
 
 def _panda_single_cube_pixels() -> mujoco.MjSpec:
-  """The same as a camera should see it: a dark floor that shows the strip, a sun, and the target out of sight."""
+  """The same for a camera: a dark floor that shows the strip, a sun, and an invisible target."""
   spec = _panda_single_cube_camera()
   floor = spec.geom("floor")
   floor.material, floor.rgba = "", [0.125, 0.125, 0.125, 1]

@@ -14,7 +14,7 @@ _SPIN_VELOCITY = -15.0  # rad/s, at least this fast
 
 
 class Finger(SuiteTask):
-  """What spinning and turning share: the finger (two motors, actions in [-1, 1]), the spinner and their observation.
+  """Base of spinning and turning: the finger (two motors, actions in [-1, 1]), the spinner and their observation.
 
   Observation [9]: angles of the finger's joints rad, tip of the spinner from its hinge (x, z) m, velocities of both
   joints and the hinge rad/s, log(1 + force in N) on the fingertip's top and bottom.

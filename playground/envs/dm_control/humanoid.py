@@ -22,8 +22,8 @@ class Humanoid(SuiteTask):
   upright) times small_control times move, which asks for a speed or, if that is 0, for no speed.
 
   Every episode starts from the model's pose, upright with the feet 0.2 m above the floor, as in Playground 0.2.0. The
-  original suite draws poses, any way up, until nothing touches: a search without bound, and episodes that begin with a
-  fall, which the paper's settings and returns are not for.
+  original suite draws poses, any way up, until nothing touches. This search has no bound, and those episodes begin with
+  a fall, but the paper's settings and returns are for upright starts.
   """
 
   domain = "humanoid"

@@ -1,4 +1,4 @@
-"""What the DM Control Suite's tasks share: the model beside the module, motors driven directly, endless episodes."""
+"""Base of the DM Control Suite's tasks: the model beside the module, motors driven directly, endless episodes."""
 
 import abc
 import math

@@ -1,4 +1,4 @@
-"""How a robot on legs walks, beside what it earns: for evaluations of trained policies."""
+"""Metrics of how a robot on legs walks, for evaluations of trained policies."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -14,8 +14,8 @@ class Joystick(LeggedTask):
   """Tracks commanded forward, sideways and turning velocity (paper: appendix "Locomotion", joystick tasks).
 
   Its terms are in `configs/env/joystick.yaml`, for two legs in `biped_joystick.yaml`, and for tracking a gait (paper:
-  gait tracking, with a joystick and in place) in `gait_tracking.yaml`. It keeps account of the feet: `feet_air_time`,
-  `swing_peak` and `last_contact`. What differs from Playground 0.2.0 is in docs/differences.md.
+  gait tracking, with a joystick and in place) in `gait_tracking.yaml`. It tracks `feet_air_time`, `swing_peak` and
+  `last_contact` in `info`. What differs from Playground 0.2.0 is in docs/differences.md.
   """
 
   episode_info = (*LeggedTask.episode_info, "feet_air_time", "swing_peak", "last_contact")

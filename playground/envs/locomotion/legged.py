@@ -1,4 +1,4 @@
-"""Robots on legs: scene and joint targets. All else of a task is terms of its config."""
+"""Robots on legs: scene and joint targets. The terms of a task's config define everything else."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
@@ -49,7 +49,7 @@ class LeggedTask(Task):
     self._settle_steps = round(config.settle_s / self.sim_dt)
 
   def scene(self, config: Any) -> mujoco.MjSpec:
-    """Returns the scene to compile; called first of all."""
+    """Returns the scene to compile; called before everything else."""
     scene, robot = config.scene, config.robot
     check_keys(robot, _KEYS, "robot on legs")
     ground = {"terrain": scene.terrain, "parameters": dict(scene.terrain_params or {})}

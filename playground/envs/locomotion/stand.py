@@ -38,7 +38,7 @@ class Stand(LeggedTask):
     return spec
 
   def watched_feet(self, config: Any) -> list[str]:
-    """Returns the feet whose legs must not touch the floor otherwise."""
+    """Returns the feet whose legs must touch the floor with nothing but the foot."""
     return list(config.support)
 
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> LeggedRobot:

@@ -1,4 +1,4 @@
-"""Arms at a table: scene, servo targets and when the object is at its goal. All else is terms of a task's config."""
+"""Arms at a table: scene, servo targets and success. The terms of a task's config define everything else."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -23,7 +23,7 @@ class TabletopTask(Task):
   `success_angle` of its turn where that is given, when the episode ends; `position_error_cm` is how far it is then.
 
   Attributes:
-    object: name of the body of `c.object_pos` and its companions; None if the config names none.
+    object: name of the body of `c.object_pos`, `c.goal_angle`, ...; None if the config names none.
     gripper: name of the site at the tip of the gripper; None if the config names none.
   """
 
@@ -89,8 +89,8 @@ class ArmTask(TabletopTask):
 class Bimanual(TabletopTask):
   """Two arms at a table; an action adds to the targets of the servos of all joints and of both grippers.
 
-  The terms' weighted mean is the potential that a task pays, or pays for raising. The model is that of Playground
-  0.2.0, its upstream bug included: capsules `right_finger_bottom` lie across the palm instead of along the finger.
+  The weighted mean of the terms is the reward, or the potential whose gain is the reward. The model is that of
+  Playground 0.2.0 with its upstream bug: capsules `right_finger_bottom` lie across the palm, not along the finger.
   """
 
   arm_joints = r"(left|right)/(?!.*_finger).*"
@@ -100,9 +100,9 @@ class Bimanual(TabletopTask):
 
 
 class ProgressTask(TabletopTask):
-  """Pays what the terms' total gains over its best so far in the episode: going back and forth earns nothing.
+  """Rewards the gain of the terms' total over its best so far in the episode: going back and forth earns nothing.
 
-  The first step pays nothing, since what the start itself is worth is no progress.
+  The first step has no reward, since the value of the initial state is no progress.
   """
 
   # `first_step`: no step was made since the reset.
@@ -116,7 +116,7 @@ class ProgressTask(TabletopTask):
     return super().next_info(c, key) | {"first_step": jnp.zeros((), bool)}
 
   def bonus(self, c: ArmContext, potential: jax.Array) -> jax.Array:
-    """Returns what is paid besides the gain, from the terms' total."""
+    """Returns the reward besides the gain, from the terms' total."""
     return jnp.zeros(())
 
   def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:

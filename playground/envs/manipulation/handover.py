@@ -1,4 +1,4 @@
-"""Hand a box over from one hand to the other."""
+"""A box that one arm hands over to the other."""
 
 from typing import Any
 
@@ -13,13 +13,13 @@ _MEETING = (0.0, 0.0, 0.24)  # m, where the box changes hands
 _PICK_X, _PASS_X = -0.1, 0.0  # m: the box's x up to which it is the left hand's, and from which the right one's
 _LIFTED, _FALLEN = 0.15, 0.05  # m: heights at which the box counts as picked up, and then as dropped
 _DROP_COST = 0.1
-_HOLDING_RATE = 0.02  # of the potential, paid in every step once the right hand has the box
+_HOLDING_RATE = 0.02  # of the potential, in every step once the right hand has the box
 
 
 class HandOver(ProgressTask, Bimanual):
   """The left arm picks the box up and passes it to the right one, which brings it to the goal. (Not in the paper.)
 
-  The reward is what the terms' weighted mean gains over its best so far in the episode; a dropped box costs and ends
+  The reward is the gain of the terms' weighted mean over its best so far in the episode; a dropped box costs and ends
   the episode. The left gripper does not close below 1 cm, which helps exploration.
 
   Metrics of an evaluation: `success` is whether the box is within `success_distance` of the goal, and the left hand on

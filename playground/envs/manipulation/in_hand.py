@@ -1,4 +1,4 @@
-"""A hand with a cube: scene and targets of its actuators. All else of a task is terms of its config."""
+"""A hand with a cube: scene and targets of its actuators. The terms of a task's config define everything else."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -16,7 +16,7 @@ from playground.mdp.poses import Pose, sensed_pose
 from playground.physics.backend import PhysicsData, mjx
 from playground.robots.in_hand import build_in_hand_scene
 
-_AWAY = (-100.0, -100.0, -100.0)  # m, where a goal is that the task does not have
+_AWAY = (-100.0, -100.0, -100.0)  # m, place of the goal's marker in tasks without a goal
 
 # What an action is added to: the targets that hold the keyframe `home`, or those of the step before.
 _ACTION_BASES: dict[str, Callable[[Hand, PhysicsData], jax.Array]] = {
@@ -28,7 +28,7 @@ _ACTION_BASES: dict[str, Callable[[Hand, PhysicsData], jax.Array]] = {
 class HandTask(Task):
   """A hand, palm up, with a cube: target = base + action_scale * action, within the targets' range.
 
-  Terms read the cube's pose as it is, or as a camera tracks it (`sensed_*`), with the noise of `env.pose_noise`. What
+  Terms read the cube's true pose, or the tracked one (`sensed_*`), which has the noise of `env.pose_noise`. What
   differs from Playground 0.2.0 is in docs/differences.md.
   """
 
@@ -43,7 +43,7 @@ class HandTask(Task):
     self.pose_noise = config.pose_noise if config.noise_level else None
 
   def scene(self, config: Any) -> mujoco.MjSpec:
-    """Returns the scene to compile; called first of all."""
+    """Returns the scene to compile; called before everything else."""
     spec = build_in_hand_scene(config.robot)
     if not config.torque_limits:
       for joint in spec.joints:

@@ -1,4 +1,4 @@
-"""Put a peg into a socket, one in each hand."""
+"""A peg that two arms put into a socket, one in each hand."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar

@@ -25,7 +25,7 @@ class PickCubeCartesian(ProgressTask, ArmTask):
 
   Actions: where the hand's tip goes along y and z, in parts of `action_scale`, and whether the fingers close (below 0)
   or open. Inverse kinematics turn the tip's place into the joints' targets; the hand keeps its attitude and joint 7 its
-  angle. The reward is what the terms' total gains over its best so far in the episode. Some episodes begin with the
+  angle. The reward is the gain of the terms' total over its best so far in the episode. Some episodes begin with the
   cube in the hand.
   """
 
@@ -89,14 +89,14 @@ class PickCubeCartesian(ProgressTask, ArmTask):
     return super().next_info(c, key) | {"action_delay": delays.draw_delay(key, (0, self.config.gripper_delay))}
 
   def _delayed(self, info: Mapping[str, Any], action: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The action with the gripper's part of some steps ago, and the history of that part."""
+    """Returns the action with the gripper's entry of some steps ago, and the history of that entry."""
     history = delays.push(info["action_history"], action[2])
     return action.at[2].set(delays.delayed(history, info["action_delay"])), history
 
   def _plan(
     self, ctrl: jax.Array, info: Mapping[str, Any], action: jax.Array
   ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Where the tip goes, the joint angles for it, and whether the arm can do that: else the tip stays."""
+    """Returns the tip's target, its joint angles, and whether the arm can reach it; otherwise the tip stays."""
     step = self._action_scale * jnp.array([0.0, action[0], action[1]])
     tip = jnp.clip(info["current_pos"] + step, *WORKSPACE)
     joints = inverse_kinematics(tip, self.attitude, ctrl[6], near=ctrl[:7])

@@ -23,7 +23,7 @@ _PLACES = jnp.array([[0.4, -0.2, -0.005], [0.65, 0.2, 0.04]])
 _SPREAD = jnp.array([0.4, 1.0, 0.0]), jnp.array([0.0, 0.0, 0.005])  # of places: in parts of a distance, and m
 _BOX_SPREAD = 0.15  # m
 ARM_SPREAD = 0.3 * jnp.array([0.2, 0.2, 0.2, 0.2, 0.3, 0.3, 0.3])  # of the joints' ranges
-_BONUSES = ("is_terminated", "object_at_goal", "goal_reached")  # terms that are paid beside the mean of the others
+_BONUSES = ("is_terminated", "object_at_goal", "goal_reached")  # terms that are added to the mean of the others
 
 
 class PushCube(ArmTask):
@@ -47,7 +47,7 @@ class PushCube(ArmTask):
     "success": "max",
     "success_1": "max",
     "success_2": "max",
-    "goals_reached": "last",  # so far: of an event, an evaluation would see the last of the repeats of an action only
+    "goals_reached": "last",  # so far, since a metric holds the last repeat of an action only
     "curriculum_level": "last",
   }
 
@@ -144,14 +144,14 @@ class PushCube(ArmTask):
     return jnp.minimum(c.info[PRESERVE_INFO]["curriculum_id"] + self.goal_reached(c), len(self._distances) - 1)
 
   def _draw_place(self, key: jax.Array, distance: jax.Array) -> jax.Array:
-    """A place for the block, m [3], up to `distance` from the keyframe's along y and 0.4 times that along x."""
+    """Draws a place for the block, m [3], up to `distance` from the keyframe's along y and 0.4 times that along x."""
     reach = _SPREAD[0] * distance + _SPREAD[1]
     home = self.robot.init_qpos[_BOX]
     return jnp.clip(jax.random.uniform(key, (3,), minval=home - reach, maxval=home + reach), *_PLACES)
 
 
 class _DelayedObservations(ObservationManager):
-  """Observations whose group `state` is late as a whole; at the start of an episode it is that of the start."""
+  """Observations whose group `state` is delayed as a whole; at the start of an episode it is that of the start."""
 
   def __init__(self, config: Any, bounds: tuple[int, int]):
     super().__init__(config)
@@ -168,5 +168,5 @@ class _DelayedObservations(ObservationManager):
 
 
 def draw_yaw(key: jax.Array, max_angle: jax.Array | float) -> jax.Array:
-  """A turn about the vertical, uniform in [0, `max_angle`) rad, as a quaternion [4]."""
+  """Draws a turn about the vertical, uniform in [0, `max_angle`) rad, as a quaternion [4]."""
   return axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), jax.random.uniform(key) * max_angle)

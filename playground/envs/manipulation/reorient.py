@@ -1,4 +1,4 @@
-"""Turn a cube in the hand to one orientation after another."""
+"""A cube that the hand turns to one orientation after another."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -23,8 +23,8 @@ _TURN = 2.0  # control steps' worth of turning in each step
 class Reorient(HandTask):
   """Turns the cube to the goal's orientation, again and again (paper, Section IV-C.1 and Appendix C.4).
 
-  Within `success_threshold` of the goal the task pays the reward term `success`, once and not times `ctrl_dt`, and the
-  goal turns on: it spins, slower and slower, to another orientation, at least `goal.min_turn` away. Its motion is that
+  Within `success_threshold` of the goal the task adds the reward term `success` once, not times `ctrl_dt`, and the goal
+  turns on: it spins, slower and slower, to another orientation, at least `goal.min_turn` away. Its motion is that
   of Playground 0.2.0; the paper only states that a new goal is at least 90 degrees from the last.
 
   Metrics of an evaluation: `rotations` is the number of goals reached before failure, the cube dropped or no goal

@@ -1,4 +1,4 @@
-"""Turn a cube in the hand about the vertical, on and on."""
+"""A cube that the hand turns about the vertical."""
 
 import jax
 import jax.numpy as jnp
