@@ -21,7 +21,7 @@ from playground.envs.wrappers import FINAL_OBS, AutoReset, wrap_for_evaluation
 from playground.errors import ConfigError
 from playground.learning.rollout import episode_sums
 from playground.randomization import Randomizer
-from playground.settings import Section
+from playground.settings import Section, plain
 
 Extra = torch.Tensor | TensorDict | dict[str, float]
 PRIVILEGED = "privileged_state"
@@ -74,7 +74,7 @@ class VecEnv(rsl_rl_env.VecEnv):
     self.num_envs, self.num_actions = state.done.shape[0], env.action_size
     self.max_episode_length = env.episode_length
     self.device = to_torch(state.done).device
-    self.cfg = env.config.to_dict() if hasattr(env, "config") else {}
+    self.cfg = plain(env.config) or {}
     self._sums = jax.jit(episode_sums)
 
   @property
