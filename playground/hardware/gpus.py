@@ -2,7 +2,7 @@
 
 import os
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 
 def visible_gpus(env: Mapping[str, str] = os.environ) -> list[str]:
@@ -12,9 +12,14 @@ def visible_gpus(env: Mapping[str, str] = os.environ) -> list[str]:
   named = env.get("CUDA_VISIBLE_DEVICES")
   if named is not None:
     return [gpu.strip() for gpu in named.split(",") if gpu.strip() not in ("", "-1")]
+  return query_gpus("index")
+
+
+def query_gpus(fields: str, options: Sequence[str] = ()) -> list[str]:
+  """Returns the driver's answer about fields, a line for each GPU; none without a driver."""
+  query = ["nvidia-smi", f"--query-gpu={fields}", "--format=csv,noheader,nounits", *options]
   try:
-    query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
     done = subprocess.run(query, capture_output=True, text=True, timeout=20)
   except (OSError, subprocess.TimeoutExpired):
     return []
-  return done.stdout.split() if done.returncode == 0 else []
+  return [line.strip() for line in done.stdout.splitlines()] if done.returncode == 0 else []

@@ -4,12 +4,12 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 import mujoco
 import numpy as np
 
+from playground.config import RunConfig
 from playground.envs.base import Env
 from playground.errors import PlaygroundError
 from playground.hardware.mesh import local_shard
@@ -32,9 +32,6 @@ from playground.runs.run_dir import RunDirectory
 from playground.runs.top_ops import format_ops, write_top_ops
 from playground.runs.trackers import make_trackers
 
-if TYPE_CHECKING:
-  from playground.config import RunConfig
-
 
 class NonfiniteError(PlaygroundError):
   """Too many environment steps were NaN, infinite or too large: the run stops."""
@@ -45,7 +42,7 @@ class RunCallbacks:
 
   def __init__(
     self,
-    config: "RunConfig",
+    config: RunConfig,
     run_dir: RunDirectory,
     env: Env,
     trainer: Trainer,
@@ -252,7 +249,7 @@ class RunCallbacks:
 class NonMainCallbacks:
   """Callbacks of a process that writes nothing (`learning.loop.Callbacks`): it stops when process 0 does."""
 
-  def __init__(self, config: "RunConfig", env: Env, interrupts: Interrupts, step: int | None):
+  def __init__(self, config: RunConfig, env: Env, interrupts: Interrupts, step: int | None):
     self._allowed = config.on_nonfinite.max_fraction
     self._action_repeat = env.action_repeat
     self._interrupts = interrupts

@@ -10,33 +10,34 @@ start JAX and the device again for every stage, and would have to forward signal
 
 import contextlib
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from playground import registry
-from playground.config import in_stage, stage_folders
+from playground.config import RunConfig, in_stage, stage_folders
 from playground.errors import ConfigError
+from playground.files import write_text
 from playground.hardware.distributed import any_process, is_main, noting_loss, share
 from playground.hardware.setup import setup
 from playground.learning.checkpoints import describe
 from playground.learning.trainer import Trainer
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
-from playground.runs.chain_result import write_result
+from playground.runs.csv_tracker import STAGE, read_metrics
 from playground.runs.interrupts import Interrupts, exit_code
+from playground.runs.plots import plot_learning_curve
 from playground.runs.progress import format_return
 from playground.runs.provenance import process_age_s
 from playground.runs.restore_plan import RestorePlan, weights_of
-from playground.runs.run_dir import RunDirectory
+from playground.runs.run_dir import RETURNS, RunDirectory
+from playground.settings import Plain, Section
 
-if TYPE_CHECKING:
-  from playground.config import RunConfig
+_RESULT = ("env", *RETURNS, "best_step", "params_sha256")
+_OF_A_RUN = (*_RESULT, "steps", "steps_per_second", "wall_clock_s")
+TrainRun = Callable[[RunConfig, Interrupts, float], int]
 
-TrainRun = Callable[["RunConfig", Interrupts, float], int]
 
-
-def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun) -> int:
+def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) -> int:
   """Runs the stages of a new chain, or the unfinished stages of a resumed one.
 
   Args:
@@ -80,14 +81,14 @@ def train_chain(config: "RunConfig", interrupts: Interrupts, train_run: TrainRun
         before = str(run_dir.path)
     finally:
       if is_main():
-        write_result(chain, folders)
+        _write_result(chain, folders)
   finished = is_main() and chain.summary["status"] == "finished"
   if is_main():
     _say_where(chain)
   return 0 if interrupts.signum is None or finished else exit_code(interrupts.signum)
 
 
-def _check(config: "RunConfig") -> None:
+def _check(config: RunConfig) -> None:
   """Builds every stage, so that an invalid stage ends the chain before any is trained.
 
   This traces each task's reset for the sizes of its observation: seconds, where a stage takes minutes.
@@ -124,7 +125,7 @@ def _compare(env: str, facts: dict[str, object], before: str, theirs: dict[str, 
       raise ConfigError(f"{env} cannot start from the weights of stage {before}: {key} is {here}, and {there} there.")
 
 
-def _lay_out(config: "RunConfig") -> "tuple[RunDirectory, list[RunConfig]]":
+def _lay_out(config: RunConfig) -> tuple[RunDirectory, list[RunConfig]]:
   """Makes the directories of the chain and its stages; returns the stages' configurations, as for resumed runs.
 
   Process 0 makes them, the others wait for that.
@@ -148,6 +149,62 @@ def _lay_out(config: "RunConfig") -> "tuple[RunDirectory, list[RunConfig]]":
     chain.write_config(config.resolved, config.overrides)  # last: the chain can be resumed from here on
     share(str(chain.path.absolute()))
   return chain, stages
+
+
+def _write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
+  """Writes metrics.csv, plots and summary.json of a chain from its stages' files.
+
+  Args:
+    chain: its directory.
+    folders: of the stages, by name.
+  """
+  runs = {name: RunDirectory(chain.path / folder) for name, folder in folders.items()}
+  _write_metrics(chain, runs)
+  plot_learning_curve(chain.metrics_csv, chain.plots)
+  stages = [_stage(name, run) for name, run in runs.items()]
+  begun = [stage for stage in stages if stage["steps"] is not None]
+  open_ = [stage["status"] for stage in stages if stage["status"] != "finished"]
+  last: Section = begun[-1] if begun else {}
+  steps, rates = sum(stage["steps"] for stage in begun), [stage["steps_per_second"] for stage in begun]
+  seconds = sum(stage["steps"] / rate for stage, rate in zip(begun, rates, strict=True) if rate)
+  status = "finished" if not open_ else "failed" if "failed" in open_ else "preempted"
+  chain.write_summary(
+    {
+      "status": status,
+      # Stages may have different rewards, so return and step are those of the last stage.
+      **{key: last.get(key) for key in _RESULT},
+      "steps": steps,
+      "steps_per_second": steps / seconds if seconds else None,
+      "wall_clock_s": sum(stage["wall_clock_s"] or 0.0 for stage in begun),
+      "stages": stages,
+    }
+  )
+
+
+def _stage(name: str, run: RunDirectory) -> dict[str, Plain]:
+  """Returns the result of a stage; None where it has none yet."""
+  status, summary = run.status.get("status", "not begun"), run.summary
+  return {"name": name, "folder": run.path.name, "status": status, **{key: summary.get(key) for key in _OF_A_RUN}}
+
+
+def _write_metrics(chain: RunDirectory, runs: Mapping[str, RunDirectory]) -> None:
+  """Writes one table of all stages: steps and wall-clock time accumulate, column `stage` names the stage."""
+  import pandas as pd
+
+  tables, steps, seconds = [], 0, 0.0
+  for name, run in runs.items():
+    table = read_metrics(run.metrics_csv)
+    if table.empty:
+      break
+    table.insert(1, STAGE, name)
+    table["step"] += steps
+    steps = int(table["step"].iloc[-1])
+    if "time/wall_clock_s" in table:
+      table["time/wall_clock_s"] += seconds
+      seconds = float(table["time/wall_clock_s"].iloc[-1])
+    tables.append(table)
+  if tables:
+    write_text(chain.metrics_csv, pd.concat(tables, ignore_index=True).to_csv(index=False))
 
 
 def _say_where(chain: RunDirectory) -> None:

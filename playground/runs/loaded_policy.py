@@ -3,13 +3,13 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import jax
 from ml_collections import ConfigDict
 
 from playground import config as configs
 from playground import registry
+from playground.config import RunConfig
 from playground.envs.base import Env, Observation
 from playground.hardware.options import Platform
 from playground.hardware.setup import Hardware, setup, this_machine
@@ -18,9 +18,6 @@ from playground.learning.checkpoints import Checkpoint
 from playground.learning.trainer import Trainer
 from playground.runs.restore_plan import weights_of
 from playground.runs.run_dir import RunDirectory
-
-if TYPE_CHECKING:
-  from playground.config import RunConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +35,7 @@ class LoadedPolicy:
   """
 
   run_dir: RunDirectory
-  config: "RunConfig"
+  config: RunConfig
   checkpoint: Checkpoint
   env: Env
   hardware: Hardware

@@ -4,12 +4,13 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import jax
 import numpy as np
 
 from playground import registry
+from playground.config import RunConfig
 from playground.errors import CheckpointError
 from playground.hardware.distributed import is_main
 from playground.learning.algorithm import Policy
@@ -19,9 +20,6 @@ from playground.learning.trainer import Settings, Trainer, TrainState
 from playground.pretrained import check_task, is_pretrained, locate
 from playground.pytree import PyTree
 from playground.runs.run_dir import RunDirectory
-
-if TYPE_CHECKING:
-  from playground.config import RunConfig
 
 
 def weights_of(path: str | Path) -> Checkpoint:
@@ -69,7 +67,7 @@ class RestorePlan:
   began_s: float = 0.0
 
   @classmethod
-  def find(cls, config: "RunConfig", began_s: float = 0.0) -> Self:
+  def find(cls, config: RunConfig, began_s: float = 0.0) -> Self:
     """Finds the runs and checkpoints of `resume`, `init_from` and `run_dir`.
 
     Raises:
@@ -95,7 +93,7 @@ class RestorePlan:
     return cls()
 
   @contextlib.contextmanager
-  def locked(self, config: "RunConfig") -> Iterator[Self]:
+  def locked(self, config: RunConfig) -> Iterator[Self]:
     """Locks the resumed run, if any; yields the plan of the current files, which the last holder may have changed.
 
     Raises:

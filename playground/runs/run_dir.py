@@ -18,8 +18,8 @@ from playground.runs.provenance import git_state, package_versions
 from playground.settings import Plain, Section, plain
 from playground.text import dump_yaml
 
-_RETURNS = ("final_return", "final_sampled_return", "final_mode_return", "best_return")
-_NUMBERS_OF_SUMMARY = (*_RETURNS, "best_step", "steps", "steps_per_second", "wall_clock_s")
+RETURNS = ("final_return", "final_sampled_return", "final_mode_return", "best_return")
+_NUMBERS_OF_SUMMARY = (*RETURNS, "best_step", "steps", "steps_per_second", "wall_clock_s")
 RunStatus = Literal["running", "finished", "failed", "preempted"]
 
 

@@ -4,13 +4,13 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import jax
 import mujoco
 from jax.stages import Wrapped
 
 from playground import registry
+from playground.config import RunConfig
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
 from playground.hardware.distributed import ending_together, is_main, leave, noting_loss, preflight, share, wait_for_all
@@ -43,13 +43,10 @@ from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.scaling import describe_division, scale_envs
 
-if TYPE_CHECKING:
-  from playground.config import RunConfig
-
 ROWS = 100  # rows of metrics.csv in a run, about: one for each call to the device
 
 
-def train(config: "RunConfig") -> int:
+def train(config: RunConfig) -> int:
   """Runs the training that `config` describes, a single run or a chain of them.
 
   Returns:
@@ -71,7 +68,7 @@ def train(config: "RunConfig") -> int:
       return code
 
 
-def _train(config: "RunConfig", interrupts: Interrupts, began_s: float = 0.0) -> int:
+def _train(config: RunConfig, interrupts: Interrupts, began_s: float = 0.0) -> int:
   """Trains one run; `began_s` is the age of the process at its start, 0 for the first run."""
   plan = RestorePlan.find(config, began_s)
   if not plan.finished:
@@ -128,7 +125,7 @@ class Training:
 
 
 def prepare(
-  configs: "Sequence[RunConfig]", plans: Sequence[RestorePlan], hardware: Hardware, together: bool = False
+  configs: Sequence[RunConfig], plans: Sequence[RestorePlan], hardware: Hardware, together: bool = False
 ) -> Training:
   """Builds task, trainer and schedule, and restores states, before compilation.
 
@@ -175,7 +172,7 @@ def prepare(
 
 
 def _train_locked(
-  config: "RunConfig", interrupts: Interrupts, began_s: float, plan: RestorePlan, hardware: Hardware
+  config: RunConfig, interrupts: Interrupts, began_s: float, plan: RestorePlan, hardware: Hardware
 ) -> int:
   """Trains one run, new or resumed, whose lock this process holds."""
   training = prepare([config], [plan], hardware)
@@ -210,7 +207,7 @@ def _train_locked(
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
 
 
-def open_run(config: "RunConfig", plan: RestorePlan) -> RunDirectory:
+def open_run(config: RunConfig, plan: RestorePlan) -> RunDirectory:
   """Returns the run's directory; makes it for a new run."""
   return plan.run_dir or RunDirectory.create(
     str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
@@ -247,7 +244,7 @@ def cut_short(
 
 
 def model_sampler(
-  env: Env, config: "RunConfig", num_envs: int, num_eval_envs: int
+  env: Env, config: RunConfig, num_envs: int, num_eval_envs: int
 ) -> Callable[[int], tuple[ModelFields, ModelFields]]:
   """Returns the function that draws a run's randomised models.
 

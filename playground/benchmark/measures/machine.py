@@ -2,8 +2,6 @@
 
 import contextlib
 import os
-import shutil
-import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +10,7 @@ import jax
 
 from playground.benchmark.worker import Facts
 from playground.config import compose
+from playground.hardware.gpus import query_gpus
 from playground.hardware.setup import setup
 from playground.runs.provenance import package_versions
 
@@ -71,8 +70,4 @@ def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
 def _query_gpu(field: str) -> str | None:
   """Returns a field of nvidia-smi for the first GPU of this process; None without one."""
   first = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0] or "0"
-  if not shutil.which("nvidia-smi"):
-    return None
-  query = ["nvidia-smi", f"--id={first}", f"--query-gpu={field}", "--format=csv,noheader,nounits"]
-  done = subprocess.run(query, capture_output=True, text=True, timeout=20)
-  return done.stdout.strip() or None if done.returncode == 0 else None
+  return next(iter(query_gpus(field, [f"--id={first}"])), None)

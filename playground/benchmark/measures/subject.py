@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import fcntl
 import functools
 import math
 import time
@@ -19,6 +18,7 @@ from playground.benchmark.worker import Facts
 from playground.config import RunConfig, compose
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
+from playground.files import locking
 from playground.hardware.mesh import put
 from playground.hardware.setup import Hardware, setup
 from playground.learning.trainer import Trainer, trainer_settings
@@ -95,11 +95,7 @@ def _precision(hardware: Hardware, trainer: Trainer) -> str:
 @contextlib.contextmanager
 def alone(lock: str | None) -> Iterator[None]:
   """Locks the device during the block: other measurements may compile, but wait with their timing."""
-  if lock is None:
-    yield
-    return
-  with Path(lock).open("w") as file:
-    fcntl.flock(file, fcntl.LOCK_EX)
+  with contextlib.nullcontext() if lock is None else locking(Path(lock), math.inf):
     yield
 
 
