@@ -3,6 +3,7 @@
 import contextlib
 import gzip
 import importlib.util
+import io
 import shutil
 import socket
 import threading
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from playground.cli.main import main
 from playground.cli.play import open_policy
@@ -93,6 +95,17 @@ def test_a_single_step_pauses(watch: Watch, session: Session) -> None:
   session.carry_out()
   assert session.paused and session.player.seconds == pytest.approx(session.player.period)
   np.testing.assert_allclose(session.qpos(session.player), session.player.state.data.qpos, atol=1e-6)
+
+
+def test_the_floor_is_squares_above_the_plane(watch: Watch, session: Session) -> None:
+  view = watch.panel.view
+  watch.frame()
+  (light, dark), (plane,) = view.squares, view.planes
+  assert not np.array_equal(light.color, dark.color)
+  np.testing.assert_array_equal(light.position, dark.position)
+  assert plane.position[2] < light.position[2] - 0.05  # a nearer one hides them where depth is coarse
+  first_corners = [{tuple(corner) for corner in handle.vertices[::4].tolist()} for handle in view.squares]
+  assert len(first_corners[0]) == len(first_corners[1]) and not first_corners[0] & first_corners[1]
 
 
 def test_what_is_shown(watch: Watch, session: Session) -> None:
@@ -344,6 +357,8 @@ def test_page(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     session = watch.session
     begun = session.player.seconds
     eventually(page, lambda: session.player.seconds != begun)
+    eventually(page, lambda: floor_contrast(page) > 0.05)  # light and dark squares; a plane of one colour has 0.02
+    page.get_by_text("(automatic)").wait_for(timeout=_WAIT)
 
     slider = page.get_by_role("slider").first
     slider.focus()
@@ -396,6 +411,12 @@ def test_page(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
       page.get_by_role("link", name="Go1JoystickFlatTerrain.mp4").click(timeout=2 * _WAIT)
     assert b"ftyp" in Path(download.value.path()).read_bytes()[:16]
     assert complaints == []
+
+
+def floor_contrast(page: Any) -> float:
+  """Difference of the brightest and darkest parts of the floor at the page's lower left, in [0, 1]."""
+  pixels = imread(io.BytesIO(page.screenshot(timeout=_WAIT)))[300:, :200, :3].mean(-1)
+  return float(np.diff(np.percentile(pixels, [5, 95]))[0])
 
 
 def asked(session: Session) -> list[float] | None:

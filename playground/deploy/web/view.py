@@ -39,6 +39,8 @@ class View:
   Attributes:
     shown: whether arrows of velocity and contacts are drawn, the camera follows a robot that walks, the page is dark.
     scene: mjviser's, of the task that is drawn.
+    squares: of the floor, light ones and dark ones; none on a terrain.
+    planes: mjviser's, below the squares.
     arrows: of the commanded and the actual velocity, for a robot that takes commands.
     boxes: the controls of `shown`.
     num_envs: the control of how many environments there are.
@@ -80,7 +82,7 @@ class View:
     for handle, position in self._copies:
       handle.batched_positions = np.delete(places, scene.env_idx, 0) + position
     step = 2 * _SIDE
-    for squares in self._squares:
+    for squares in self.squares:
       squares.position = (*(np.round(data.xpos[self._root, :2] / step) * step), squares.position[2])
     self._draw_velocity(player)
     self._move_cameras()
@@ -128,7 +130,8 @@ class View:
     self._walks = walks(model)
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     self._root = int(model.jnt_bodyid[free[0]]) if len(free) else 0
-    self._squares, self._grids = [], []
+    self.squares: list[viser.MeshHandle] = []
+    self.planes: list[viser.GridHandle] = []
     self._add_floor(model)
     self._places = np.zeros((number, 3))
     if not (model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD).any():  # on a terrain they stand where they are
@@ -154,7 +157,7 @@ class View:
       if isinstance(grid, viser.GridHandle):
         grid.position = grid.position - np.array([0.0, 0.0, _BELOW])
         grid.plane_opacity, grid.cell_thickness, grid.section_thickness, grid.shadow_opacity = 1.0, 0.0, 0.0, 0.0
-        self._grids.append(grid)
+        self.planes.append(grid)
     if len(planes):
       for odd in (False, True):
         squares = self._server.scene.add_mesh_simple(
@@ -165,7 +168,7 @@ class View:
           side="double",
           position=(0.0, 0.0, float(model.geom_pos[planes[0], 2])),
         )
-        self._squares.append(squares)
+        self.squares.append(squares)
 
   def _add_copies(self) -> list[tuple[viser.BatchedGlbHandle, np.ndarray]]:
     """Draws what is fixed to the world once more for each other environment; mjviser draws it once.
@@ -194,9 +197,9 @@ class View:
     """Colours sky and floor, and the page's panels."""
     zenith, horizon, *floor = _COLORS[self.shown["dark"]]
     self._server.scene.set_background_image(_sky(zenith, horizon))
-    for grid in self._grids:
+    for grid in self.planes:
       grid.plane_color = tuple(np.mean(floor, 0).astype(int).tolist())
-    for squares, color in zip(self._squares, floor, strict=False):  # a scene without a plane has no squares
+    for squares, color in zip(self.squares, floor, strict=False):  # a scene without a plane has no squares
       squares.color = color
     dark = self.shown["dark"]
     self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium", dark_mode=dark)
