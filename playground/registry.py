@@ -15,6 +15,7 @@ Classes of any other package are refused unless the user trusts it (`playground.
 
 import functools
 import inspect
+import typing
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol, cast
 
@@ -32,7 +33,8 @@ from playground.config import (
 )
 from playground.envs.options import sees
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.settings import Section
+from playground.settings import Section, problem
+from playground.text import format_value
 from playground.trust import trusted_object
 
 if TYPE_CHECKING:
@@ -94,8 +96,13 @@ def load(
 
 def build(env_config: TaskConfig) -> "Env":
   """Builds the task that a composed env section describes, with a camera if `env.vision` enables it."""
-  make = cast("Callable[[ConfigDict], Env]", task_class(str(env_config.task)))
-  env = make(env_config)
+  cls = task_class(str(env_config.task))
+  for name, hint in typing.get_type_hints(cls.keys, include_extras=True).items():
+    if name not in env_config:
+      raise ConfigError(f"env.{name} is missing: {cls.__name__} needs it.")
+    if wanted := problem(env_config[name], hint):
+      raise ConfigError(f"env.{name}={format_value(env_config[name])} must be {wanted}.")
+  env = cast("Callable[[ConfigDict], Env]", cls)(env_config)
   if not sees(env_config):
     return env
   from playground.rendering.vision import Vision

@@ -16,7 +16,7 @@ from ml_collections import ConfigDict
 
 import playground
 from playground import registry, trust
-from playground.config import compose, config_roots, options
+from playground.config import compose, config_dict, config_roots, options
 from playground.config.files import lineage
 from playground.envs.wrappers import wrap_for_evaluation
 from playground.errors import ConfigError, UnknownNameError
@@ -183,6 +183,31 @@ def test_terms_of_any_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
   env = built(override)
   assert (env.rewards.terms[-1].name, env.rewards.terms[-1].params) == ("mine", {"factor": 2})
   assert "reward/mine" in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
+
+
+def test_a_task_of_any_package_limits_its_own_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  (tmp_path / "my_task.py").write_text("""
+from playground.envs.dm_control.cartpole import Cartpole
+from playground.limits import Positive
+
+class Keys:
+  rail_length: Positive
+  tags: list[str]
+
+class Long(Cartpole):
+  keys = Keys
+""")
+  monkeypatch.syspath_prepend(tmp_path)
+  monkeypatch.setattr(trust, "_named", {"my_task"})
+  config = {**registry.config("CartpoleBalance").to_dict(), "task": "my_task:Long", "tags": ["a"]}
+  build: Any = lambda values: registry.build(config_dict(values))
+  with pytest.raises(ConfigError, match=r"^env\.rail_length is missing: Long needs it"):
+    build(config)
+  with pytest.raises(ConfigError, match=r"^env\.rail_length=-1 must be a number above 0"):
+    build(config | {"rail_length": -1})
+  with pytest.raises(ConfigError, match=r"^env\.tags=3 must be a list of texts"):
+    build(config | {"rail_length": 2.0, "tags": 3})
+  assert build(config | {"rail_length": 2.0}).config.rail_length == 2.0
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,8 @@ class Env(abc.ABC):
   episode_info: ClassVar[tuple[str, ...]] = ()
   # Names of the managers, which are those of their sections: numbers there may be arguments of compiled programs.
   managers: ClassVar[tuple[str, ...]] = ()
+  # A class that annotates keys of the config with their limits (`reach: Positive`), which `registry.build` checks.
+  keys: ClassVar[type] = object
   # Whether `redraw(info, key)` draws entries of `info` for an episode that an auto-reset starts from a stored state.
   redraws: bool = False
 
