@@ -113,7 +113,9 @@ def jit_on_mesh(
     function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
   )
   mapped = over_mesh(function) if mesh.size == 1 else _without_empty_arrays(function, over_mesh)
-  return jax.jit(mapped, in_shardings=ins, out_shardings=outs, donate_argnums=donate_argnums)
+  # An argument that is not used, such as an empty array, would lose its sharding in a stored program.
+  keep = mesh.size > 1
+  return jax.jit(mapped, in_shardings=ins, out_shardings=outs, donate_argnums=donate_argnums, keep_unused=keep)
 
 
 def _without_empty_arrays(function: Callable[..., PyTree], over_mesh: Callable[..., PyTree]) -> Callable[..., PyTree]:

@@ -1,6 +1,8 @@
 """Functions on disk: they compute the same, and what is damaged or not the user's own is not read."""
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from jax.stages import Wrapped
 from playground.hardware.mesh import AXIS, jit_on_mesh, make_mesh
 from playground.learning import stored_program
 from playground.learning.stored_program import LoweredFunction, StoredProgram, UnusableProgramError
+from tests.processes import ROOT, WITHOUT_WARP
 
 MESH = make_mesh(1)
 ARGUMENTS = ({"x": jnp.arange(4.0), "empty": {}}, jnp.float32(3))
@@ -82,3 +85,24 @@ def test_programs_that_were_not_used_for_longest_go(stored: StoredProgram, monke
   stored.load()
   StoredProgram(paths[2]).save({})
   assert [path.exists() for path in paths] == [True, False, True]
+
+
+TWO_DEVICES = """
+import jax.numpy as jnp, numpy as np
+from jax.sharding import PartitionSpec as P
+from playground.hardware.mesh import AXIS, jit_on_mesh, make_mesh, put
+from playground.learning.stored_program import LoweredFunction
+
+mesh, tree = make_mesh(2), {"x": jnp.arange(4.0), "empty": jnp.zeros((4, 0))}
+function = jit_on_mesh(lambda tree: tree | {"x": 2 * tree["x"]}, mesh, (P(AXIS),), P(AXIS), donate_argnums=0)
+stored = LoweredFunction.of(function, function.trace(tree), tree).compile(mesh)
+result = stored(stored(put(tree, mesh, P(AXIS))))
+np.testing.assert_array_equal(result["x"], 4 * np.arange(4.0))
+assert result["empty"].shape == (4, 0) and result["empty"].sharding.spec == P(AXIS)
+"""
+
+
+def test_over_several_devices_empty_arrays_stay_divided():
+  env = os.environ | WITHOUT_WARP | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
+  done = subprocess.run([sys.executable, "-c", TWO_DEVICES], cwd=ROOT, env=env, capture_output=True, text=True)
+  assert done.returncode == 0, done.stderr[-2000:]
