@@ -31,7 +31,7 @@ from playground.config import (
   override_section,
   task_names,
 )
-from playground.envs.options import sees
+from playground.envs.options import uses_vision
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.settings import Section, problem
 from playground.text import format_value
@@ -103,7 +103,7 @@ def build(env_config: TaskConfig) -> "Env":
     if wanted := problem(env_config[name], hint):
       raise ConfigError(f"env.{name}={format_value(env_config[name])} must be {wanted}.")
   env = cast("Callable[[ConfigDict], Env]", cls)(env_config)
-  if not sees(env_config):
+  if not uses_vision(env_config):
     return env
   from playground.rendering.vision import Vision
 

@@ -140,7 +140,7 @@ class PushCube(NoForward, push.PushCube):
 
 def applied_action_rate_norm(c: ArmContext) -> jax.Array:
   """|action - the action that acted in the step before|."""
-  return jnp.linalg.norm(c.action - c.carried("applied_act"))
+  return jnp.linalg.norm(c.action - c.info["applied_act"])
 
 
 def joint_pos_out_of_scaled_limits(c: ArmContext, factor: float) -> jax.Array:

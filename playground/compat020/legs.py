@@ -49,7 +49,7 @@ def feet_air_time_unless_turning(c: LeggedContext, threshold: float) -> jax.Arra
 
 def is_terminated_early(c: LeggedContext) -> jax.Array:
   """As `is_terminated`, but 0 in the last two steps of a command of 501 (Barkour, OP3)."""
-  return rewards.is_terminated(c) * (c.carried("command_steps_left") > 1)
+  return rewards.is_terminated(c) * (c.info["command_steps_left"] > 1)
 
 
 def action_smoothness_l2_lagged(c: StepContext) -> jax.Array:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from playground.config.definitions import chosen_names, definition
 from playground.config.schema import is_of_terms
-from playground.envs.options import sees
+from playground.envs.options import uses_vision
 from playground.errors import ConfigError
 from playground.limits import Limit
 from playground.settings import Plain, Section, check_value
@@ -56,7 +56,7 @@ def _check_order(node: Section, key: str) -> None:
 def check_vision(said: Iterable[str], resolved: Section) -> None:
   """Raises ConfigError where a command line (its keys are `said`) sets `env.vision` of a task without vision."""
   unused = [key for key in said if key.startswith("env.vision.") and key != "env.vision.enable"]
-  if unused and not sees(resolved["env"]):
+  if unused and not uses_vision(resolved["env"]):
     raise ConfigError(f"{unused[0]}: this task sees nothing. Add env.vision.enable=true env.vision.camera=<name>.")
 
 

@@ -12,7 +12,7 @@ from playground.deploy.contract import Contract
 from playground.deploy.policy import Seen
 from playground.envs.base import Env, Observation
 from playground.envs.c_physics import on_c_physics
-from playground.envs.options import sees
+from playground.envs.options import uses_vision
 from playground.errors import lookup
 from playground.hardware.setup import setup, this_machine
 from playground.randomization import Randomizer
@@ -77,7 +77,7 @@ def build_task(
   """
   setup(this_machine(compose(["hardware=cpu"]).hardware))
   config: Any = config_dict(compose([f"env={task}", *overrides]).env)
-  config.impl = "warp" if sees(config) else "jax"  # the smallest model to build; it is not simulated
+  config.impl = "warp" if uses_vision(config) else "jax"  # the smallest model to build; it is not simulated
   for event in config.events.values():
     if event is not None and event.get("mode") == "interval" and not interval_events:
       event.enabled = False

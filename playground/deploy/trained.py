@@ -14,7 +14,7 @@ from playground.deploy.graph import policy_graph
 from playground.deploy.policy import ExportedPolicy
 from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
-from playground.envs.options import sees
+from playground.envs.options import uses_vision
 from playground.envs.wrappers import wrap_for_training
 from playground.extras import need
 from playground.runs.csv_tracker import read_metrics
@@ -99,5 +99,5 @@ def load_on_c_physics(task: str, config: Section | ConfigDict) -> Env:
     ConfigError: the task has images, and MuJoCo-Warp, which renders them, is not installed.
   """
   own = config_dict(config)
-  own.impl = "warp" if sees(own) else "jax"  # the smallest model to build; it is not simulated
+  own.impl = "warp" if uses_vision(own) else "jax"  # the smallest model to build; it is not simulated
   return on_c_physics(registry.load(task, config=own))

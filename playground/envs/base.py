@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from playground.envs.options import auto_impl, sees
+from playground.envs.options import auto_impl, uses_vision
 from playground.errors import ConfigError
 from playground.mdp.traced import traced_settings
 from playground.physics.backend import DERIVED_FIELDS, Physics, PhysicsData, mjx
@@ -81,7 +81,7 @@ class Env(abc.ABC):
     self.action_repeat: int = config.action_repeat
     mj_model.opt.timestep = self.sim_dt
     self.mj_model = mj_model
-    self.impl = choose_impl(config.impl, config.cuda_impl, sees(config))
+    self.impl = choose_impl(config.impl, config.cuda_impl, uses_vision(config))
     buffers = {name: config[name] for name in ("naconmax_per_env", "naccdmax_per_env", "njmax")}
     self.physics = Physics(mj_model, impl=self.impl, derived=self.derived, **buffers)
 
@@ -173,14 +173,14 @@ class Env(abc.ABC):
     return self
 
 
-def newest_picture(env: Env, obs: Observation) -> jax.Array | None:
+def newest_image(env: Env, obs: Observation) -> jax.Array | None:
   """The newest frame of an observation's first camera, [..., H, W, 1 or 3] uint8; None without images."""
   cameras = sorted(key for key in obs if key.startswith(PIXELS)) if isinstance(obs, Mapping) else []
   if not cameras:
     return None
-  pictures = obs[cameras[0]]
+  images = obs[cameras[0]]
   frames = len(env.observation_parts.get(cameras[0], {})) or 1
-  return pictures[..., -(pictures.shape[-1] // frames) :]
+  return images[..., -(images.shape[-1] // frames) :]
 
 
 def choose_impl(impl: str, cuda_impl: str, renders: bool = False) -> str:

@@ -214,14 +214,14 @@ class TaskKeys:
   links: Annotated[int, count(3, 1000), "links of the body"]
 
 
-def sees(env: Mapping[str, Any]) -> bool:
+def uses_vision(env: Mapping[str, Any]) -> bool:
   """Whether a task of this `env` config observes images."""
   return "vision" in env and env["vision"]["enable"]
 
 
 def impl_on_gpu(env: Mapping[str, Any]) -> str:
   """The backend that an `env` config chooses on an NVIDIA GPU."""
-  return auto_impl(env["cuda_impl"], sees(env), on_gpu=True) if env["impl"] == "auto" else env["impl"]
+  return auto_impl(env["cuda_impl"], uses_vision(env), on_gpu=True) if env["impl"] == "auto" else env["impl"]
 
 
 def auto_impl(cuda_impl: str, renders: bool, on_gpu: bool) -> str:

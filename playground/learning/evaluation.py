@@ -9,7 +9,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jax.stages import Wrapped
 
-from playground.envs.base import Env, Observation, State, newest_picture
+from playground.envs.base import Env, Observation, State, newest_image
 from playground.envs.wrappers import ModelFields, wrap_for_evaluation
 from playground.hardware.mesh import AXIS, jit_on_mesh
 from playground.learning.algorithm import Policy
@@ -76,7 +76,7 @@ def make_evaluator(
 
     def view(state: State, active: jax.Array) -> dict[str, jax.Array]:
       shown = {name: getattr(state.data, name) for name in ("qpos", "mocap_pos", "mocap_quat")}
-      picture = newest_picture(env, state.obs)
+      picture = newest_image(env, state.obs)
       shown |= {} if picture is None else {"seen": picture}
       return jax.tree.map(lambda x: x[:num_recorded], shown | {"active": active})
 

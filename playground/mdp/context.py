@@ -93,6 +93,13 @@ class Robot:
         self.find(kind, params[kind], f"{key}.{kind}")
 
 
+class _Info(dict[str, Any]):
+  """Entries of `info`, of which a missing one is an error of the configuration."""
+
+  def __missing__(self, name: str) -> Any:
+    raise ConfigError(f"it reads info[{name!r}], which this task does not have; a command or an event must write it.")
+
+
 class StepContext:
   """One environment after one control step, before the bookkeeping for the next. Arrays have no batch axis.
 
@@ -100,7 +107,7 @@ class StepContext:
     env: the task: its model and control step `dt`.
     robot: the robot's constants.
     data: the physics after the step.
-    info: the `info` of the task during the step.
+    info: the `info` of the task during the step; an entry that it does not have raises ConfigError.
     action: the action just applied, shape [action_size].
     dt: time since the step before, s; 0 at the start of an episode.
   """
@@ -110,7 +117,7 @@ class StepContext:
   ):
     self.env, self.robot = env, env.robot
     self.data = data
-    self.info = info
+    self.info: Mapping[str, Any] = _Info(info)
     self.action = action
     self.dt = env.dt if dt is None else dt
 
@@ -153,13 +160,7 @@ class StepContext:
   @mirrors_as("command")
   def command(self) -> jax.Array:
     """Velocity command: forward m/s, left m/s, turn rad/s [3]."""
-    return self.carried("command")
-
-  def carried(self, name: str) -> jax.Array:
-    """Returns an entry of `info`; raises ConfigError if the task does not have it."""
-    if name not in self.info:
-      raise ConfigError(f"it reads info[{name!r}], which this task does not have; a command or an event must write it.")
-    return self.info[name]
+    return self.info["command"]
 
   def sensor(self, name: str) -> jax.Array:
     """Returns the reading of a sensor; see `Robot.sensor`."""

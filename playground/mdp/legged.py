@@ -163,19 +163,19 @@ class LeggedContext(StepContext):
   @mirrors_as("feet")
   def feet_air_time(self) -> jax.Array:
     """How long each foot has been in the air, this step included, s [feet]."""
-    return self.carried("feet_air_time") + self.dt
+    return self.info["feet_air_time"] + self.dt
 
   @functools.cached_property
   @mirrors_as("feet")
   def swing_peak(self) -> jax.Array:
     """Highest z of each foot since it last touched, m [feet]."""
-    return jnp.maximum(self.carried("swing_peak"), self.feet_height)
+    return jnp.maximum(self.info["swing_peak"], self.feet_height)
 
   @property
   @mirrors_as("feet")
   def first_contact(self) -> jax.Array:
     """Which feet have landed, bool [feet]: one that touched in the step before but left since has, too."""
-    return (self.carried("feet_air_time") > 0) & (self.contact | self.carried("last_contact"))
+    return (self.info["feet_air_time"] > 0) & (self.contact | self.info["last_contact"])
 
   @property
   def still(self) -> jax.Array:
@@ -185,7 +185,7 @@ class LeggedContext(StepContext):
   @property
   def phase(self) -> jax.Array:
     """Phases of the feet in the gait, rad [feet]."""
-    return self.carried("phase")
+    return self.info["phase"]
 
   @property
   @mirrors_as("polar")

@@ -171,7 +171,7 @@ class ArmContext(StepContext):
   def reached(self) -> jax.Array:
     """1 from the step on in which the gripper first reached the object in this episode, else 0."""
     near = jnp.linalg.norm(self.object_pos - self.gripper_pos) < _REACH
-    return jnp.maximum(self.carried("reached_box"), near.astype(jnp.float32))
+    return jnp.maximum(self.info["reached_box"], near.astype(jnp.float32))
 
 
 class HandContext(StepContext):

@@ -28,9 +28,9 @@ def _sensor(name: str, what: str, mirror: MirrorKind | None = None) -> Observe:
   return _reads(what, lambda c: c.sensor(name), mirror)
 
 
-def _carried(name: str, what: str, mirror: MirrorKind | None = None) -> Observe:
+def _from_info(name: str, what: str, mirror: MirrorKind | None = None) -> Observe:
   """Returns the term that reads an entry of `info`."""
-  return _reads(what, lambda c: c.carried(name), mirror)
+  return _reads(what, lambda c: c.info[name], mirror)
 
 
 def _reads(what: str, read: Observe, mirror: MirrorKind | None = None) -> Observe:
@@ -75,11 +75,11 @@ global_angvel = _sensor("global_angvel", "Angular velocity of the base in the wo
 upvector = _sensor(
   "upvector", "The base's upward axis in the world frame [3]: unlike `gravity`, it has the heading.", "polar"
 )
-last_contact = _carried("last_contact", "Which feet touched the floor in the step before, 0 or 1 [feet].", "feet")
-gait = _carried("gait", "Index of the episode's gait in the modes of the gait command [1].", "same")
-gait_frequency = _carried("gait_freq", "Frequency of the gait's steps, Hz [1].", "same")
-foot_height = _carried("foot_height", "Highest swing of the feet in this episode's gait, m [1].", "same")
-pushed = _carried("pushing", "Whether a push is under way, 0 or 1 [1].", "same")
+last_contact = _from_info("last_contact", "Which feet touched the floor in the step before, 0 or 1 [feet].", "feet")
+gait = _from_info("gait", "Index of the episode's gait in the modes of the gait command [1].", "same")
+gait_frequency = _from_info("gait_freq", "Frequency of the gait's steps, Hz [1].", "same")
+foot_height = _from_info("foot_height", "Highest swing of the feet in this episode's gait, m [1].", "same")
+pushed = _from_info("pushing", "Whether a push is under way, 0 or 1 [1].", "same")
 root_height = _reads("World z of the root joint, m [1].", lambda c: c.data.qpos[2], "same")
 root_pos = _reads("World position of the root joint, m [3].", lambda c: c.data.qpos[:3], "polar")
 root_quat = _reads(
@@ -107,10 +107,10 @@ def push_force(c: LeggedContext) -> jax.Array:
 
 # Arms at a table.
 
-applied_action = _carried(
+applied_action = _from_info(
   "applied_act", "The action that acted in the step before, late (task PushCube) [action_size]."
 )
-no_ik_solution = _carried("no_solution", "1 where inverse kinematics found no joint angles for the last action [1].")
+no_ik_solution = _from_info("no_solution", "1 where inverse kinematics found no joint angles for the last action [1].")
 
 
 def servo_error(c: ArmContext) -> jax.Array:
@@ -169,7 +169,7 @@ fingertip_pos = _sensor("fingertip_pos", "Positions of the fingertips in the fra
 cube_quat = _sensor("cube_orientation", "The cube's orientation, a quaternion w, x, y, z [4].")
 cube_linvel = _sensor("cube_linvel", "World velocity of the cube, m/s [3].")
 cube_angvel = _sensor("cube_angvel", "World angular velocity of the cube, rad/s [3].")
-push_direction = _carried("push_direction", "Unit vector of the last push's force and torque on the cube [6].")
+push_direction = _from_info("push_direction", "Unit vector of the last push's force and torque on the cube [6].")
 
 
 def sensed_cube_pos_error(c: HandContext) -> jax.Array:

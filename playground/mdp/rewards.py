@@ -144,7 +144,7 @@ def lin_vel_z_l2(c: LeggedContext, sensors: Sequence[str] = ("global_linvel",)) 
 def lin_vel_z_l2_in_gaits(c: LeggedContext, gaits: Sequence[str]) -> jax.Array:
   """v_z² in the world frame while the episode's gait is one of those; 0 in the others, in which the base flies."""
   level = jnp.array([mode in gaits for mode in c.env.config.commands.gait.params.modes])
-  return lin_vel_z_l2(c) * level[c.carried("gait")]
+  return lin_vel_z_l2(c) * level[c.info["gait"]]
 
 
 def lin_vel_xy_l2(c: LeggedContext) -> jax.Array:
@@ -304,7 +304,7 @@ def feet_phase_exp(c: LeggedContext, std: Positive, peak: Positive | None = None
 
   `peak` is the highest swing, m; None is the `foot_height` that the gait command draws for an episode.
   """
-  peaks = c.carried("foot_height") if peak is None else peak
+  peaks = c.info["foot_height"] if peak is None else peak
   error = jnp.square(c.feet_height - swing_height(c.phase, peaks)).sum()
   return jnp.exp(-error / std**2)
 
@@ -442,7 +442,7 @@ def joint_vel_within_limits(c: ArmContext, limits: Sequence[float]) -> jax.Array
 
 def no_ik_solution(c: ArmContext) -> jax.Array:
   """1 where the arm cannot go where the action sends it (task PickCubeCartesian)."""
-  return c.carried("no_solution")
+  return c.info["no_solution"]
 
 
 # Hands with a cube.

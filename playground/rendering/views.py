@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from playground.envs.base import PIXELS, Env, newest_picture
+from playground.envs.base import PIXELS, Env, newest_image
 from playground.envs.wrappers import Vectorize
 from playground.errors import ConfigError
 from playground.files import need_file, replacing
@@ -43,7 +43,7 @@ def save_views(env: Env, events: Mapping[str, object], path: str | Path, count: 
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
   model = Randomizer(env.mj_model, events).sample_batch(jax.random.split(model_key, count))
   state = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)
-  page = sheet(np.asarray(newest_picture(env, state.obs)))
+  page = sheet(np.asarray(newest_image(env, state.obs)))
   path.parent.mkdir(parents=True, exist_ok=True)
   with replacing(path) as temporary:
     matplotlib.image.imsave(temporary, page)

@@ -45,7 +45,7 @@ class HandOver(ProgressTask, Bimanual):
 
 def dropped(c: ArmContext) -> jax.Array:
   """The box is down after it was picked up in this episode."""
-  return (c.carried("picked") | (c.object_pos[2] > _LIFTED)) & (c.object_pos[2] < _FALLEN)
+  return (c.info["picked"] | (c.object_pos[2] > _LIFTED)) & (c.object_pos[2] < _FALLEN)
 
 
 def grippers_at_box_exp(c: ArmContext) -> jax.Array:
