@@ -134,7 +134,7 @@ def test_the_readmes_returns_are_those_of_the_reference_tables():
       values = [value for name, value in row.items() if value and (name == "value" or "return" in str(name))]
       returns.setdefault(row["task"], []).extend(float(value) for value in values if re.fullmatch(r"-?[\d.]+", value))
   section = README.read_text(encoding="utf-8").split("## Results")[1].split("\n## ")[0]
-  rows = re.findall(r"^\| ([A-Z][a-zA-Z]+\w*)( from pixels)?[^|]*\| ([^|]*) \|[^|]*\| ([^|]*) \|$", section, re.M)
+  rows = re.findall(r"^\| ([A-Z]\w+)( from pixels)?[^|]*\| ([^|]*) \|[^|]*\| ([^|]*) \|$", section, re.M)
   assert len(rows) >= 8
   for task, vision, *cells in rows:
     for number in (found[0] for cell in cells if (found := re.match(r"[\d.]+", cell))):
