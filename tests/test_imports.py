@@ -59,6 +59,14 @@ def test_the_product_does_not_import_the_benchmark() -> None:
   assert not [name for name in product if any(other.startswith(allowed) for other in GRAPH[name])]
 
 
+def test_nothing_names_the_package_of_0_2_0() -> None:
+  """Deleting playground/compat020 and its entry point deletes the feature and nothing else."""
+  files = [*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.yaml"), *(PACKAGE.parent / "configs").rglob("*.yaml")]
+  rest = [file for file in files if PACKAGE / "compat020" not in file.parents]
+  assert len(rest) < len(files)
+  assert [file for file in rest if "compat020" in file.read_text(encoding="utf-8")] == []
+
+
 def test_imports_between_files_form_no_circle() -> None:
   assert circle(str) == []
 
