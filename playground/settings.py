@@ -214,7 +214,7 @@ def _setting(name: str, hint: Any, default: object) -> Iterator[Setting]:
   depths = [_text_depth(option) for option in options]
   mappings = [option for option in options if get_origin(option) is Mapping]
   limit = next((entry for entry in metadata if isinstance(entry, Limit)), None)
-  said = next((entry for entry in metadata if isinstance(entry, str)), "")
+  text = next((entry for entry in metadata if isinstance(entry, str)), "")
   yield Setting(
     name=name,
     default=default,
@@ -222,7 +222,7 @@ def _setting(name: str, hint: Any, default: object) -> Iterator[Setting]:
     choices=next((get_args(option) for option in options if get_origin(option) is Literal), None),
     text_depth=next((depth for depth in depths if depth is not None), None),
     nullable=type(None) in options,
-    help=said,
+    help=text,
   )
   for option in options:
     if dataclasses.is_dataclass(option) and isinstance(option, type):
@@ -231,7 +231,7 @@ def _setting(name: str, hint: Any, default: object) -> Iterator[Setting]:
     if is_typeddict(value):
       yield from _settings(value, f"{name}.*.")
     else:
-      yield Setting(f"{name}.*", dataclasses.MISSING, limit, None, _text_depth(value), False, said)
+      yield Setting(f"{name}.*", dataclasses.MISSING, limit, None, _text_depth(value), False, text)
 
 
 def _default(field: "dataclasses.Field[object]", hint: object) -> object:

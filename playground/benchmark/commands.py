@@ -236,7 +236,7 @@ class BesidePeer(OfTasks):
     check_peer(self.peer, self.peer_python, self.peer_path, self.peer_menagerie)
 
   def peer_job(
-    self, measure: str, quantity: str, task: str, setting: Sequence[str], **arguments: object
+    self, measure: str, quantity: str, task: str, setting: Sequence[str], /, **arguments: object
   ) -> Measurement:
     """A measurement of the peer; overrides are of our run and do not reach it."""
     peer = {"name": self.peer, "python": self.peer_python, "path": self.peer_path, "menagerie": self.peer_menagerie}
@@ -291,7 +291,7 @@ class Learning(BesidePeer, OfRuns):
         for backend in self.backends:
           setting = [f"env.impl={backend}", *self.budget()]
           of_it = {"agent": self.agent, "num_timesteps": self.num_timesteps, "backend": backend, "seeds": [seed]}
-          of_it["told"] = [*self.overrides, *setting]
+          of_it["setting"] = [*self.overrides, *setting]
           jobs.append(self.peer_job("peer:whole", "final_return", task, setting, **of_it))
     return jobs
 
@@ -307,7 +307,7 @@ def run(command: Measuring) -> int:
   command.check()
   table = Table(Path(command.out) if command.out else RESULTS / f"{command.name}.csv")
   hardware = [text for text in command.overrides if text.startswith("hardware")]
-  devices, facts = probe(hardware, command.gpus)
+  devices, machine = probe(hardware, command.gpus)
   jobs = command.jobs(devices)  # raises for invalid options, before any output
-  print(f"{devices} x {facts['device']}; {facts['versions']}")
-  return run_jobs(jobs, table, facts, command)
+  print(f"{devices} x {machine['device']}; {machine['versions']}")
+  return run_jobs(jobs, table, machine, command)

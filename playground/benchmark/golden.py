@@ -62,13 +62,13 @@ def run(options: Options) -> int:
   chosen = [lookup(runs, name, "only") for name in options.only] or list(runs.values())
   jobs = [measurement(each, options) for each in chosen]
   table = Table(Path(options.out or "results/benchmarks/golden.csv"))
-  devices, facts = probe([text for text in options.overrides if text.startswith("hardware")], options.gpus)
-  print(f"{devices} x {facts['device']}; {facts['versions']}")
+  devices, machine = probe([text for text in options.overrides if text.startswith("hardware")], options.gpus)
+  print(f"{devices} x {machine['device']}; {machine['versions']}")
   earlier = len(table.rows())
-  code = run_jobs(jobs, table, facts, options)
+  code = run_jobs(jobs, table, machine, options)
   rows = table.rows(earlier if options.rerun else 0)
   outside = [
-    name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job, facts["device"]))
+    name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job, machine["device"]))
   ]
   if outside:
     print(f"error: outside of their windows: {', '.join(each.name for each in outside)}.", file=sys.stderr)

@@ -72,7 +72,7 @@ class Plan:
   note: Annotated[str, "added to the conditions of every row"] = ""
 
 
-class _Rows(View):
+class _RowView(View):
   """Passes on each row as soon as its measurement prints it, and prints the reasons of failures."""
 
   def __init__(self, sweep: SweepDirectory, measurements: Sequence[Measurement], add: Add):
@@ -113,7 +113,7 @@ class _Rows(View):
     return "\n".join([state.reason, *[line for line in lines if line.strip() and not line.startswith(ROW)][-TAIL:]])
 
 
-def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int, _Rows]:
+def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int, _RowView]:
   """Runs measurements; returns the runner's exit code and their states."""
   gpus = list(map(str, plan.gpus)) or [ALL]
   slots = [Slot(number, gpus[number % len(gpus)], ()) for number in range(plan.workers)]
@@ -126,7 +126,7 @@ def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int
       payload |= {"measure": each.measure, "arguments": dict(each.arguments), "folder": str(folder / "jobs" / name)}
       jobs.append(Job(name, [json.dumps(payload)], {}))
     sweep = SweepDirectory.create(folder, "benchmark", [], [], [], jobs)
-    rows = _Rows(sweep, measurements, add)
+    rows = _RowView(sweep, measurements, add)
     launch = LocalLauncher(sweep, LocalConfig(grace=GRACE_S), WORKER, slots)
     with contextlib.closing(launch) as launcher:
       code = Runner(sweep, launcher, rows, seconds=plan.minutes and 60 * plan.minutes).run()
@@ -152,19 +152,19 @@ def probe(overrides: Sequence[str], gpus: Sequence[int]) -> tuple[int, dict[str,
   return int(found[0]["value"]), {name: found[0][name] for name in ("device", "versions")}
 
 
-def run_jobs(measurements: Sequence[Measurement], table: Table, facts: Mapping[str, str], plan: Plan) -> int:
+def run_jobs(measurements: Sequence[Measurement], table: Table, machine: Mapping[str, str], plan: Plan) -> int:
   """Runs the measurements that the table lacks.
 
   Returns:
     0 when the table is complete, 1 after a failure, 3 when the time was up, 130 or 143 when interrupted.
   """
-  todo = [left for each in measurements if (left := each if plan.rerun else each.left(table, facts["device"]))]
+  todo = [left for each in measurements if (left := each if plan.rerun else each.left(table, machine["device"]))]
   if len(todo) < len(measurements):
     there = len(measurements) - len(todo)
     print(f"{there} of {len(measurements)} are in {table.path} already (rerun=true measures them again).")
   remarks = [f"{plan.workers} processes at once, one timed at a time on a device"] if plan.workers > 1 else []
   remarks += ["caches of earlier runs" if plan.cache else "cold caches", " ".join(plan.note.split())]
-  shared = {**facts, "commit": plan.commit or commit_of(git_state())}
+  shared = {**machine, "commit": plan.commit or commit_of(git_state())}
 
   def add(measurement: Measurement, row: Row) -> None:
     conditions = "; ".join(part for part in (row.get("conditions", ""), *remarks) if part)

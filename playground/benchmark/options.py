@@ -120,6 +120,6 @@ class OfRuns(OfTasks):
   def whole_run(self, task: str, agent: str, seed: int, setting: Sequence[str] = ()) -> Measurement:
     """Returns a measurement of a whole training."""
     setting = [*setting, *self.budget()]
-    told = [*self.overrides, *setting]
-    arguments = {"task": task, "agent": agent, "overrides": told, "told": told, "seeds": [seed]}
+    texts = [*self.overrides, *setting]
+    arguments = {"task": task, "agent": agent, "overrides": texts, "setting": texts, "seeds": [seed]}
     return Measurement("runs:whole", arguments, self.columns(task, agent, setting), {"quantity": "final_return"})

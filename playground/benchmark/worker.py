@@ -14,7 +14,7 @@ ROW = "ROW "  # a line with a row begins with it; other lines are the libraries'
 CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")
 
 
-class Facts(dict[str, object]):
+class Rows(dict[str, object]):
   """Columns that all rows of a measurement share, and the function that emits one.
 
   Attributes:
@@ -34,20 +34,20 @@ def main() -> None:
   from playground.files import write_json
 
   job = json.loads(sys.argv[1])
-  arguments, folder, facts = job["arguments"], Path(job["folder"]), Facts()
+  arguments, folder, rows = job["arguments"], Path(job["folder"]), Rows()
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # else a GPU appears full from the start
   if not job["cache"]:
     os.environ |= {name: str(folder / name) for name in CACHES}
   if job["shares"]:  # with the measurements that see the same GPUs
     gpus = re.sub(r"\W", "_", os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
-    facts.lock = str(folder.parent / f"gpu{gpus}.lock")
+    rows.lock = str(folder.parent / f"gpu{gpus}.lock")
   module, _, function = job["measure"].partition(":")
   try:
     with gc_paused(stays=True):
       if module == "training":  # in this process
         _prestart(**arguments)
       measure = getattr(importlib.import_module(f"playground.benchmark.measures.{module}"), function or "measure")
-    measure(facts, **arguments)
+    measure(rows, **arguments)
   except PlaygroundError as error:
     write_json(folder / "status.json", {"status": "failed", "reason": " ".join(str(error).split())})
     sys.exit(2)

@@ -108,7 +108,7 @@ def budget(curriculum: CurriculumConfig, stage: str, default: int) -> int:
   return max(1, round(scale * (default if own is None else own))) if scale else default
 
 
-def fresh_starts(curriculum: CurriculumConfig, parsed: Sequence[Override], default: int) -> int:
+def resets_per_eval(curriculum: CurriculumConfig, parsed: Sequence[Override], default: int) -> int:
   """Returns `agent.num_resets_per_eval` of a stage: fewer in a shortened chain, to cover as much of an episode.
 
   Args:

@@ -20,10 +20,10 @@ def keys_and_comments(text: str) -> Iterator[tuple[str, str, str]]:
 
 def meaning(setting: Setting | None, comment: str) -> str:
   """Returns the help of a key and what the comment of a file adds to it."""
-  said = setting.help if setting else ""
-  if said in comment or comment in said:
-    return max(said, comment, key=len)
-  return f"{said} ({comment})"
+  text = setting.help if setting else ""
+  if text in comment or comment in text:
+    return max(text, comment, key=len)
+  return f"{text} ({comment})"
 
 
 def flow(value: object) -> str:
@@ -40,12 +40,12 @@ def _keys(node: yaml.Node | None, lines: list[str], prefix: str = "") -> Iterato
     section = isinstance(value, yaml.MappingNode) and not value.flow_style
     in_block = not section and not value.end_mark.column  # a list over several lines ends where the next key begins
     beside = _beside(lines, key.end_mark if section or in_block else value.end_mark)
-    said = " ".join([*_above(lines, key.start_mark), *beside])
+    comment = " ".join([*_above(lines, key.start_mark), *beside])
     if section:
-      yield from [(name, "", said)] if said else []
+      yield from [(name, "", comment)] if comment else []
       yield from _keys(value, lines, f"{name}.")
     else:
-      yield name, flow(yaml.safe_load(yaml.serialize(value))), said
+      yield name, flow(yaml.safe_load(yaml.serialize(value))), comment
 
 
 def _above(lines: list[str], key: yaml.Mark) -> list[str]:

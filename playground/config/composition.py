@@ -22,8 +22,8 @@ from playground.config.chains import (
   SINGLE_RUN,
   budget,
   check_chain,
-  fresh_starts,
   in_stage,
+  resets_per_eval,
   stage_folders,
   stage_overrides,
 )
@@ -282,7 +282,7 @@ def _compose_stage(
     stage = _compose_new(parsed, files, roots)
   lengths = {
     "num_timesteps": budget(chain.curriculum, name, stage.agent.num_timesteps),
-    "num_resets_per_eval": fresh_starts(chain.curriculum, parsed, stage.agent.num_resets_per_eval),
+    "num_resets_per_eval": resets_per_eval(chain.curriculum, parsed, stage.agent.num_resets_per_eval),
   }
   own = {"name": f"{chain.name}/{name}", "choices": {**stage.choices, "curriculum": "none"}, "curriculum": SINGLE_RUN}
   own |= {"agent": {**stage.resolved["agent"], **lengths}, "run_dir": None, "init_from": None}

@@ -53,9 +53,9 @@ def _check_order(node: Section, key: str) -> None:
       raise ConfigError(f"{key}.{name}={format_value(low)} must not be above {key}.{other}={high}.")
 
 
-def check_vision(said: Iterable[str], resolved: Section) -> None:
-  """Raises ConfigError where a command line (its keys are `said`) sets `env.vision` of a task without vision."""
-  unused = [key for key in said if key.startswith("env.vision.") and key != "env.vision.enable"]
+def check_vision(keys: Iterable[str], resolved: Section) -> None:
+  """Raises ConfigError where `keys` of a command line set `env.vision` of a task without vision."""
+  unused = [key for key in keys if key.startswith("env.vision.") and key != "env.vision.enable"]
   if unused and not uses_vision(resolved["env"]):
     raise ConfigError(f"{unused[0]}: this task sees nothing. Add env.vision.enable=true env.vision.camera=<name>.")
 

@@ -147,10 +147,10 @@ def combinations(*sets: Sequence[str]) -> list[list[str]]:
 
 def varying(*sets: Iterable[str]) -> list[str]:
   """Returns the keys and groups with more than one value, in one set of lines or among several."""
-  said = [{parse_with_hydra(line).key_or_group: tuple(_values(line)) for line in lines} for lines in sets]
-  differs = lambda key: len({values.get(key) for values in said}) > 1
-  listed = lambda key: any(len(values[key]) != 1 for values in said if key in values)
-  return [key for key in dict.fromkeys(itertools.chain(*said)) if differs(key) or listed(key)]
+  values_of = [{parse_with_hydra(line).key_or_group: tuple(_values(line)) for line in lines} for lines in sets]
+  differs = lambda key: len({values.get(key) for values in values_of}) > 1
+  listed = lambda key: any(len(values[key]) != 1 for values in values_of if key in values)
+  return [key for key in dict.fromkeys(itertools.chain(*values_of)) if differs(key) or listed(key)]
 
 
 def sweep_names() -> list[str]:

@@ -358,9 +358,9 @@ def _within(call: Callable[[], T], seconds: float | None, otherwise: str) -> T:
   try:
     return outcome.result()
   except Exception as error:
-    said = first_line(error)[:200]
-    late = "DEADLINE" in said.upper() or "timed out" in said.lower()
-    raise HardwareError(f"hardware=multi_node: {otherwise if late else said}.") from error
+    text = first_line(error)[:200]
+    late = "DEADLINE" in text.upper() or "timed out" in text.lower()
+    raise HardwareError(f"hardware=multi_node: {otherwise if late else text}.") from error
 
 
 def _start_thread(target: Callable[[], None], name: str = "watch") -> threading.Thread:

@@ -50,7 +50,7 @@ def make_evaluator(
     (1 until the episode ended) before each policy step, [steps, episodes, ...].
   """
   wrapped = wrap_for_evaluation(env)
-  decisions = -(-env.episode_length // env.action_repeat)
+  num_steps = -(-env.episode_length // env.action_repeat)
   per_device = num_envs // mesh.shape[AXIS]
   acts = (act, *others.values())
   repeat = lambda tree: jax.tree.map(lambda x: jnp.concatenate([x] * len(acts)) if others else x, tree)
@@ -81,16 +81,16 @@ def make_evaluator(
       return jax.tree.map(lambda x: x[:num_recorded], shown | {"active": active})
 
     active = jnp.ones_like(state.done)
-    recording = jax.tree.map(lambda x: jnp.zeros((decisions, *x.shape), x.dtype), view(state, active))
+    recording = jax.tree.map(lambda x: jnp.zeros((num_steps, *x.shape), x.dtype), view(state, active))
 
     def running(carry: tuple[PyTree, ...]) -> jax.Array:
       step, _, active, _, _ = carry
       # Devices must leave the loop together: a policy may use collectives.
-      return (step < decisions) & (jax.lax.pmax(active.max(), AXIS) > 0)
+      return (step < num_steps) & (jax.lax.pmax(active.max(), AXIS) > 0)
 
     def step(carry: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
       step, state, active, totals, recording = carry
-      recording = jax.tree.map(lambda tape, x: tape.at[step].set(x), recording, view(state, active))
+      recording = jax.tree.map(lambda frames, x: frames.at[step].set(x), recording, view(state, active))
       state = episodes.step(state, act_all(policy, state.obs, jax.random.fold_in(act_key, step)), model)
       now = state.info["episode_metrics"] | {"nonfinite": totals["nonfinite"] + state.info["nonfinite"]}
       totals = {k: jnp.where(active > 0, now[k], total) for k, total in totals.items()}

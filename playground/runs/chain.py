@@ -106,22 +106,22 @@ def _check(config: RunConfig) -> None:
       trainer = Trainer(env, stage.agent, hardware.mesh, hardware.network_precision)
       trainer.notices()  # raises for a replay buffer larger than device memory
       size = env.observation_size
-      facts: dict[str, object] = {"agent.name": stage.agent_name, "size of the action": env.action_size}
-      facts |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
-      facts |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(trainer.policy_shape())}
+      sizes: dict[str, object] = {"agent.name": stage.agent_name, "size of the action": env.action_size}
+      sizes |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
+      sizes |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(trainer.policy_shape())}
       if before is None and config.init_from is not None:
         plan = RestorePlan(weights=weights_of(config.init_from))
         plan.restore(trainer, stage.agent_name, lambda: ({}, {}))
       if before is not None:
-        _compare(f"env={stage.choices['env']}", facts, *before)
-      before = name, facts
+        _compare(f"env={stage.choices['env']}", sizes, *before)
+      before = name, sizes
 
 
-def _compare(env: str, facts: dict[str, object], before: str, theirs: dict[str, object]) -> None:
+def _compare(env: str, sizes: dict[str, object], before: str, theirs: dict[str, object]) -> None:
   """Raises ConfigError where a stage's networks differ from the previous stage's."""
-  for key in {**facts, **theirs}:
-    if facts.get(key) != theirs.get(key):
-      here, there = (side.get(key, "not there") for side in (facts, theirs))
+  for key in {**sizes, **theirs}:
+    if sizes.get(key) != theirs.get(key):
+      here, there = (side.get(key, "not there") for side in (sizes, theirs))
       raise ConfigError(f"{env} cannot start from the weights of stage {before}: {key} is {here}, and {there} there.")
 
 

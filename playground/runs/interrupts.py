@@ -40,9 +40,9 @@ def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[No
 @contextlib.contextmanager
 def noted_signals() -> Iterator[threading.Event]:
   """Context with an event that these signals set: for loops in callbacks of C code, which swallow exceptions."""
-  told = threading.Event()
-  with on_signals(lambda *_: told.set()):
-    yield told
+  received = threading.Event()
+  with on_signals(lambda *_: received.set()):
+    yield received
 
 
 class Interrupts:

@@ -141,8 +141,8 @@ class RunDirectory:
     """
     earlier = self.manifest
     starts = [*earlier.pop("earlier_starts", []), *([earlier] if earlier else [])]
-    facts = {"created": now(), "host": socket.gethostname(), "git": git_state(), "versions": package_versions()}
-    write_json(self.path / "manifest.json", _merged(facts, fields) | {"earlier_starts": starts})
+    process = {"created": now(), "host": socket.gethostname(), "git": git_state(), "versions": package_versions()}
+    write_json(self.path / "manifest.json", _merged(process, fields) | {"earlier_starts": starts})
 
   def update_manifest(self, **fields: object) -> None:
     """Merges `fields` into the manifest; nested mappings (`timings={"compile_s": 9.1}`) are merged key by key."""

@@ -60,9 +60,9 @@ class MultiProcessService:
     self.environment = {"CUDA_MPS_PIPE_DIRECTORY": str(pipes), "CUDA_MPS_LOG_DIRECTORY": str(logs)}
     if self._control(command="get_server_list\n")[0] == 0:
       return
-    code, said = self._control("-d")
+    code, output = self._control("-d")
     if code:
-      raise HardwareError(f"launcher.mps=true, but {CONTROL} does not start: {said or f'exit code {code}'}")
+      raise HardwareError(f"launcher.mps=true, but {CONTROL} does not start: {output or f'exit code {code}'}")
 
   def stop(self) -> None:
     """Ends the service once the processes that use it have ended."""

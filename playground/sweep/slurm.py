@@ -80,9 +80,9 @@ class Queue:
     """Returns Slurm's state of a job, None if it left the queue; at most `QUEUE_S` old, UNKNOWN without an answer."""
     if time.monotonic() - self._asked > QUEUE_S:
       command = ["squeue", "--me", "--all", "--noheader", "--format=%i %T"]
-      told = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-      lines = [line.split(maxsplit=1) for line in told.stdout.splitlines()]
-      self._states = dict(lines) if told.returncode == 0 else None
+      answer = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+      lines = [line.split(maxsplit=1) for line in answer.stdout.splitlines()]
+      self._states = dict(lines) if answer.returncode == 0 else None
       self._asked = time.monotonic()
     return "UNKNOWN" if self._states is None else self._states.get(job_id)
 

@@ -70,11 +70,11 @@ class View:
       self._seen[job.name] = state.status, state.attempt
       ended = sum(s.status in ENDED for s in states.values())
       _, score = self._sweep.folder(job).progress()
-      facts = [f"on {state.where}" if state.status == "running" and state.where else ""]
-      facts += [f"return {score:.1f}" if state.status == "finished" and score is not None else ""]
-      facts += [_clock(state.seconds) if state.status in ENDED else "", state.reason]
-      said = ", ".join(fact for fact in facts if fact)
-      self.print(f"[{ended}/{len(states)}] {job.name} {state.status}{f': {said}' if said else ''}")
+      details = [f"on {state.where}" if state.status == "running" and state.where else ""]
+      details += [f"return {score:.1f}" if state.status == "finished" and score is not None else ""]
+      details += [_clock(state.seconds) if state.status in ENDED else "", state.reason]
+      text = ", ".join(fact for fact in details if fact)
+      self.print(f"[{ended}/{len(states)}] {job.name} {state.status}{f': {text}' if text else ''}")
 
 
 def status_table(sweep: SweepDirectory, states: Mapping[str, JobState], rows: int | None = ROWS) -> Table:

@@ -59,12 +59,12 @@ class Worker:
     """Asks the job to save and exit."""
     self._stopping = True
 
-  def run(self, where: str = "", **facts: object) -> int:
+  def run(self, where: str = "", **fields: object) -> int:
     """Runs the jobs to their end and returns the exit code; 0 if other workers run or finished them.
 
     Args:
       where: the machine or devices, for people.
-      **facts: entries that the launcher adds to job.json.
+      **fields: entries that the launcher adds to job.json.
     """
     sweep = SweepDirectory.open(self._sweep_path)
     overrides = {job.name: job.overrides for job in sweep.jobs}
@@ -75,7 +75,7 @@ class Worker:
         if lock is None:
           continue
         started = {"attempt": folder.record.get("attempt", 0) + 1, "host": socket.gethostname(), "started": now()}
-        self._records[folder] = {**started, "where": where, "pid": os.getpid(), **facts}
+        self._records[folder] = {**started, "where": where, "pid": os.getpid(), **fields}
         if folder.run.status.get("status") == "finished":  # another worker had the lock while this one started
           self._write(folder, "finished")
           del self._records[folder]
@@ -215,7 +215,7 @@ def _signal(child: "subprocess.Popen[bytes]", signum: int, group: bool) -> None:
 def _last_line(log: Path) -> str:
   """Returns the last line of a job's log, mostly its error."""
   lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-  return (lines or ["it said nothing"])[-1][:300]
+  return (lines or ["no output"])[-1][:300]
 
 
 if __name__ == "__main__":

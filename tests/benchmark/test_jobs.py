@@ -31,9 +31,9 @@ if measure == "train":
   gpu = os.environ["CUDA_VISIBLE_DEVICES"]
   for seed in arguments["seeds"]: row(seed=seed, value=100.0 + seed, conditions="timed", backend=gpu)
 elif measure in ("lock", "caches"):
-  def told(facts, **_):
-    text = f"lock {facts.lock}" if measure == "lock" else ",".join(os.environ.get(name, "") for name in worker.CACHES)
-    facts.emit("training_steps_per_s", 1.0, "", seed=1, conditions=text)
+  def told(rows, **_):
+    text = f"lock {rows.lock}" if measure == "lock" else ",".join(os.environ.get(name, "") for name in worker.CACHES)
+    rows.emit("training_steps_per_s", 1.0, "", seed=1, conditions=text)
   worker.importlib.import_module = lambda name: type("Module", (), {"measure": told})
   worker.main()
 elif measure == "read": row(seed=1, value=1.0, commit="earlier")

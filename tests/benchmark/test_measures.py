@@ -20,7 +20,7 @@ from playground.benchmark.commands import Compare, Learning, Topology
 from playground.benchmark.measures import peer as peer_measures
 from playground.benchmark.measures import runs
 from playground.benchmark.schema import Table
-from playground.benchmark.worker import ROW, Facts
+from playground.benchmark.worker import ROW, Rows
 from playground.errors import ConfigError
 from playground.files import write_json
 from tests.dummy import Point
@@ -41,7 +41,7 @@ def test_a_training(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
   from playground.benchmark.measures import training
 
   monkeypatch.setattr(registry, "load", lambda name, config: Point())
-  training.measure(Facts(), "CartpoleBalance", "ppo", SMALL, seeds=[3, 4], seconds=0.2)
+  training.measure(Rows(), "CartpoleBalance", "ppo", SMALL, seeds=[3, 4], seconds=0.2)
   found = rows(capsys)
   assert [(row["quantity"], row["seed"]) for row in found] == [
     ("trace_s", 3), ("compile_s", 3), ("start_to_first_update_s", 3),
@@ -56,8 +56,8 @@ def test_agents_in_one_program_have_seeds_of_their_own(monkeypatch: pytest.Monke
   from playground.benchmark.measures import subject
 
   monkeypatch.setattr(registry, "load", lambda name, config: Point())
-  facts = Facts()
-  two = subject.Subject.build(facts, "CartpoleBalance", "ppo", SMALL, num_agents=2)
+  rows = Rows()
+  two = subject.Subject.build(rows, "CartpoleBalance", "ppo", SMALL, num_agents=2)
   assert two.trainer.num_agents == 2
   assert two.key(3).tolist() == [jax.random.PRNGKey(seed).tolist() for seed in (3, 4)]
   plan = commands.Together(tasks=["CartpoleBalance"], num_agents=[1, 5])
@@ -90,7 +90,7 @@ def write_chain(run: Path, final_return: float = 4.0) -> None:
 
 def test_a_finished_chain_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
   write_chain(tmp_path / "some_chain_seed_2")
-  runs.chain(Facts(), "some_chain", [], str(tmp_path), again=False, seeds=[2])
+  runs.chain(Rows(), "some_chain", [], str(tmp_path), again=False, seeds=[2])
   given = rows(capsys)
   found = {(row["setting"], row["quantity"]): row["value"] for row in given}
   assert found["stage=walk", "final_return"] == 3.0 and found["stage=run", "wall_clock_s"] == 2.0
@@ -108,7 +108,7 @@ def test_a_chain_of_other_overrides_or_again_is_another_run(
     write_chain(Path(overrides[-1].partition("=")[2]), final_return=10.0 * len(begun))
 
   def measured(overrides: list[str], again: bool = False) -> float:
-    runs.chain(Facts(), "some_chain", overrides, str(tmp_path), again=again, seeds=[2])
+    runs.chain(Rows(), "some_chain", overrides, str(tmp_path), again=again, seeds=[2])
     return next(r["value"] for r in rows(capsys) if r["quantity"] == "final_return" and "stage=all" in r["setting"])
 
   monkeypatch.setattr(runs, "run_training", train)
@@ -129,14 +129,14 @@ def test_a_peer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.
   driver.write_text(f"print('noise'); print('RESULT ' + {json.dumps(result)!r})")
   monkeypatch.setitem(peers.PEERS, "some", peers.Peer(driver, "some", "1"))
   arguments = {"task": "CheetahRun", "seconds": 1.0, "peer": PEER}
-  peer_measures.rates(Facts(), **arguments, backend="jax", seeds=[1])
+  peer_measures.rates(Rows(), **arguments, backend="jax", seeds=[1])
   found = {row["quantity"]: row["value"] for row in rows(capsys)}
   # The best epoch; the first epoch's end less what is beyond its first update, at that speed.
   assert found == {"training_steps_per_s": 500.0, "start_to_first_update_s": 1.2, "peak_memory_gib": 1.5}
 
   driver.write_text("raise SystemExit('it broke')")
   with pytest.raises(peer_measures.PeerFailedError, match="it broke"):
-    peer_measures.rates(Facts(), **arguments, backend="jax", seeds=[1])
+    peer_measures.rates(Rows(), **arguments, backend="jax", seeds=[1])
 
 
 def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -148,9 +148,9 @@ def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
     file.write(f"print('RESULT ' + {json.dumps(result)!r})")
   monkeypatch.setitem(peers.PEERS, "some", peers.Peer(driver, "some", "1"))
   arguments = {"task": "CheetahRun", "num_timesteps": None, "peer": PEER}
-  arguments |= {"agent": "sac", "backend": "warp", "told": ["env.impl=warp"]}
+  arguments |= {"agent": "sac", "backend": "warp", "setting": ["env.impl=warp"]}
   arguments |= {"seeds": [2]}
-  peer_measures.whole(Facts(), **arguments)
+  peer_measures.whole(Rows(), **arguments)
   found = rows(capsys)
   assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
     ("return", 9.0, "env.impl=warp step=0"), ("return", 7.0, "env.impl=warp step=1000"),
@@ -163,8 +163,8 @@ def test_a_peer_that_evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
   assert json.loads((tmp_path / "job").read_text()) == job
 
   driver.write_text("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
-  with pytest.raises(peer_measures.PeerFailedError, match="some failed: nothing said"):
-    peer_measures.whole(Facts(), **arguments)
+  with pytest.raises(peer_measures.PeerFailedError, match="some failed: no output"):
+    peer_measures.whole(Rows(), **arguments)
   assert rows(capsys) == []
 
 
@@ -192,7 +192,7 @@ def test_a_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
 
   monkeypatch.setattr(runs, "run_training", train)
   overrides, told = ["agent.num_timesteps=200", "hardware.devices=1"], ["agent.num_timesteps=200"]
-  runs.whole(Facts(), "CheetahRun", "ppo", overrides, told, seeds=[3])
+  runs.whole(Rows(), "CheetahRun", "ppo", overrides, told, seeds=[3])
   found = rows(capsys)
   setting = "agent.num_timesteps=200 step="
   assert [(row["quantity"], row["value"], row.get("setting")) for row in found] == [
@@ -226,10 +226,10 @@ def test_learning_is_ours_and_then_the_peer_for_as_many_steps(monkeypatch: pytes
   told = ["env.impl=jax", "agent.num_timesteps=5000"]
   overrides = [*told, "hardware.devices=1"]
   assert ours.arguments == {
-    "task": "CheetahRun", "agent": "ppo_v020", "overrides": overrides, "told": told, "seeds": [1],
+    "task": "CheetahRun", "agent": "ppo_v020", "overrides": overrides, "setting": told, "seeds": [1],
   }  # fmt: skip
   setting = "env.impl=jax env.impl=warp agent.num_timesteps=5000"
-  assert peer.columns["setting"] == " ".join(peer.arguments["told"]) == setting
+  assert peer.columns["setting"] == " ".join(peer.arguments["setting"]) == setting
   assert peer.arguments["num_timesteps"] == 5000 and peer.arguments["backend"] == "warp"
 
   monkeypatch.setattr(commands, "check_peer", lambda *_: None)
@@ -277,22 +277,22 @@ def test_topology_trains_whole_runs_after_the_rates():
   ]
   for job in both[3:]:
     assert job.last == {"quantity": "final_return"} and job.columns["benchmark"] == "topology"
-    assert job.arguments["overrides"] == job.arguments["told"] == job.columns["setting"].split()
+    assert job.arguments["overrides"] == job.arguments["setting"] == job.columns["setting"].split()
     job_of_run = inspect.signature(runs.whole).parameters
-    assert set(job.arguments) == set(job_of_run) - {"facts"}
+    assert set(job.arguments) == set(job_of_run) - {"rows"}
 
 
 def test_whole_runs_that_were_stopped_go_on_where_they_are_missing(tmp_path: Path):
   jobs = Topology(tasks=("CheetahRun",), seeds=2, devices=(1,), num_timesteps=5000).jobs(1)
-  table, facts = Table(tmp_path / "rows.csv"), {"device": "a device"}
+  table, rows = Table(tmp_path / "rows.csv"), {"device": "a device"}
   left = lambda: [(job.measure, job.arguments["seeds"]) for each in jobs if (job := each.left(table, "a device"))]
-  whole = {**jobs[1].columns, **facts, "seed": 1}
+  whole = {**jobs[1].columns, **rows, "seed": 1}
   table.add({**whole, "quantity": "training_steps_per_s", "value": 1.0})
   assert left() == [("training", [1, 2]), ("runs:whole", [1]), ("runs:whole", [2])], (
     "its rate is not that of the rates, nor its end"
   )
   table.add({**whole, "quantity": "final_return", "value": 1.0})
-  table.add({**jobs[0].columns, **facts, "seed": 1, "quantity": "training_steps_per_s", "value": 1.0})
+  table.add({**jobs[0].columns, **rows, "seed": 1, "quantity": "training_steps_per_s", "value": 1.0})
   assert left() == [("training", [2]), ("runs:whole", [2])]
 
 

@@ -121,6 +121,6 @@ def _read(path: Path) -> dict[str, Limit]:
     raise ConfigError(f"table={path} cannot be read: {getattr(error, 'strerror', None) or error}.") from None
   for name, limit in limits.items():
     if not (0 < limit.ratio < math.inf and 1 <= limit.tolerance < math.inf):
-      told = f"ratio {limit.ratio:g}, tolerance {limit.tolerance:g}"
-      raise ConfigError(f"table={path}: {name} has {told}, which must be above 0 and at least 1.")
+      values = f"ratio {limit.ratio:g}, tolerance {limit.tolerance:g}"
+      raise ConfigError(f"table={path}: {name} has {values}, which must be above 0 and at least 1.")
   return limits

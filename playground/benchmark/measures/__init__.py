@@ -1,1 +1,1 @@
-"""The measurements that a worker runs: modules with `measure(facts, **arguments)`."""
+"""The measurements that a worker runs: modules with `measure(rows, **arguments)`."""

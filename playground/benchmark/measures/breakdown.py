@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from playground.benchmark.measures.machine import used_memory
-from playground.benchmark.measures.subject import Subject, alone, emit_peak, rate, told
-from playground.benchmark.worker import Facts
+from playground.benchmark.measures.subject import Subject, alone, emit_peak, rate, setting_of
+from playground.benchmark.worker import Rows
 from playground.envs.base import PIXELS
 from playground.envs.wrappers import ModelFields, Vectorize, Wrapper, wrap_for_training
 from playground.learning.rollout import Environments, unroll
@@ -35,7 +35,7 @@ Step = Callable[[PyTree, ModelFields, jax.Array], PyTree]
 
 
 def measure(
-  facts: Facts,
+  rows: Rows,
   task: str,
   agent: str,
   overrides: list[str],
@@ -48,8 +48,8 @@ def measure(
   The parts take turns, and the best turn of each counts, since their differences matter. The memory is that of all
   parts together: JAX's, and with `watch_memory` the GPU driver's.
   """
-  with used_memory(facts) if watch_memory else nullcontext():
-    subject = Subject.build(facts, task, agent, overrides)
+  with used_memory(rows) if watch_memory else nullcontext():
+    subject = Subject.build(rows, task, agent, overrides)
     trainer, state = (
       subject.trainer,
       subject.trainer.init(subject.key(0), subject.model, None, subject.trainer.settings),
@@ -65,16 +65,14 @@ def measure(
     for call, _ in calls.values():
       jax.block_until_ready(call(1))
     best = dict.fromkeys(calls, 0.0)
-    with alone(facts.lock):
+    with alone(rows.lock):
       for _ in range(TURNS):
         for part, (call, steps) in calls.items():
           best[part] = max(best[part], rate(call, steps, seconds / TURNS)[0])
-  emit_peak(facts)
-  facts["conditions"] = (
-    f"{facts['conditions']}; parts added one by one, best of {TURNS} turns of {seconds / TURNS:.1f} s"
-  )
+  emit_peak(rows)
+  rows["conditions"] = f"{rows['conditions']}; parts added one by one, best of {TURNS} turns of {seconds / TURNS:.1f} s"
   for part, speed in best.items():
-    facts.emit("seconds_per_step", 1 / speed, "s", setting=" ".join((*told(overrides), f"part={part}")))
+    rows.emit("seconds_per_step", 1 / speed, "s", setting=" ".join((*setting_of(overrides), f"part={part}")))
 
 
 def _repeat(subject: Subject, run: Run, carry: PyTree) -> Callable[[int], PyTree]:

@@ -3,17 +3,17 @@
 import jax
 
 from playground.benchmark.measures.subject import Subject, alone, emit_peak, rate
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 
 LENGTH = 20  # control steps of one call
 
 
-def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float) -> None:
+def measure(rows: Rows, task: str, agent: str, overrides: list[str], seconds: float) -> None:
   """Emits a row for env steps/s of `agent.num_envs` environments, and one for memory.
 
   The environments are wrapped as in training: guard, time limit, auto-reset, randomised models.
   """
-  subject = Subject.build(facts, task, agent, overrides)
+  subject = Subject.build(rows, task, agent, overrides)
   env, model, num_envs = subject.trainer.env, subject.model, subject.trainer.config.num_envs
 
   def roll(state, key, calls):
@@ -35,8 +35,8 @@ def measure(facts: Facts, task: str, agent: str, overrides: list[str], seconds: 
     return state.done
 
   jax.block_until_ready(call(1))
-  with alone(facts.lock):
+  with alone(rows.lock):
     speed, timed = rate(call, num_envs * LENGTH * env.action_repeat, seconds)
-  facts["conditions"] = f"random actions; {timed:.1f} s timed"
-  facts.emit("env_steps_per_s", speed, "steps/s")
-  emit_peak(facts)
+  rows["conditions"] = f"random actions; {timed:.1f} s timed"
+  rows.emit("env_steps_per_s", speed, "steps/s")
+  emit_peak(rows)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 from playground.config import compose
 from playground.hardware.gpus import query_gpus
 from playground.hardware.setup import setup
@@ -19,10 +19,10 @@ _NAMES = {"python": "Python", "jax": "JAX", "mujoco": "MuJoCo", "mujoco-mjx": "M
 INTERVAL_S = 0.5  # s between two queries of the driver
 
 
-def measure(facts: Facts, overrides: list[str]) -> None:
+def measure(rows: Rows, overrides: list[str]) -> None:
   """Emits a row with the number of devices of a run with these overrides."""
   hardware = setup(compose(["env=CartpoleBalance", *overrides]).hardware)
-  facts.emit("devices", hardware.mesh.size, "", device=device_name(), versions=versions())
+  rows.emit("devices", hardware.mesh.size, "", device=device_name(), versions=versions())
 
 
 def device_name() -> str:
@@ -44,7 +44,7 @@ def versions() -> str:
 
 
 @contextlib.contextmanager
-def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
+def used_memory(rows: Rows, seed: int | None = None) -> Iterator[None]:
   """Emits a row for the peak GPU memory during the block above that before it; none without a GPU.
 
   It queries the driver twice a second, so that memory outside JAX (Warp's arrays, compiled code) counts.
@@ -64,7 +64,7 @@ def used_memory(facts: Facts, seed: int | None = None) -> Iterator[None]:
   ended.set()
   if before == before:
     watcher.join()
-    facts.emit("used_memory_gib", (most - before) / 1024, "GiB", seed=seed)
+    rows.emit("used_memory_gib", (most - before) / 1024, "GiB", seed=seed)
 
 
 def _query_gpu(field: str) -> str | None:

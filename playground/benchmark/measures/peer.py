@@ -11,7 +11,7 @@ from playground.benchmark.measures.machine import used_memory
 from playground.benchmark.measures.runs import RESULT, emit_result, emit_returns
 from playground.benchmark.measures.subject import alone
 from playground.benchmark.peer import PEERS
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 from playground.errors import PlaygroundError
 from playground.paper import SUITES, paper_table
 
@@ -22,24 +22,24 @@ class PeerFailedError(PlaygroundError):
   """The peer's process ended with an error."""
 
 
-def rates(facts: Facts, task: str, seconds: float, backend: str, seeds: list[int], peer: dict[str, str]) -> None:
+def rates(rows: Rows, task: str, seconds: float, backend: str, seeds: list[int], peer: dict[str, str]) -> None:
   """Emits rows for steps/s of the best epoch, time to the first update and memory, like `training` for ours."""
   (seed,) = seeds
   job = {"task": task, "backend": backend, "seed": seed, "steps": _epoch_steps(task, seconds), "epochs": EPOCHS}
-  with used_memory(facts, seed):
-    result = drive(facts, peer, job)
+  with used_memory(rows, seed):
+    result = drive(rows, peer, job)
   epochs = result["epochs"]  # seconds of each
   best = result["epoch_steps"] / min(epochs[1:])
   first_update = result["start_s"] + epochs[0] - (result["epoch_steps"] - result["update_steps"]) / best
-  facts["conditions"] = f"best of {len(epochs) - 1} epochs of {result['epoch_steps']:,} steps; {result['settings']}"
-  facts.emit("start_to_first_update_s", first_update, "s", seed=seed)
+  rows["conditions"] = f"best of {len(epochs) - 1} epochs of {result['epoch_steps']:,} steps; {result['settings']}"
+  rows.emit("start_to_first_update_s", first_update, "s", seed=seed)
   if result["peak_memory_gib"] is not None:
-    facts.emit("peak_memory_gib", result["peak_memory_gib"], "GiB", seed=seed)
-  facts.emit("training_steps_per_s", best, "steps/s", seed=seed)
+    rows.emit("peak_memory_gib", result["peak_memory_gib"], "GiB", seed=seed)
+  rows.emit("training_steps_per_s", best, "steps/s", seed=seed)
 
 
 def whole(
-  facts: Facts, task: str, agent: str, num_timesteps: int | None, backend: str, told: list[str], seeds: list[int],
+  rows: Rows, task: str, agent: str, num_timesteps: int | None, backend: str, setting: list[str], seeds: list[int],
   peer: dict[str, str],
 ) -> None:  # fmt: skip
   """Emits rows like `runs.whole` for ours, with the peer's own evaluations.
@@ -49,21 +49,21 @@ def whole(
   (seed,) = seeds
   job = {"task": task, "agent": agent, "backend": backend, "seed": seed}
   job |= {"evaluate": True, "num_timesteps": num_timesteps}
-  with alone(facts.lock):
-    result = drive(facts, peer, job)
+  with alone(rows.lock):
+    result = drive(rows, peer, job)
   when = "time from the end of the evaluation before training to that of the last, compiling the training in it"
-  facts["conditions"] = f"a whole run, {when}; {result['settings']}"
-  emit_returns(facts, result["evaluations"], told, seed)
+  rows["conditions"] = f"a whole run, {when}; {result['settings']}"
+  emit_returns(rows, result["evaluations"], setting, seed)
   trained = [score for step, score, _ in result["evaluations"] if step > 0]
   result |= {"best_return": max(trained), "final_return": trained[-1]}
-  emit_result(facts, result, RESULT, seed=seed)
+  emit_result(rows, result, RESULT, seed=seed)
 
 
-def drive(facts: Facts, peer: dict[str, str], job: Mapping[str, object]) -> dict[str, Any]:
+def drive(rows: Rows, peer: dict[str, str], job: Mapping[str, object]) -> dict[str, Any]:
   """Runs a job in the peer's driver, and fills in the columns that its rows share.
 
   Args:
-    facts: columns of the rows.
+    rows: columns of the rows.
     peer: its `name`, `python` (interpreter), `path` (PYTHONPATH) and `menagerie` (folder of robot models).
     job: the driver's argument.
 
@@ -76,9 +76,9 @@ def drive(facts: Facts, peer: dict[str, str], job: Mapping[str, object]) -> dict
   done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=env)
   lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
   if done.returncode or not lines:
-    raise PeerFailedError(f"{peer['name']} failed: {(done.stderr.strip().splitlines() or ['nothing said'])[-1]}")
+    raise PeerFailedError(f"{peer['name']} failed: {(done.stderr.strip().splitlines() or ['no output'])[-1]}")
   result = json.loads(lines[-1].removeprefix("RESULT "))
-  facts.update(backend=job["backend"], devices=1, precision="JAX's default", versions=result["versions"])
+  rows.update(backend=job["backend"], devices=1, precision="JAX's default", versions=result["versions"])
   return result
 
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from playground.benchmark.measures.subject import alone
 from playground.benchmark.schema import commit_of
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 from playground.config import RunConfig, compose
 from playground.errors import PlaygroundError, nearest
 from playground.interpreter import PYTHON
@@ -30,7 +30,7 @@ class RunFailedError(PlaygroundError):
   """The command ended with an error."""
 
 
-def startup(facts: Facts, task: str, agent: str, overrides: list[str], seconds: float) -> None:
+def startup(rows: Rows, task: str, agent: str, overrides: list[str], seconds: float) -> None:
   """Emits rows `cold` and `warm`: the same command twice in new processes, up to the first update that learns.
 
   Evaluation is compiled, too; the one before training runs after the first training call, as in any run.
@@ -44,34 +44,34 @@ def startup(facts: Facts, task: str, agent: str, overrides: list[str], seconds: 
       run = Path(folder) / name
       run_training([*chosen, *short, f"run_dir={run}"], without=_CACHES)
       manifest = RunDirectory(run).manifest
-      facts.update(facts_of(manifest), conditions="whole command, evaluation compiled, one update, a cache of its own")
+      rows.update(columns_of(manifest), conditions="whole command, evaluation compiled, one update, a cache of its own")
       for quantity in ("trace_s", "compile_s", "start_to_first_update_s"):
-        facts.emit(quantity, manifest["timings"][quantity], "s", setting=" ".join((*overrides, name)))
+        rows.emit(quantity, manifest["timings"][quantity], "s", setting=" ".join((*overrides, name)))
 
 
-def whole(facts: Facts, task: str, agent: str, overrides: list[str], told: list[str], seeds: list[int]) -> None:
+def whole(rows: Rows, task: str, agent: str, overrides: list[str], setting: list[str], seeds: list[int]) -> None:
   """Emits a row for each evaluation, `step=<steps trained>`, then those of the whole run, the final return last.
 
-  The whole run, compilation included, has the device alone. `told` is the measurement's setting, to which an
+  The whole run, compilation included, has the device alone. `setting` is the measurement's, to which an
   evaluation's row adds its step.
   """
   (seed,) = seeds
   with tempfile.TemporaryDirectory() as folder:
     run = RunDirectory(Path(folder) / "run")
     chosen = [f"env={task}", f"agent={agent}", *overrides, f"seed={seed}"]
-    with alone(facts.lock):
+    with alone(rows.lock):
       run_training([*chosen, "video.enable=false", "tracking=csv", f"run_dir={run.path}"])
-    facts.update(facts_of(run.manifest), conditions="a whole run, evaluations and saving in its time, compiling not")
+    rows.update(columns_of(run.manifest), conditions="a whole run, evaluations and saving in its time, compiling not")
     evaluations = pd.read_csv(run.metrics_csv).dropna(subset=[RETURN])
-    emit_returns(facts, evaluations[["step", RETURN, _TIME]].itertuples(index=False), told, seed)
+    emit_returns(rows, evaluations[["step", RETURN, _TIME]].itertuples(index=False), setting, seed)
     if run.summary.get("final_mode_return") is not None:
       mode = OTHER_RETURNS["mode"] if OTHER_RETURNS["mode"] in evaluations else RETURN
-      emit_returns(facts, evaluations[["step", mode, _TIME]].itertuples(index=False), told, seed, "mode_return")
+      emit_returns(rows, evaluations[["step", mode, _TIME]].itertuples(index=False), setting, seed, "mode_return")
     result = {**run.summary, "training_steps_per_s": run.manifest["timings"]["steady_steps_per_second"]}
-    emit_result(facts, result, RESULT, seed=seed)
+    emit_result(rows, result, RESULT, seed=seed)
 
 
-def chain(facts: Facts, experiment: str, overrides: list[str], runs: str, again: bool, seeds: list[int]) -> None:
+def chain(rows: Rows, experiment: str, overrides: list[str], runs: str, again: bool, seeds: list[int]) -> None:
   """Emits rows for each stage of a curriculum, `stage=<name>`, and for the whole, `stage=all`.
 
   An unfinished run of the same experiment, overrides and seed is resumed; its times are sums over its starts. A
@@ -86,24 +86,24 @@ def chain(facts: Facts, experiment: str, overrides: list[str], runs: str, again:
   for stage in [*run.summary["stages"], {**run.summary, "name": "all"}]:
     manifest = (run if stage["name"] == "all" else RunDirectory(run.path / stage["folder"])).manifest
     columns: dict[str, object] = {"seed": seed, "setting": " ".join((*overrides, f"stage={stage['name']}"))}
-    columns |= facts_of(manifest) if manifest else {}
+    columns |= columns_of(manifest) if manifest else {}
     if git := manifest.get("git"):
       columns["commit"] = commit_of(git)
     columns["conditions"] = f"task {stage['env']}, evaluations included, compiling not"
-    emit_result(facts, stage, ("steps", "final_return", "wall_clock_s"), **columns)
+    emit_result(rows, stage, ("steps", "final_return", "wall_clock_s"), **columns)
 
 
-def golden(facts: Facts, overrides: list[str], metrics: list[str], settings: list[str]) -> None:
+def golden(rows: Rows, overrides: list[str], metrics: list[str], settings: list[str]) -> None:
   """Emits a row for each metric of a run: the last value of its column of metrics.csv, with its `setting`."""
   with tempfile.TemporaryDirectory() as folder:
     run = RunDirectory(Path(folder) / "run")
     run_training([*overrides, "video.enable=false", "tracking=csv", f"run_dir={run.path}"])
-    facts.update(facts_of(run.manifest), conditions=f"{run.summary['steps']:,} steps; {' '.join(overrides)}")
+    rows.update(columns_of(run.manifest), conditions=f"{run.summary['steps']:,} steps; {' '.join(overrides)}")
     table = pd.read_csv(run.metrics_csv)
     for metric, setting in zip(metrics, settings, strict=True):
       if metric not in table or table[metric].dropna().empty:
         raise RunFailedError(f"metrics.csv has no {metric}.{nearest(metric, list(table))}")
-      facts.emit("golden_metric", float(table[metric].dropna().iloc[-1]), "", setting=setting)
+      rows.emit("golden_metric", float(table[metric].dropna().iloc[-1]), "", setting=setting)
 
 
 def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
@@ -117,18 +117,18 @@ def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
     out, errors = process.communicate()
   if process.returncode:
     lines = (errors or out).strip().splitlines()
-    why = lines[-1] if lines else "nothing said"
+    why = lines[-1] if lines else "no output"
     raise RunFailedError(f"playground-run ended with code {process.returncode}: {why}")
 
 
-def facts_of(manifest: Mapping[str, object]) -> dict[str, object]:
+def columns_of(manifest: Mapping[str, object]) -> dict[str, object]:
   """Returns columns of a row, from a run's manifest."""
   precision = f"physics {manifest['matmul_precision']}, networks {manifest['network_precision']}"
   return {"backend": manifest["impl"], "devices": manifest["num_devices"], "precision": precision}
 
 
 def emit_returns(
-  facts: Facts,
+  rows: Rows,
   evaluations: Iterable[tuple[float, float, float]],
   setting: Sequence[str],
   seed: int,
@@ -137,14 +137,14 @@ def emit_returns(
   """Emits a row for each evaluation: (steps trained, mean return, seconds into the run)."""
   for step, score, seconds in evaluations:
     columns = {"setting": " ".join((*setting, f"step={step:.0f}")), "seed": seed}
-    facts.emit(quantity, score, "", **columns, conditions=f"{facts['conditions']}; after {seconds:.1f} s")
+    rows.emit(quantity, score, "", **columns, conditions=f"{rows['conditions']}; after {seconds:.1f} s")
 
 
-def emit_result(facts: Facts, result: Mapping[str, float | None], quantities: Sequence[str], **columns: object) -> None:
+def emit_result(rows: Rows, result: Mapping[str, float | None], quantities: Sequence[str], **columns: object) -> None:
   """Emits a row for each quantity of the result of a run, in order."""
   for quantity in quantities:
     if (value := result.get(quantity)) is not None:
-      facts.emit(quantity, value, _UNITS.get(quantity, ""), **columns)
+      rows.emit(quantity, value, _UNITS.get(quantity, ""), **columns)
 
 
 def _one_update(config: RunConfig) -> int:
@@ -155,8 +155,8 @@ def _one_update(config: RunConfig) -> int:
 
 def _chain_run(runs: Path, experiment: str, overrides: list[str], seed: int, again: bool) -> RunDirectory:
   """Returns the run directory, one for each set of overrides; with `again`, the first unfinished numbered one."""
-  told = [hashlib.sha256(" ".join(overrides).encode()).hexdigest()[:8]] if overrides else []
-  name = "_".join([experiment, *told, f"seed_{seed}"])
+  digest = [hashlib.sha256(" ".join(overrides).encode()).hexdigest()[:8]] if overrides else []
+  name = "_".join([experiment, *digest, f"seed_{seed}"])
   numbered = (name if number == 1 else f"{name}_{number}" for number in itertools.count(1))
   return next(run for path in numbered if not _finished(run := RunDirectory(runs / path)) or not again)
 

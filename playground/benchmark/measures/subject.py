@@ -14,7 +14,7 @@ from jax.sharding import PartitionSpec as P
 
 from playground import registry
 from playground.benchmark.measures.machine import device_name, versions
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 from playground.config import RunConfig, compose
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
@@ -44,7 +44,7 @@ class Subject:
   draw: Callable[[int], tuple[ModelFields, ModelFields]]
 
   @classmethod
-  def build(cls, facts: Facts, task: str, agent: str, overrides: Sequence[str], num_agents: int = 1) -> "Subject":
+  def build(cls, rows: Rows, task: str, agent: str, overrides: Sequence[str], num_agents: int = 1) -> "Subject":
     """Builds the subject, of one agent or several in one program, and fills in the columns that its rows share."""
     config = compose([f"env={task}", f"agent={agent}", *overrides])
     hardware = setup(config.hardware)
@@ -60,7 +60,7 @@ class Subject:
     def draw(seed: int) -> tuple[ModelFields, ModelFields]:
       return trainer.join([sample(seed + i) for i in range(num_agents)])
 
-    facts.update(
+    rows.update(
       backend=env.impl,
       devices=hardware.mesh.size,
       device=device_name(),
@@ -81,15 +81,15 @@ class Subject:
     return put(self.trainer.join(keys), self.trainer.mesh, P())
 
 
-def told(overrides: Sequence[str]) -> list[str]:
+def setting_of(overrides: Sequence[str]) -> list[str]:
   """Returns the overrides in a row's setting: all but the default of one device."""
   return [text for text in overrides if text != ONE_DEVICE]
 
 
 def _precision(hardware: Hardware, trainer: Trainer) -> str:
-  facts, value_dtype = hardware.facts, getattr(trainer.networks, "value_dtype", None)
+  manifest, value_dtype = hardware.facts, getattr(trainer.networks, "value_dtype", None)
   critic = f", critic activations {value_dtype}" if value_dtype else ""
-  return f"physics {facts['matmul_precision']}, networks {facts['network_precision']}{critic}"
+  return f"physics {manifest['matmul_precision']}, networks {manifest['network_precision']}{critic}"
 
 
 @contextlib.contextmanager
@@ -130,8 +130,8 @@ def peak_memory_gib() -> float | None:
   return max(known) / 2**30 if known else None
 
 
-def emit_peak(facts: Facts, **columns: object) -> None:
+def emit_peak(rows: Rows, **columns: object) -> None:
   """Emits a row for the peak memory, if known."""
   peak = peak_memory_gib()
   if peak is not None:
-    facts.emit("peak_memory_gib", peak, "GiB", **columns)
+    rows.emit("peak_memory_gib", peak, "GiB", **columns)

@@ -8,13 +8,13 @@ import numpy as np
 
 from playground.benchmark.measures.machine import used_memory
 from playground.benchmark.measures.subject import Subject, alone, emit_peak, rate
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 from playground.learning.loop import compile_program
 from playground.runs.provenance import process_age_s
 
 
 def measure(
-  facts: Facts,
+  rows: Rows,
   task: str,
   agent: str,
   overrides: list[str],
@@ -29,7 +29,7 @@ def measure(
   includes no evaluation and no full reset. One compilation serves all seeds.
 
   Args:
-    facts: for the rows.
+    rows: for the rows.
     task: its name.
     agent: an option of the group.
     overrides: of the run's configuration.
@@ -38,17 +38,17 @@ def measure(
     watch_memory: whether to query the GPU driver for the memory in use.
     num_agents: agents in one program, each with a seed of its own; their steps are added up.
   """
-  with used_memory(facts, seeds[0]) if watch_memory else nullcontext():
-    subject = Subject.build(facts, task, agent, overrides, num_agents)
-    trainer, conditions = subject.trainer, facts["conditions"]
+  with used_memory(rows, seeds[0]) if watch_memory else nullcontext():
+    subject = Subject.build(rows, task, agent, overrides, num_agents)
+    trainer, conditions = subject.trainer, rows["conditions"]
     no_evaluation = jax.jit(lambda policy, key, model, settings: ())
     program = compile_program(trainer, no_evaluation, partial(subject.draw, seeds[0]))
-    facts.emit("trace_s", program.trace_s, "s", seed=seeds[0])
-    facts.emit("compile_s", program.compile_s, "s", seed=seeds[0])
+    rows.emit("trace_s", program.trace_s, "s", seed=seeds[0])
+    rows.emit("compile_s", program.compile_s, "s", seed=seeds[0])
     warm_up = 1 + trainer.config.prefill_updates
     for seed in seeds:
       model = program.model if seed == seeds[0] else subject.draw(seed)[0]
-      with alone(facts.lock):
+      with alone(rows.lock):
         state = None  # frees the last seed's state before the next one: a replay buffer is large
         state = program.init(subject.key(seed), model, None, trainer.settings)
 
@@ -58,9 +58,9 @@ def measure(
           return metrics["nonfinite"]
 
         jax.block_until_ready(train(warm_up))
-        if seed == seeds[0] and facts.lock is None:  # with a lock, the time would include waiting for it
-          facts.emit("start_to_first_update_s", process_age_s(), "s", seed=seed)
+        if seed == seeds[0] and rows.lock is None:  # with a lock, the time would include waiting for it
+          rows.emit("start_to_first_update_s", process_age_s(), "s", seed=seed)
         speed, timed = rate(train, trainer.steps_per_update * num_agents, seconds)
       how = f"{timed:.1f} s timed after the first update, no evaluation, no outer resets"
-      facts.emit("training_steps_per_s", speed, "steps/s", seed=seed, conditions=f"{conditions}; {how}")
-    emit_peak(facts, seed=seeds[0])
+      rows.emit("training_steps_per_s", speed, "steps/s", seed=seed, conditions=f"{conditions}; {how}")
+    emit_peak(rows, seed=seeds[0])

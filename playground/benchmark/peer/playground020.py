@@ -103,7 +103,7 @@ def arguments_of(task: str, backend: str, seed: int, agent: str = "ppo") -> Sett
   }
 
 
-def told(arguments: Settings, *names: str) -> str:
+def in_words(arguments: Settings, *names: str) -> str:
   """Settings in words."""
   return ", ".join(f"{name} {arguments[name]}" for name in (*SIZES, *names) if name in arguments)
 
@@ -133,7 +133,7 @@ def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: Ca
     "epoch_steps": epoch_steps,
     "update_steps": update_steps,
     "peak_memory_gib": None if memory is None else memory / 2**30,
-    "settings": told(arguments),
+    "settings": in_words(arguments),
   }
 
 
@@ -163,7 +163,7 @@ def learn(task: str, backend: str, seed: int, num_timesteps: int | None, agent: 
     "steps": evaluations[-1][0],
     "wall_clock_s": evaluations[-1][2] - begin,
     "training_steps_per_s": float(np.median(rates)),
-    "settings": told(arguments, *EVALUATION),
+    "settings": in_words(arguments, *EVALUATION),
   }
 
 

@@ -87,11 +87,11 @@ class _Comparison:
     return self.score / self.equal[0] if self.equal and self.equal[0] > 0 else math.inf
 
   def cells(self) -> list[str]:
-    told = lambda found: f"{found[0]:,.1f} ({found[1]})" if found else "none so early"
+    named = lambda found: f"{found[0]:,.1f} ({found[1]})" if found else "none so early"
     share = f"{self.ratio:.2f}" if math.isfinite(self.ratio) else ""
     steps = f"{self.curve.points[-1][0] / 1e6:,.0f}"
     own = [self.task, self.curve.label, self.curve.actions, f"{self.score:,.1f}", steps]
-    return [*own, told(self.equal), share, "below" * self.below, told(self.best)]
+    return [*own, named(self.equal), share, "below" * self.below, named(self.best)]
 
 
 def _compared(task: str, curve: Curve, theirs: Sequence[Curve]) -> _Comparison:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 from playground.benchmark.measures import environment
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 
 
 class Steps(NamedTuple):
@@ -29,5 +29,5 @@ def test_every_environment_and_every_repeat_of_an_action_counts(monkeypatch: pyt
 
   monkeypatch.setattr(environment.Subject, "build", lambda *_: found)
   monkeypatch.setattr(environment, "rate", rate)
-  environment.measure(Facts(), "A", "ppo", [], seconds=1.0)
+  environment.measure(Rows(), "A", "ppo", [], seconds=1.0)
   assert counted == {"steps": 4 * environment.LENGTH * 3, "taken": [2.0 * environment.LENGTH] * 4}

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from playground.benchmark.measures import runs
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 from playground.config import compose
 
 
@@ -31,8 +31,8 @@ def test_cold_and_warm_share_a_new_cache_and_nothing_else(monkeypatch: pytest.Mo
   monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/somewhere")
   monkeypatch.setattr(runs.signal, "signal", lambda *_: None)
   monkeypatch.setattr(runs.subprocess, "Popen", run)
-  monkeypatch.setattr(Facts, "emit", lambda *_, setting: settings.append(setting))
-  runs.startup(Facts(), "CartpoleBalance", "ppo", ["agent.num_envs=64"], seconds=1.0)
+  monkeypatch.setattr(Rows, "emit", lambda *_, setting: settings.append(setting))
+  runs.startup(Rows(), "CartpoleBalance", "ppo", ["agent.num_envs=64"], seconds=1.0)
   cold, warm = given
   assert settings == ["agent.num_envs=64 cold"] * 3 + ["agent.num_envs=64 warm"] * 3
   assert cold["caches of the user"] == "" and cold["hardware.cache_dir"] == warm["hardware.cache_dir"]

@@ -8,7 +8,7 @@ import pytest
 
 from playground.benchmark.measures import machine, subject
 from playground.benchmark.measures.subject import alone, rate
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 
 
 def test_everything_that_is_timed_is_waited_for(monkeypatch: pytest.MonkeyPatch):
@@ -58,7 +58,7 @@ def test_used_memory_is_the_most_beyond_what_was_there(monkeypatch: pytest.Monke
   found: dict[str, Any] = {}
   monkeypatch.setattr(machine, "_query_gpu", query)
   monkeypatch.setattr(machine, "INTERVAL_S", 0.001)
-  monkeypatch.setattr(Facts, "emit", lambda _, quantity, value, unit, **columns: found.update({quantity: value}))
-  with machine.used_memory(Facts()):
+  monkeypatch.setattr(Rows, "emit", lambda _, quantity, value, unit, **columns: found.update({quantity: value}))
+  with machine.used_memory(Rows()):
     assert enough.wait(10)
   assert found == {"used_memory_gib": 3.0}

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from playground.benchmark.measures import training
-from playground.benchmark.worker import Facts
+from playground.benchmark.worker import Rows
 from playground.config import compose
 
 
@@ -31,10 +31,10 @@ def test_a_seed_begins_anew_and_warms_up_before_the_clock(monkeypatch: pytest.Mo
     key=lambda seed: f"key {seed}",
     draw=lambda seed: (f"model {seed}", None),
   )
-  monkeypatch.setattr(training.Subject, "build", lambda facts, *_: facts.update(conditions="") or found)
+  monkeypatch.setattr(training.Subject, "build", lambda rows, *_: rows.update(conditions="") or found)
   monkeypatch.setattr(training, "compile_program", lambda *_: program)
   monkeypatch.setattr(training, "rate", timed)
-  training.measure(Facts(), "CartpoleBalance", agent, [], seeds=[3, 4], seconds=1.0)
+  training.measure(Rows(), "CartpoleBalance", agent, [], seeds=[3, 4], seconds=1.0)
   assert done == [
     ("train", "key 3 model 3", "model 3", before), "clock",
     ("train", "key 4 model 4", "model 4", before), "clock",
