@@ -1,6 +1,7 @@
 """Which modules may import which; imports inside functions count, and so do those for type checkers."""
 
 import ast
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -74,3 +75,19 @@ def test_imports_between_files_form_no_circle() -> None:
 def test_imports_between_folders_form_no_circle() -> None:
   assert circle(top_folder) == []
   assert circle(folder) == []
+
+
+def test_only_the_parser_of_its_flags_is_a_private_part_of_hydra() -> None:
+  private = {
+    f"{node.module}.{alias.name}"
+    for file in MODULES.values()
+    for node in ast.walk(ast.parse(file.read_text()))
+    if isinstance(node, ast.ImportFrom) and re.match(r"(hydra|omegaconf)(\.\w+)*\._", node.module or "")
+    for alias in node.names
+  }
+  assert private == {"hydra._internal.utils.get_args_parser"}
+
+
+def test_few_lines_hide_a_type_behind_any() -> None:
+  lines = [line for file in MODULES.values() for line in file.read_text().splitlines() if re.search(r"\bAny\b", line)]
+  assert len(lines) < 300
