@@ -59,8 +59,9 @@ class Evidence:
     for rows in groups.values():
       mean, ci95 = mean_and_ci95(row["value"] for row in rows.values())
       figures.append(Figure(mean, ci95, tuple(rows.values())))
-    order = lambda f: (f["device"].startswith("CPU"), _before(f["date"]), -f.mean)
-    return sorted(figures, key=order)
+    figures.sort(key=lambda figure: figure.mean, reverse=True)
+    figures.sort(key=lambda figure: figure["date"], reverse=True)  # sorting is stable
+    return sorted(figures, key=lambda figure: figure["device"].startswith("CPU"))
 
   def best(self, **wanted: str) -> Figure | None:
     """Returns the first of `find`, None if there is none."""
@@ -68,11 +69,6 @@ class Evidence:
 
 
 SAME = ("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "devices", "device", "commit", "note")
-
-
-def _before(date: str) -> list[int]:
-  """Returns a key that sorts later dates first."""
-  return [-ord(character) for character in date] or [0]
 
 
 def _read(path: Path) -> list[dict[str, str]]:

@@ -71,18 +71,13 @@ def _entries(name: str, rows: Mapping[str, Sequence[Row]]) -> list[Entry]:
 
 def _rewrite(path: Path, begin: str, end: str, content: Sequence[Block] | str) -> Path:
   """Writes a page with other content between two comments; returns its path."""
-  text = content if isinstance(content, str) else to_markdown(content, "")
-  write_text(path, _replaced(path, path.read_text(encoding="utf-8"), begin, end, text))
-  return path
-
-
-def _replaced(path: Path, text: str, begin: str, end: str, content: str) -> str:
-  """The text of a page with other content between two comments."""
-  before, found, rest = text.partition(begin)
+  before, found, rest = path.read_text(encoding="utf-8").partition(begin)
   _, closed, after = rest.partition(end)
   if not found or not closed:
     raise ConfigError(f"pages={path.parent}: {path} lacks the line {begin if not found else end}.")
-  return f"{before}{begin}\n\n{content}\n{end}{after}"
+  text = content if isinstance(content, str) else to_markdown(content, "")
+  write_text(path, f"{before}{begin}\n\n{text}\n{end}{after}")
+  return path
 
 
 def _grid(suite: str) -> str:
