@@ -27,7 +27,7 @@ from playground.learning.hyperparameters import (
 )
 from playground.pytree import PyTree
 
-ACTIVATIONS: dict[str, Activation] = {name: getattr(linen, name) for name in get_args(ActivationName)}
+ACTIVATIONS: dict[ActivationName, Activation] = {name: getattr(linen, name) for name in get_args(ActivationName)}
 
 Normalizer = running_statistics.RunningStatisticsState
 ObservationSize = int | Mapping[str, tuple[int, ...]]

@@ -13,6 +13,7 @@ from playground.deploy.policy import ExportedPolicy
 from playground.errors import ConfigError
 from playground.learning.cnn import _POOLS, CNNConfig
 from playground.learning.fast_sac import FastSACNetworks
+from playground.learning.hyperparameters import ActivationName
 from playground.learning.networks import ACTIVATIONS, ActorCritic, NetworkConfig, SoftActorCritic, SoftNetworkConfig
 from tests.dummy import SMALL_FAST_SAC, PointTask
 
@@ -40,7 +41,7 @@ def ends(model: onnx.ModelProto) -> dict[str, list[int]]:
   return {end.name: [dim.dim_value for dim in end.type.tensor_type.shape.dim] for end in both}
 
 
-def networks(activation: str, soft: bool) -> ActorCritic | SoftActorCritic:
+def networks(activation: ActivationName, soft: bool) -> ActorCritic | SoftActorCritic:
   if soft:
     return SoftActorCritic(OBS, ACTIONS, SoftNetworkConfig((16, 8), activation, policy_network_layer_norm=True))
   return ActorCritic(OBS, ACTIONS, NetworkConfig((16, 8), (4,), activation))
@@ -57,7 +58,7 @@ def trained(nets: ActorCritic | SoftActorCritic) -> tuple[Any, Any]:
 
 
 @pytest.mark.parametrize(("activation", "soft"), [*((name, False) for name in ACTIVATIONS), ("relu", True)])
-def test_same_actions(activation: str, soft: bool) -> None:
+def test_same_actions(activation: ActivationName, soft: bool) -> None:
   nets = networks(activation, soft)
   policy, normalizer = trained(nets)
   obs = np.random.default_rng(1).normal(scale=3, size=(20, OBS)).astype(np.float32)
