@@ -1,4 +1,4 @@
-"""Task name to task: a file `configs/env/<TaskName>.yaml` is the registration, `task: module:Class` in it the code.
+"""Builds tasks by name: a file `configs/env/<TaskName>.yaml` registers a task, its `task: module:Class` the code.
 
 Outside packages add tasks through an entry point of the group `playground.tasks`:
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
   from playground.envs.base import Env
 
-ALL_ENVS: tuple[str, ...]  # every task's name, read when asked for
+ALL_ENVS: tuple[str, ...]  # names of all tasks, read on access
 
 
 def __getattr__(name: str) -> tuple[str, ...]:
@@ -53,12 +53,12 @@ def __getattr__(name: str) -> tuple[str, ...]:
 
 
 def names(word: str | None = None) -> list[str]:
-  """Names of all tasks, sorted; with a word, of those that contain it (in any case)."""
+  """Returns the names of all tasks, sorted; with a word, only names that contain it (ignoring case)."""
   return [name for name in task_names() if word is None or word.lower() in name.lower()]
 
 
 def config(name: str) -> TaskConfig:
-  """A task's configuration as its file has it, the robot under `robot`: a fresh copy, yours to change.
+  """Returns a copy of the configuration that a task's file defines, with the robot's under `robot`.
 
   Raises:
     UnknownNameError: no such task.
@@ -107,7 +107,7 @@ def build(env_config: TaskConfig) -> "Env":
     return env
   from playground.rendering.vision import Vision
 
-  return cast("Env", Vision(env))  # it is one in all but class
+  return cast("Env", Vision(env))  # it has the interface of `Env`, without being a subclass
 
 
 def task_class(task: str) -> "type[Env]":
@@ -125,7 +125,7 @@ def task_class(task: str) -> "type[Env]":
 
 
 class DomainRandomizer(Protocol):
-  """Draws models, as Brax's wrappers ask for them."""
+  """Draws randomised models for Brax's wrappers."""
 
   def __call__(self, mjx_model: "mjx.Model", rng: "jax.Array") -> "tuple[mjx.Model, mjx.Model]":
     """Returns the model with drawn fields, [N, ...], and the axes of `vmap` of all its fields."""
@@ -133,7 +133,7 @@ class DomainRandomizer(Protocol):
 
 
 def get_domain_randomizer(name: str) -> DomainRandomizer | None:
-  """The task's randomisation as Playground 0.2.0 gave it, or None if it has none.
+  """Returns the task's randomisation as a function like those of Playground 0.2.0; None if the task has none.
 
   Returns:
     A function of a model and keys [N], which returns the model with a leading axis N on every randomised field, and the
@@ -153,7 +153,7 @@ def get_domain_randomizer(name: str) -> DomainRandomizer | None:
 
 
 def _composed(name: str) -> RunConfig:
-  """The composition of a task alone: no tuned set, whose env values belong to an algorithm."""
+  """Composes a task without a tuned set, whose values for the task belong to an algorithm."""
   if name not in (task_names() if "/" not in name else options("env")):
     raise UnknownNameError(f"Task {name!r} does not exist; `playground list` shows all.{nearest(name, task_names())}")
   return compose([f"env={name}", "tuned=null"])

@@ -91,7 +91,7 @@ class GymEnv(gymnasium.Env[PyTree, np.ndarray]):
     if self._renderer is None:
       model.vis.global_.offheight, model.vis.global_.offwidth = _HEIGHT, _WIDTH
       self._renderer = _open_renderer(model)
-      atexit.register(_close, weakref.ref(self))  # later, when modules are torn down, OpenGL fails
+      atexit.register(_close, weakref.ref(self))  # before modules are torn down, after which OpenGL fails
     data = mujoco.MjData(model)
     for name in ("qpos", "mocap_pos", "mocap_quat"):
       getattr(data, name)[:] = getattr(state.data, name)[0]

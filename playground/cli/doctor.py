@@ -1,4 +1,4 @@
-"""`playground doctor`: checks this machine for training and says how to install what is missing."""
+"""`playground doctor`: checks this machine, and prints how to install missing packages."""
 
 import contextlib
 import importlib
@@ -98,7 +98,7 @@ def _import_error(module: str) -> str:
     # mujoco.mjx prints "Failed to import warp: …" where Warp is not installed.
     with contextlib.redirect_stdout(io.StringIO()):
       importlib.import_module(module)
-  except Exception as error:  # a broken install fails in any way it likes
+  except Exception as error:  # a broken installation raises any type of error
     return f"import fails: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
   return ""
 

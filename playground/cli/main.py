@@ -26,7 +26,7 @@ _NUMBERS = {
 }
 
 
-# Commands that read the command line themselves: module and help.
+# Commands with their own parsers: module and help.
 _PROGRAMS = {
   "train": ("playground.cli.run", "Train a policy, or sweep with -m; the same as playground-run."),
   "bench": ("playground.cli.bench", "Measure speed and memory; the same as playground-bench."),
@@ -126,7 +126,9 @@ def _parser() -> argparse.ArgumentParser:
   export.add_argument("--out", metavar="FOLDER", help="folder to write to (default: <run>/export)")
   play = add("play", _play, "Run a policy in plain C MuJoCo: measure it, film it or watch it.")
   play.add_argument("policy", help=f"{_RUN}, or a policy.onnx beside its policy.yaml")
-  play.add_argument("--agent", choices=("zero", "random"), help="act so on a task instead of with a policy")
+  play.add_argument(
+    "--agent", choices=("zero", "random"), help="zero or random actions on a task, in place of a policy"
+  )
   play.add_argument("--episodes", type=int, default=10, help="episodes to measure (default: %(default)s)")
   play.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
   shown = _add_places(play, "also render an episode to this .mp4")
@@ -135,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
   view.add_argument("task", help="a task of `playground list`")
   view.add_argument("overrides", nargs="*", help="as for playground-run, such as terrain=stairs")
   view.add_argument(
-    "--agent", choices=("zero", "random"), default="zero", help="what the actions are (default: %(default)s)"
+    "--agent", choices=("zero", "random"), default="zero", help="zero or random actions (default: %(default)s)"
   )
   view.add_argument("--randomize", action="store_true", help="draw the model by the task's startup events")
   view.add_argument("--no-events", action="store_true", help="switch pushes and other interval events off")
@@ -144,7 +146,7 @@ def _parser() -> argparse.ArgumentParser:
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
   pretrained.add_argument("--add", metavar="RUN", help="measure a run's policy in C MuJoCo and put it into the package")
   pretrained.add_argument(
-    "--note", default="", metavar="TEXT", help="with --add: what else its card says of the training"
+    "--note", default="", metavar="TEXT", help="with --add: a remark on the training, for its card"
   )
   sweep = add("sweep", _sweep, "Show a sweep, collect its results, or run its missing jobs.")
   sweep.add_argument(

@@ -49,14 +49,14 @@ def play(
   port: int = 8080,
   console: Console | None = None,
 ) -> int:
-  """Runs a policy with ONNX Runtime in C MuJoCo, with the task's rate, noise, pushes, delays and nominal model.
+  """Runs a policy with ONNX Runtime in C MuJoCo, with the task's rate, noise, pushes and delays, on the nominal model.
 
   Args:
     path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it; with `agent` a
       task.
     agent: zero or random actions in place of a policy; None is the policy of `path`.
     overrides: with `agent`: as for playground-run.
-    randomize: with `agent`: whether the task's startup events change the model once.
+    randomize: with `agent`: whether the task's startup events draw the model.
     interval_events: with `agent`: whether pushes and other interval events act.
     episodes: number of episodes to measure.
     seed: of the episodes.
@@ -194,7 +194,7 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
     raise
   except Exception as error:  # of any type: the file may hold anything
     reason = f"{type(error).__name__}: {first_line(error)}"
-    raise CheckpointError(f"{path}: the `env` of its contract makes no task ({reason}).") from error
+    raise CheckpointError(f"{path}: the `env` of its contract describes no valid task ({reason}).") from error
   return env
 
 

@@ -1,4 +1,4 @@
-"""`playground sweep status|collect|retry|stop <folder>`: works on the files of a sweep alone."""
+"""`playground sweep status|collect|retry|stop <folder>`: commands that read only the files of a sweep."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from playground.sweep.worker import job_command
 
 
 def status(folder: str) -> int:
-  """Prints how every job stands."""
+  """Prints the status of every job."""
   sweep = SweepDirectory.open(folder)
   Console().print(status_table(sweep, sweep.states(), rows=None))
   return 0

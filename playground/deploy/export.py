@@ -53,8 +53,8 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   exported = export_policy(trained, state)
   error = check_parity(exported, obs, actions)
   folder.mkdir(parents=True, exist_ok=True)
-  # The contract first, which has the model's hash: whatever ends this in between, the pair that it leaves is refused,
-  # even where the export before had no hash.
+  # The contract is written first. It has the model's hash, so loading refuses the pair of files that remains if the
+  # process ends between the two, even over an older export without a hash.
   write_text(folder / "policy.yaml", _yaml(exported.contract))
   with replacing(folder / "policy.onnx") as temporary:
     temporary.write_bytes(exported.model)

@@ -1,4 +1,4 @@
-"""The checkpoints that the viewer offers: those of a run, or of all stages of a chain."""
+"""Lists the checkpoints that the viewer offers: those of a run, or of all stages of a chain."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,14 +7,14 @@ from playground.errors import CheckpointError
 from playground.learning.checkpoints import BEST, find_checkpoints, find_stages
 from playground.runs.loaded_policy import LoadedPolicy
 
-# Keys of a run's config that give meaning to what an actor reads and gives; how many numbers that is, its arrays tell.
+# Keys of a run's config that define the meaning of an actor's inputs and outputs; its arrays define their sizes.
 _ENV = ("task", "robot", "observations", "observation_order", "observation_frames", "vision")
 _CONTROL = ("ctrl_dt", "action_repeat", "action_base", "action_scale", "clip_targets")
 _MEANING = {"env": (*_ENV, *_CONTROL), "agent": ("name", "network", "normalize_observations")}
 
 
 class Menu:
-  """The checkpoints that lie on disk, as training adds and removes them.
+  """The checkpoints on disk, which training adds and removes.
 
   A stage of a chain is left out, with a sentence, if its policies do not fit the task of the newest stage.
 

@@ -1,4 +1,4 @@
-"""A task under a policy, step by step, with the commands and pushes of the person who watches it."""
+"""Steps a task with a policy, and applies the user's commands and pushes."""
 
 import copy
 import time
@@ -24,7 +24,7 @@ class Player:
     exported: the policy; it may be replaced at any time.
     state: the present state.
     previous_qpos: joint positions one policy step before `state`, [nq].
-    command: forward m/s, left m/s, turn rad/s; None leaves it to the task, which draws one from time to time.
+    command: forward m/s, left m/s, turn rad/s; with None, the task draws commands itself.
     manual_action: acts instead of the policy, in [-1, 1], [action_size]; None lets the policy act.
     action: the last action, [action_size].
     force: external forces and torques in the next policy steps, world frame, N and N m, [nbody, 6].
@@ -50,7 +50,7 @@ class Player:
     self.reset()
 
   def copy(self, seed: int) -> "Player":
-    """Returns another environment of the same task, policy and compiled functions, in an episode of its own."""
+    """Returns another environment with the same task, policy and compiled functions, in a separate episode."""
     other = copy.copy(self)
     other._seed(seed)
     other.reset()
@@ -83,7 +83,7 @@ class Player:
     return self.state
 
   def show_present(self) -> None:
-    """Makes the present state the one that poses are interpolated from."""
+    """Interpolates poses from the present state on."""
     self.previous_qpos = np.asarray(self.state.data.qpos)
 
   @property
@@ -92,11 +92,11 @@ class Player:
 
   @property
   def task_command(self) -> np.ndarray:
-    """The command in force, of the task or of the person who watches."""
+    """The present command, of the task or of the user."""
     return np.asarray(self.state.info[_COMMAND]) if self.command is None else self.command
 
   def push(self, speed: float) -> None:
-    """Adds `speed` m/s (rad/s) to what moves freely (else to the first joint), in a random horizontal direction."""
+    """Adds `speed` in a random horizontal direction to the free body, m/s, else to the first joint, m/s or rad/s."""
     model = self.env.mj_model
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     angle = self._directions.uniform(0, 2 * np.pi)

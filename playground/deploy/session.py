@@ -1,4 +1,4 @@
-"""Runs environments in time for a viewer, and carries out what the viewer asks for between policy steps."""
+"""Runs environments in real time for a viewer, and handles the viewer's requests between policy steps."""
 
 import queue
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class Session:
     players: the environments. Changing the terrain replaces all of them.
     selected: index of the environment that is plotted and followed.
     trained: the run's policy that acts; None without a run.
-    following: `LATEST` or `BEST` to change to that checkpoint as training writes it, None to keep the present one.
+    following: `LATEST` or `BEST` to load that checkpoint when training writes it, None to keep the present one.
     paused: whether time stands still.
     speed: simulated seconds per second.
     on_step: functions that are called with the selected environment after each of its policy steps.
@@ -59,7 +59,7 @@ class Session:
     return self.players[min(self.selected, len(self.players) - 1)]
 
   def set_num_envs(self, number: int) -> None:
-    """Adds environments, each in an episode of its own, or removes the last ones."""
+    """Adds environments, each in a separate episode, or removes the last ones."""
     first, have = self.players[0], len(self.players)
     self.players = self.players[:number] + [first.copy(self._seed + i) for i in range(have, number)]
 
@@ -69,7 +69,7 @@ class Session:
       player.command = command
 
   def ask(self, request: Callable[[], None]) -> None:
-    """Queues a function to call between two policy steps, unless too many wait already."""
+    """Queues a function to call between two policy steps; drops it if the queue is full."""
     if self._requests.qsize() < _MOST_REQUESTS:
       self._requests.put(request)
 

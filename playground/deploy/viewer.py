@@ -1,4 +1,4 @@
-"""Shows a policy in MuJoCo's native viewer: push with the mouse, steer with the arrow keys."""
+"""Shows a policy in MuJoCo's native viewer, with pushes by mouse and commands by arrow keys."""
 
 import os
 import sys
@@ -18,10 +18,10 @@ from playground.runs.interrupts import noted_signals
 
 # GLFW's codes of the keys -> component of the command, direction.
 _STEERING = {265: (0, 1), 264: (0, -1), 263: (2, 1), 262: (2, -1), ord(","): (1, 1), ord("."): (1, -1)}
-_AS_THE_TASK_DRAWS, _RESET = 259, 257  # backspace, enter
+_AUTOMATIC, _RESET = 259, 257  # backspace, enter
 _CLOSING = 5.0  # s for a window to close
 _HELP = (
-  "Keys: up and down go, left and right turn, comma and period go sideways, backspace leaves commands to the task, "
+  "Keys: up and down go, left and right turn, comma and period go sideways, backspace: automatic commands, "
   "enter resets. Double-click a body, then hold ctrl and drag with the right button to push it."
 )
 
@@ -60,7 +60,7 @@ def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
   def on_key(key: int) -> None:
     if key == _RESET:
       player.reset()
-    elif key == _AS_THE_TASK_DRAWS:
+    elif key == _AUTOMATIC:
       player.command = None
     elif key in _STEERING and player.takes_commands:
       component, sign = _STEERING[key]

@@ -79,9 +79,9 @@ def render_video(
   view = {"camera": camera, "width": width, "height": height, "seen": seen}
   trajectory = _pack(mj_model, qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat, dt=dt, **view)
   environment = gl_environment(backend) | {
-    # The child runs this very package, whatever its folder.
+    # The child imports this package, from any working directory.
     "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
-    "JAX_PLATFORMS": "cpu",  # and must never use the GPU memory of training
+    "JAX_PLATFORMS": "cpu",  # the child must not use the GPU memory of training
   }
   scratch = Path(tempfile.gettempdir()).absolute() / f"playground_video_{secrets.token_hex(8)}"
   theirs, ours = os.pipe()
@@ -103,7 +103,7 @@ def render_video(
         reason = f"rendering with MUJOCO_GL={backend} took longer than {timeout_s:g} s"
       finally:
         with contextlib.suppress(OSError):
-          os.killpg(child.pid, signal.SIGKILL)  # the whole group: else the encoder would continue and write its file
+          os.killpg(child.pid, signal.SIGKILL)  # the whole group, else the encoder continues and writes its file
   finally:
     os.close(theirs)
     os.close(ours)
@@ -118,7 +118,7 @@ def need_place(video: str | None, camera: str | None = None) -> Path | None:
   """Returns the path of `--video`, None without one.
 
   Raises:
-    ConfigError: the path is not writable, or only `--camera` was given.
+    ConfigError: the path is not writable, or `--camera` was passed without `--video`.
   """
   if video is None:
     if camera is not None:
@@ -130,7 +130,7 @@ def need_place(video: str | None, camera: str | None = None) -> Path | None:
 
 
 def need_camera(model: "mujoco.MjModel", name: str | None, option: str) -> None:
-  """Raises UnknownNameError, which names the option that it is of, for a camera that the model has not; None is any."""
+  """Raises UnknownNameError, which names the option, if the model lacks the camera; None is valid."""
   if name is not None and name not in (names := camera_names(model)):
     have = ", ".join(names) or "none"
     raise UnknownNameError(f"{option}={name} is no camera of the model; it has {have}.{nearest(name, names)}")
@@ -262,7 +262,7 @@ def follow(view: "mujoco.MjvCamera", model: "mujoco.MjModel") -> None:
 
 
 def walks(model: "mujoco.MjModel") -> bool:
-  """Whether to follow the first body: a robot that may walk out of the image, but no free object on a table."""
+  """Returns whether the first body is a walking robot, which may leave the image, and not a free object on a table."""
   import mujoco
 
   roots = [model.body_rootid[b] for b in model.jnt_bodyid]

@@ -16,7 +16,7 @@ from playground.rendering.video import camera_names
 from playground.text import format_value
 
 _CHANNELS = {"rgb": 3, "gray": 1, "depth": 1, "segmentation": 1}
-_MAX_GEOMS = 255  # ids that fit in a byte, beside nothing
+_MAX_GEOMS = 255  # ids that fit in a byte, besides the value for no geom
 
 
 class Vision(Wrapper):

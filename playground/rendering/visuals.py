@@ -1,4 +1,4 @@
-"""Chooses the visuals of a robot in videos: our primitives, or the meshes of its model in MuJoCo Menagerie."""
+"""Chooses the visuals of a robot in videos: primitives, or the meshes of its model in MuJoCo Menagerie."""
 
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,7 @@ def _menagerie_spec(robot: str) -> mujoco.MjSpec:
     return mujoco_menagerie.get(name).spec(entry)
   except (mujoco_menagerie.MenagerieError, OSError) as error:
     remedy = f"run `mujoco-menagerie prefetch {name}` where there is a network, or set video.visuals=primitives"
-    raise HardwareError(f"video.visuals=menagerie: the meshes cannot be had ({error}): {remedy}.") from None
+    raise HardwareError(f"video.visuals=menagerie: the meshes are not available ({error}): {remedy}.") from None
 
 
 def dress(spec: mujoco.MjSpec, source: mujoco.MjSpec) -> None:

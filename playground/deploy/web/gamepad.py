@@ -1,7 +1,7 @@
-"""A gamepad at the machine that the browser runs on.
+"""Reads gamepads of the machine that the browser runs on.
 
-viser has no gamepads. The page is given a script, in a frame of its own, that notes the gamepad's state in the
-browser's local storage, and that is what viser can read.
+viser does not support gamepads. A script in a separate frame of the page writes the gamepad's state to the browser's
+local storage, which viser can read.
 """
 
 import dataclasses
@@ -22,13 +22,13 @@ _SCRIPT = """<script>
     localStorage.setItem(entry, note);
   }, 20);
 </script>"""
-_DEADBAND = 0.1  # of a stick's way
-_OFTEN, _SELDOM = 0.03, 0.5  # s between two looks, with a gamepad and without
-_PATIENCE = 5.0  # s for a browser's answer
+_DEADBAND = 0.1  # of a stick's range
+_OFTEN, _SELDOM = 0.03, 0.5  # s between two readings, with a gamepad and without
+_TIMEOUT = 5.0  # s for a browser's answer
 
 
 class _Note(msgspec.Struct):
-  """What the script writes."""
+  """The state that the script writes."""
 
   axes: Annotated[list[Annotated[float, msgspec.Meta(ge=-2.0, le=2.0)]], msgspec.Meta(min_length=3)]
   pressed: list[bool]
@@ -36,11 +36,11 @@ class _Note(msgspec.Struct):
 
 @dataclasses.dataclass(frozen=True)
 class Pad:
-  """What a gamepad of the standard layout says.
+  """The state of a gamepad with the standard layout.
 
   Attributes:
     sticks: left one forward, left one left, right one left, in [-1, 1].
-    pressed: numbers of the buttons that are down.
+    pressed: numbers of the pressed buttons.
   """
 
   sticks: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -48,7 +48,7 @@ class Pad:
 
   @classmethod
   def read(cls, note: str) -> "Pad":
-    """Reads what the script wrote; anything else is a gamepad that nobody touches."""
+    """Parses the script's state; an invalid one is that of a gamepad at rest."""
     try:
       said = msgspec.json.decode(note, type=_Note)
     except msgspec.MsgspecError:
@@ -67,13 +67,13 @@ class Gamepads:
     steer: Callable[[Sequence[float]], None],
     buttons: Mapping[int, Callable[[], None]],
   ):
-    """Begins to listen.
+    """Starts listening.
 
     Args:
       server: the browsers'.
-      ask: has the following done at a time that suits them.
-      steer: takes `Pad.sticks` when they have moved.
-      buttons: what to do when a button goes down, by its number.
+      ask: queues a function, to call between two policy steps.
+      steer: called with `Pad.sticks` when they have moved.
+      buttons: called when a button is pressed, by its number.
     """
     self._server = server
     self._ask, self._steer, self._buttons = ask, steer, buttons
@@ -91,10 +91,10 @@ class Gamepads:
     last, pause = Pad(), _SELDOM
     while not self._closed.wait(pause) and client.client_id in self._server.get_clients():
       try:
-        note = client.local_storage.get_item(_ENTRY, timeout=_PATIENCE)
+        note = client.local_storage.get_item(_ENTRY, timeout=_TIMEOUT)
       except TimeoutError:  # the page sleeps in the background
         continue
-      except RuntimeError:  # it is closed, or keeps no local storage
+      except RuntimeError:  # the page is closed, or has no local storage
         return
       now = Pad.read(note) if note else Pad()
       self._tell(last, now)

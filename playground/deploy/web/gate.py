@@ -1,8 +1,8 @@
-"""Who may talk to the viewer in the browser, and what they may say.
+"""Restricts who can connect to the viewer in the browser, and which messages they can send.
 
-viser answers whoever connects. A web page that the user opens elsewhere could connect, too (a websocket knows no
-same-origin policy), and anybody on the network if the viewer listens there. The gate stands before viser's own handling
-of requests and messages, in the places that `websockets` has for it.
+viser accepts every connection: of a web page from another site (websockets have no same-origin policy), and of every
+machine on the network if the viewer listens there. The gate checks requests and messages before viser handles them, in
+the hooks that `websockets` has for this purpose.
 """
 
 import asyncio
@@ -80,11 +80,11 @@ class Gate:
 
   Attributes:
     server: viser's.
-    url: the address to open, with the token where one is asked for.
+    url: the address to open, with the token if connections need one.
   """
 
   def __init__(self, host: str, port: int, title: str = "playground"):
-    """Starts viser's server behind the gate; a token is asked for unless only this machine can connect.
+    """Starts viser's server behind the gate; connections need a token unless only this machine can connect.
 
     Args:
       host: the address to listen at.
@@ -99,7 +99,7 @@ class Gate:
     self.url = f"http://{name}:{self.server.get_port()}/" + (f"?token={self._token}" if self._token else "")
 
   def check(self, request: Request) -> str:
-    """Why a request is refused, '' if it is not."""
+    """Returns why a request is refused, "" if it is accepted."""
     if not hasattr(self, "server"):
       return "the server has not started yet"
     hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
@@ -108,9 +108,9 @@ class Gate:
     except ValueError:
       return "a request names one host"
     if self._token is None and not (name in ("localhost", self._host) or _is_address_of_loopback(name)):
-      # A page elsewhere whose name was made to lead here (DNS rebinding).
+      # a page of another site whose name resolves to this machine (DNS rebinding)
       return f"this server is for this machine alone, as {self._host}, and not as {name}"
-    if origins and [urlsplit(origin).netloc for origin in origins] != hosts:  # a browser tells it, and no page can lie
+    if origins and [urlsplit(origin).netloc for origin in origins] != hosts:  # set by the browser, not by the page
       return f"a page of {origins[0]} may not connect"
     if self._token is not None and not any(
       hmac.compare_digest(t.encode(), self._token.encode()) for t in self._told(request)
@@ -119,7 +119,7 @@ class Gate:
     return ""
 
   def admit(self, raw: object) -> bytes | None:
-    """A message as viser may have it; None for one that the page does not send, or whose value cannot be."""
+    """Returns a message for viser; None if the page does not send such messages, or if its value is invalid."""
     try:
       message = _DECODER.decode(raw) if isinstance(raw, bytes) else None
     except msgspec.MsgspecError:
@@ -129,8 +129,8 @@ class Gate:
     return msgspec.msgpack.encode(message)
 
   def _fits(self, message: _GuiUpdateMessage) -> bool:
-    """Whether a control can have the value; callbacks of menus look their value up."""
-    handle = self.server.gui._gui_input_handle_from_uuid.get(message.uuid)  # viser has no public way from id to control
+    """Returns whether a control can have the value; callbacks of menus check their values themselves."""
+    handle = self.server.gui._gui_input_handle_from_uuid.get(message.uuid)  # viser has no public lookup
     value = message.updates.value
     if isinstance(handle, viser.GuiSliderHandle):
       return isinstance(value, float) and handle.min <= value <= handle.max
@@ -139,7 +139,7 @@ class Gate:
     return isinstance(handle, viser.GuiCheckboxHandle | viser.GuiButtonHandle) and isinstance(value, bool)
 
   def _told(self, request: Request) -> list[str]:
-    """Tokens in a request's address and cookies."""
+    """Returns the tokens in a request's address and cookies."""
     cookies = [
       pair.strip().partition("=") for header in request.headers.get_all("Cookie") for pair in header.split(";")
     ]
@@ -147,7 +147,7 @@ class Gate:
     return told + parse_qs(urlsplit(request.path).query).get("token", [])
 
   def _start(self, host: str, port: int) -> viser.ViserServer:
-    """viser's server, which calls `serve` of `websockets` while it is made and hands on no options of it."""
+    """Starts viser's server, which calls `serve` of `websockets` in its constructor and passes no options to it."""
     serve, began = websockets.asyncio.server.serve, []
 
     def guarded(*args: Any, process_request: Callable[..., Response | None], **options: Any) -> Any:
@@ -157,7 +157,9 @@ class Gate:
 
     websockets.asyncio.server.serve = guarded
     try:
-      with contextlib.redirect_stdout(io.StringIO()):  # its banner, which has no option, would name no token
+      with contextlib.redirect_stdout(
+        io.StringIO()
+      ):  # viser cannot switch off its banner, whose address lacks the token
         server = viser.ViserServer(host, port, label=self._title, verbose=False)
     finally:
       websockets.asyncio.server.serve = serve
@@ -180,7 +182,7 @@ class Gate:
 
 
 class _Connection(ServerConnection):
-  """A connection on which viser hears only what the gate admits."""
+  """A connection that passes only admitted messages to viser."""
 
   def __init__(self, gate: Gate, *args: Any, **options: Any):
     super().__init__(*args, **options)
@@ -193,7 +195,7 @@ class _Connection(ServerConnection):
 
 
 def need_port(host: str, port: int) -> None:
-  """Raises ConfigError where nothing can be served."""
+  """Raises ConfigError if the server cannot listen at this address."""
   if not host.strip():
     raise ConfigError(f"--host={host!r} is empty: name an address of this machine, or 0.0.0.0 for all.")
   try:
@@ -215,7 +217,7 @@ def _set_title(response: Response, title: str) -> None:
 
 
 def _is_loopback(host: str, port: int) -> bool:
-  """Whether an address leads to this machine alone."""
+  """Returns whether only this machine can connect to an address."""
   return all(_is_address_of_loopback(found[4][0]) for found in socket.getaddrinfo(host, port))
 
 

@@ -12,7 +12,7 @@ _PRECISION = 1e-3  # of a slider's value
 
 
 class Joints:
-  """The joints' positions, which can be set while time is paused, and the actions, which can be set by hand.
+  """Shows joint positions, which the user can set while time is paused, and actions, which the user can set by hand.
 
   Attributes:
     joints: a slider for each hinge and slide joint, by its address in `qpos`.
@@ -42,7 +42,7 @@ class Joints:
     self._shown: object = None
 
   def draw(self) -> None:
-    """Shows positions and actions, but for what is being set by hand."""
+    """Shows the present positions and actions, except those that the user sets."""
     player, paused = self._session.player, self._session.paused
     for slider in self.actions:
       slider.disabled = not self.by_hand.value
@@ -57,13 +57,13 @@ class Joints:
         _show(slider, float(player.state.data.qpos[address]))
 
   def _act(self) -> None:
-    """Lets the sliders or the policy act."""
+    """Makes the sliders or the policy act."""
     values = np.array([slider.value for slider in self.actions], np.float32) if self.by_hand.value else None
     for player in self._session.players:
       player.manual_action = values
 
   def _pose(self, address: int) -> None:
-    """Moves a joint to its slider, unless the slider only shows where it is."""
+    """Moves a joint to its slider's position, unless the slider only shows the present one."""
     session, slider = self._session, self.joints[address]
 
     def pose() -> None:

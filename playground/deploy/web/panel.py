@@ -20,7 +20,7 @@ from playground.deploy.web.view import View
 from playground.robots.terrain import TERRAINS
 
 Key = Any  # a literal type of viser that is not public
-# Component of the command, key that adds to it, key that takes away; viser moves its camera with WASD, QE and arrows.
+# Component of the command, key that increases it, key that decreases it; viser uses WASD, QE and arrows for its camera.
 AXES: tuple[tuple[str, Key, Key], ...] = (
   ("forward, m/s", "I", "K"),
   ("left, m/s", "U", "O"),
@@ -50,7 +50,7 @@ _KEYS = """
 | second button | reset |
 | start | pause |
 """
-_ELSE = 1.0  # m/s and rad/s: the sliders' range for a task without one
+_DEFAULT_RANGE = 1.0  # m/s and rad/s, of the sliders if the task has no range
 
 
 class Panel:
@@ -107,14 +107,14 @@ class Panel:
       self._offer(choices)
 
   def say(self, title: str, body: str, color: Literal["red", "blue"] = "red") -> None:
-    """Shows a sentence to all who watch."""
+    """Shows a sentence in all browsers."""
     for client in self._server.get_clients().values():
       client.add_notification(title, body, color=color, auto_close_seconds=10.0)
 
   def _add_command(self) -> list[viser.GuiSliderHandle[float]]:
     player = self._session.player
     told = player.exported.contract.get("command") or {}
-    high = np.array(told.get("max") or [_ELSE] * len(AXES))
+    high = np.array(told.get("max") or [_DEFAULT_RANGE] * len(AXES))
     low = -high if told.get("min") is None else np.array(told["min"])
     sliders: list[viser.GuiSliderHandle[float]] = []
 
@@ -167,7 +167,7 @@ class Panel:
   def _choose_terrain(self, name: str) -> None:
     if name in TERRAINS:
       self._ask(lambda: self._session.choose_terrain(name))
-    elif self._session.terrain is not None:  # no entry of the menu, which only a client that is no browser sends
+    elif self._session.terrain is not None:  # not in the menu: sent by a client that is no browser
       self.terrain.value = self._session.terrain
 
   def _choose_checkpoint(self, label: str) -> None:
@@ -178,7 +178,7 @@ class Panel:
       self.checkpoint.value = self._chosen(self._choices)
 
   def _steer(self, sticks: Sequence[float]) -> None:
-    """Sets the command from sticks in [-1, 1], whose ends are those of the sliders."""
+    """Sets the command from sticks in [-1, 1], scaled to the ranges of the sliders."""
     for slider, stick in zip(self.command, sticks, strict=False):
       _set(slider, stick * slider.max if stick > 0 else -stick * slider.min)
 
@@ -193,11 +193,11 @@ class Panel:
     self.paused.value = not self.paused.value
 
   def _offer(self, choices: Mapping[str, str | Path]) -> None:
-    """Brings the menu of checkpoints up to date."""
-    self._choices |= choices  # a label that is gone may just have been clicked
+    """Updates the menu of checkpoints."""
+    self._choices |= choices  # the user may have clicked a label that was just removed
     if tuple(choices) == self.checkpoint.options:
       return
-    if self.checkpoint.value not in choices:  # the best is another by now
+    if self.checkpoint.value not in choices:  # the best checkpoint has changed
       self.checkpoint.value = self._chosen(choices)
     self.checkpoint.options = tuple(choices)
 
@@ -212,7 +212,7 @@ class Panel:
     return button
 
   def _add_key(self, label: str, key: Key, act: Callable[[], None]) -> None:
-    """A key, and an entry in viser's palette of commands (ctrl K)."""
+    """Adds a key, and an entry in viser's palette of commands (ctrl K)."""
     self._gui.add_command(label, hotkey=key).on_trigger(lambda _: self._session.ask(act))
 
   def _ask(self, act: Callable[[], None]) -> None:
@@ -221,5 +221,5 @@ class Panel:
 
 
 def _set(slider: viser.GuiSliderHandle[float], value: float) -> None:
-  """Moves a slider as far as it goes."""
+  """Moves a slider, at most to the end of its range."""
   slider.value = round(min(max(value, slider.min), slider.max), 2)

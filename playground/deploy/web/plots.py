@@ -17,14 +17,14 @@ _POINTS = 250  # on a line, at most
 _LINES = 20  # in a chart, at most
 _DECIMALS = 6  # uPlot's ticks overflow on ranges near the smallest numbers
 _HEIGHT = 120  # pixels of a chart
-# Pixels of an axis and between its numbers: with uPlot's own a chart this low has one number.
+# Pixels of an axis and between its numbers: with uPlot's defaults the vertical axis of such a low chart has one number.
 _AXES: tuple[viser.uplot.Axis, ...] = ({"size": 26, "space": 60}, {"size": 52, "space": 16})
 _REWARDS, _OBSERVATIONS, _ACTIONS, _NOTHING = "Reward terms", "Observations", "Actions", "Nothing"
 Values = Callable[[Player], np.ndarray]
 
 
 class Plots:
-  """A menu of what to plot, and its charts below it.
+  """A menu of quantities, and the charts of the chosen one.
 
   Attributes:
     choice: the menu.
@@ -63,9 +63,9 @@ class Plots:
       self.charts = {title: self._add_chart(title, size) for title, size in self._sizes.items()}
 
   def _record(self, player: Player) -> None:
-    """Notes the state after a policy step."""
+    """Records the values after a policy step."""
     row = self._values(player)
-    # The axis of time never changes: viser's charts lose it where it gets shorter.
+    # The time axis has a constant length: viser's charts lose an axis that gets shorter.
     self._rows.extend([row] * (1 if self._rows else self._rows.maxlen or 1))
 
   def _add_chart(self, title: str, size: int) -> viser.GuiUplotHandle:
@@ -79,12 +79,12 @@ class Plots:
       axes=_AXES,
       legend=viser.uplot.Legend(show=False),
       height=_HEIGHT,
-      padding=(8, 24, 0, 0),  # the topmost number would be cut
+      padding=(8, 24, 0, 0),  # else the topmost number is cut off
     )
 
 
 def _groups(player: Player) -> Mapping[str, np.ndarray]:
-  """The state's observation groups that are vectors, by name."""
+  """Returns the observation groups that are vectors, by name."""
   obs = player.state.obs
   groups = obs if isinstance(obs, Mapping) else {"state": obs}
   return {name: np.asarray(value) for name, value in groups.items() if np.ndim(value) == 1}
@@ -98,7 +98,7 @@ def _quantities(choice: str, player: Player) -> tuple[dict[str, int], Values]:
   if choice == _ACTIONS:
     return dict.fromkeys(action_names(player), 1), lambda now: np.asarray(now.action)
   group = choice.removeprefix(f"{_OBSERVATIONS}: ")
-  if group not in (groups := _groups(player)):  # nothing, or a choice that no menu offers
+  if group not in (groups := _groups(player)):  # nothing, or a value that is not in the menu
     return {}, lambda now: np.zeros(0)
   sizes, size = player.env.observation_parts.get(group, {}), len(groups[group])
   if sum(sizes.values()) != size:  # frames, one after another
@@ -107,7 +107,7 @@ def _quantities(choice: str, player: Player) -> tuple[dict[str, int], Values]:
 
 
 def action_names(player: Player) -> list[str]:
-  """Names of the actions: those of their actuators, if each action has one."""
+  """Returns the names of the actions: those of their actuators, if each action has one."""
   model, size = player.env.mj_model, player.env.action_size
   names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
   return [names[i] or f"actuator {i}" if model.nu == size else f"action {i}" for i in range(size)]

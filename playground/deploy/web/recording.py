@@ -1,4 +1,4 @@
-"""Records what happens as a video, which the browser downloads."""
+"""Records the selected environment as a video, which the browser downloads."""
 
 import tempfile
 import threading
@@ -17,18 +17,18 @@ _FIELDS = ("qpos", "mocap_pos", "mocap_quat")
 
 
 class Recorder:
-  """Notes the selected environment's states while it records, and renders them when it ends."""
+  """Collects the selected environment's states, and renders them when the recording ends."""
 
   def __init__(
     self, server: viser.ViserServer, session: Session, camera: Callable[[], str | None], say: Callable[..., None]
   ):
-    """Records nothing yet.
+    """Prepares for recordings, without starting one.
 
     Args:
       server: whose browsers get the video.
       session: what to record.
       camera: returns the model's camera to film with, None for the default.
-      say: the panel's.
+      say: shows a sentence in the browsers.
     """
     self._server, self._session, self._camera, self._say = server, session, camera, say
     self._player: Player | None = None
@@ -41,7 +41,7 @@ class Recorder:
     return None if self._player is None else len(self._states) * self._player.period
 
   def toggle(self) -> None:
-    """Begins to record, or ends and renders the video in another thread."""
+    """Starts recording, or stops and renders the video in another thread."""
     player, self._player = self._player, None
     if player is None:
       self._player, self._states = self._session.player, []
@@ -52,7 +52,7 @@ class Recorder:
     if self._player is None:
       return
     if player is not self._player or len(self._states) * player.period >= _LONGEST:
-      self.toggle()  # another environment or model cannot be in the same video
+      self.toggle()  # a video shows one environment and one model
     else:
       self._states.append(tuple(np.asarray(getattr(player.state.data, name)) for name in _FIELDS))
 

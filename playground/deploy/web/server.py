@@ -10,9 +10,9 @@ from playground.deploy.web.panel import Panel
 from playground.errors import PlaygroundError
 from playground.runs.interrupts import noted_signals
 
-_FRAME = 1 / 30  # s between two frames: more than a browser without a GPU can draw
-_DRAW = 0.25  # s between two updates of what changes slowly: text, plots, the run's checkpoints
-_LONGEST = 0.1  # s that may pass at once; a machine that is too slow falls behind
+_FRAME = 1 / 30  # s between two frames; a browser without a GPU draws fewer
+_DRAW = 0.25  # s between two updates of text, plots and checkpoints
+_LONGEST = 0.1  # s of simulation per frame, at most; a slow machine falls behind
 
 
 class Watch:
@@ -22,7 +22,7 @@ class Watch:
     """Starts serving.
 
     Raises:
-      ConfigError: the port is taken, or is none of this machine's.
+      ConfigError: the port is taken, or the address is not one of this machine.
     """
     need_port(host, port)
     self.session = session
@@ -33,7 +33,7 @@ class Watch:
     self._drawn = 0.0
 
   def frame(self) -> None:
-    """Carries out requests, advances by the time since the last frame, and draws."""
+    """Handles requests, advances by the time since the last frame, and draws."""
     session, last = self.session, self._now
     time.sleep(max(0.0, last + _FRAME - time.perf_counter()))
     self._now = time.perf_counter()

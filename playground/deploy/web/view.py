@@ -1,4 +1,4 @@
-"""The scene as the browser draws it."""
+"""Draws the scene in the browser."""
 
 import copy
 from collections.abc import Sequence
@@ -34,17 +34,17 @@ FREE = "free"  # the camera that the mouse moves
 
 
 class View:
-  """Draws a session. A robot that walks stays in the middle, and the ground moves below it.
+  """Draws a session. A walking robot stays in the middle of the view, and the ground moves below it.
 
   Attributes:
-    shown: whether arrows of velocity and contacts are drawn, the camera follows a robot that walks, the page is dark.
-    scene: mjviser's, of the task that is drawn.
+    shown: whether velocity arrows and contacts are drawn, the camera follows a walking robot, and the page is dark.
+    scene: mjviser's scene of the task.
     squares: of the floor, light ones and dark ones; none on a terrain.
     planes: mjviser's, below the squares.
-    arrows: of the commanded and the actual velocity, for a robot that takes commands.
+    arrows: of the commanded and the actual velocity, for a robot that follows commands.
     boxes: the controls of `shown`.
-    num_envs: the control of how many environments there are.
-    selected: the control of which of them, from 1 on, is followed and plotted.
+    num_envs: the control of the number of environments.
+    selected: the control of the environment, from 1 on, that is followed and plotted.
     camera: the control of the camera.
   """
 
@@ -94,7 +94,7 @@ class View:
 
   @property
   def model_camera(self) -> str | None:
-    """The model's camera that is chosen; None for the free one."""
+    """The chosen camera of the model; None for the free camera."""
     return None if self.camera.value not in camera_names(self.scene.mj_model) else self.camera.value
 
   def _set_num_envs(self) -> None:
@@ -113,7 +113,7 @@ class View:
     return data
 
   def _arrays(self, players: Sequence[Player]) -> dict[str, Any]:
-    """The arguments of mjviser's `update_from_arrays`, a row for each environment."""
+    """Returns the arguments of mjviser's `update_from_arrays`, a row for each environment."""
     rows: list[dict[str, np.ndarray]] = []
     for player in players:
       data = self._pose(player)
@@ -125,7 +125,7 @@ class View:
     model, number = player.env.mj_model, len(self._session.players)
     fresh, self._model = self._model is not model, model
     self._server.scene.reset()
-    self.scene = ViserMujocoScene(self._server, copy.copy(model), num_envs=number)  # it changes the model's colours
+    self.scene = ViserMujocoScene(self._server, copy.copy(model), num_envs=number)  # which changes the model's colours
     self._data = mujoco.MjData(self.scene.mj_model)
     self._walks = walks(model)
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
@@ -134,7 +134,7 @@ class View:
     self.planes: list[viser.GridHandle] = []
     self._add_floor(model)
     self._places = np.zeros((number, 3))
-    if not (model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD).any():  # on a terrain they stand where they are
+    if not (model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD).any():  # on a terrain, robots stay at their own positions
       spacing = _SPACING if self._walks else 1.5 * model.stat.extent
       self._places[:, 1], self._places[:, 0] = spacing * np.array(np.divmod(np.arange(number), 3))
     self._copies = self._add_copies() if number > 1 else []
