@@ -8,6 +8,7 @@ import inspect
 import io
 import itertools
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -355,8 +356,11 @@ def test_every_key_of_the_reference_has_a_meaning_on_a_short_page():
 @pytest.mark.slow
 def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(tmp_path / "site")]
-  done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+  environment = os.environ | {"REPOSITORY": "https://example.org/me/fork"}
+  done = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
   assert done.returncode == 0, done.stdout + done.stderr
+  page = (tmp_path / "site/tutorial.html").read_text(encoding="utf-8")
+  assert 'href="https://example.org/me/fork/edit/main/docs/tutorial.md"' in page
   page = (tmp_path / "site/reference/configs/hardware.html").read_text(encoding="utf-8")
   assert "full float32, TF32 ruins some contact-rich tasks" in page  # beside a field of HardwareConfig
   assert (
