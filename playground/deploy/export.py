@@ -89,5 +89,5 @@ def _summary(contract: Contract, count: int, error: float, micros: np.ndarray) -
     f"{contract['task']}, {contract['origin']['steps']:,} steps trained: {sizes}\n"
     f"same actions on {count} observations of its own in C MuJoCo: largest difference {error:.1e}\n"
     f"inference on one core here: {np.median(micros):.0f} µs (median), {np.quantile(micros, 0.99):.0f} µs (99 %) "
-    f"of the {1e6 / rate:,.0f} µs there are at {rate:g} Hz"
+    f"of the {1e6 / rate:,.0f} µs of a step at {rate:g} Hz"
   )

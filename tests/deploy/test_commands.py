@@ -47,7 +47,7 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
   out = " ".join(capsys.readouterr().out.split())
   difference = re.search(r"same actions on 1000 observations .* largest difference (\S+)", out)
   assert difference and float(difference[1]) <= 1e-5
-  assert re.search(r"\d+ µs \(median\).* of the 10,000 µs there are at 100 Hz", out)
+  assert re.search(r"\d+ µs \(median\).* of the 10,000 µs of a step at 100 Hz", out)
   contract = yaml.safe_load((run / "export" / "policy.yaml").read_text())
   origin = {"run": "run", "agent": "ppo", "steps": STEPS, "commit": "abc", "dirty": False, "impl": "warp"}
   assert origin.items() <= contract["origin"].items()
