@@ -18,7 +18,7 @@ from playground.robots.panda.kinematics import JOINT_RANGE, inverse_kinematics
 
 
 class NoForward(Task):
-  """Resets compute no kinematics, so poses and sensors are 0 at first; what a task carries outlasts an auto-reset."""
+  """Resets compute no kinematics, so poses and sensors are 0 at first; an auto-reset keeps all of `info`."""
 
   episode_info = ()
 
@@ -29,7 +29,7 @@ class NoForward(Task):
 
 
 class ArmTask(NoForward, arm.ArmTask):
-  """Once the hand has reached the object, it counts as reached for the rest of the environment's life."""
+  """Once the hand has reached the object, it counts as reached in all later episodes of the environment."""
 
 
 class SinglePegInsertion(NoForward, peg.SinglePegInsertion):

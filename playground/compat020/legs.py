@@ -1,4 +1,4 @@
-"""Robots on legs as in Playground 0.2.0: what its upstream bugs compute (docs/differences.md)."""
+"""Robots on legs as in Playground 0.2.0, upstream bugs included (docs/differences.md)."""
 
 import copy
 import dataclasses
@@ -99,7 +99,7 @@ class GaitInStep(Gait):
 class MisreadContext(LeggedContext):
   """A step in which ids of the contact sensors are taken for the addresses of their readings (H1).
 
-  What is read are the base's height and the directions of its axes.
+  The readings are the base's height and the directions of its axes.
   """
 
   @property

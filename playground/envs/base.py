@@ -45,9 +45,9 @@ class State(struct.PyTreeNode):
 class Env(abc.ABC):
   """A task. Everything is for one environment; callers vmap (`playground.envs.wrappers`).
 
-  A step is: `pre_step` (events that act on the physics, pushes say), `action_to_ctrl`, the physics, `post_step`, which
-  turns the new physics into observation, reward, termination and the next `info`. `post_step` does not touch physics,
-  so it can be run on recorded data.
+  A step is: `pre_step` (events that act on the physics, such as pushes), `action_to_ctrl`, the physics, `post_step`.
+  `post_step` computes observation, reward, termination and the next `info` from the new physics. It runs no physics, so
+  it can run on recorded data.
   """
 
   spec: mujoco.MjSpec | None = None  # the composed scene, if the task keeps it: videos may change its geoms
@@ -161,7 +161,7 @@ class Env(abc.ABC):
     """`reset(key, fields, settings)` and `step(state, action, fields, settings)`.
 
     `fields` are randomised model fields and `settings` values for `with_settings`, each by name, {} for none. Jitted
-    inside whatever maps or scans over them: the task's Python is traced once, for all batch sizes.
+    inside of maps and scans, so the task's Python is traced once for all batch sizes.
     """
     model: Callable[..., Any] = lambda fields: self.mjx_model.tree_replace(fields) if fields else None
     reset = lambda key, fields, settings: self.with_settings(settings).reset(key, model(fields))

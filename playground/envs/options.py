@@ -49,7 +49,7 @@ class EnvConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TermsConfig:
-  """Settings of tasks that are made of terms (they have `env.observations`), beside the terms."""
+  """Settings of tasks that are made of terms (they have `env.observations`)."""
 
   commands: Annotated[TERMS, "command terms by name"] = dataclasses.field(default_factory=dict)
   noise_level: Annotated[float, at_least_0(), "factor on all noise of observations"] = 1.0
@@ -225,5 +225,5 @@ def impl_on_gpu(env: Mapping[str, Any]) -> str:
 
 
 def auto_impl(cuda_impl: str, renders: bool, on_gpu: bool) -> str:
-  """What `impl: auto` means: the backend that was measured faster, or the one that renders."""
+  """Returns the backend of `impl: auto`: the one that was measured faster, or the one that renders."""
   return "warp" if renders else cuda_impl if on_gpu else "jax"

@@ -200,7 +200,7 @@ class AutoReset(Wrapper):
   By default an episode starts again from the environment's state of the last outer `reset`, of which the simulator's
   state, the observation and the entries `env.episode_info` of `info` are stored (not the derived fields, which the next
   step writes anyway); the other entries of `info` go on. With `full_reset` it starts from a new `reset`, `info`
-  included, except what the task put under `info["AutoResetWrapper_preserve_info"]`.
+  included, except the entries of `info["AutoResetWrapper_preserve_info"]`.
 
   With `keep_final_obs` `info["final_obs"]` is the observation that the step itself made: where done = 1 the last one of
   the episode, else `obs`.

@@ -469,5 +469,5 @@ def cube_lin_vel_l1(c: HandContext) -> jax.Array:
 
 
 def joint_power_qfrc_l1(c: StepContext) -> jax.Array:
-  """Sum |qd_j| |tau_j|, W, tau what the actuators do at the joints, through tendons too."""
+  """Sum |qd_j| |tau_j|, W, tau the torques of the actuators at the joints, tendons included."""
   return (jnp.abs(c.joint_vel) * jnp.abs(c.data.qfrc_actuator[c.robot.qvel])).sum()

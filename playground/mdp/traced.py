@@ -45,7 +45,7 @@ def _numbers(config: Mapping[str, Any], kind: str, term: Term) -> Iterator[tuple
     yield from (
       (f"{term.key}.noise.{name}", size) for name, size in (term.options.noise or {}).items() if name != "same_as"
     )
-  # Another package's function may decide by a number what it computes.
+  # A function of another package may branch on a number in Python.
   if kind in ("commands", "events") and term.func.__module__ == MODULES[kind]:
     arguments = inspect.signature(term.func).parameters
     traced = [name for name in term.params if _is_traced(kind, term.func, arguments[name])]

@@ -167,7 +167,7 @@ class Physics:
 
     if self.impl == "warp":  # computes all of them anyway, and allocates memory for each call site
       return jax.lax.scan(lambda data, _: (advance(data, self.derived), None), data, None, num_substeps)[0]
-    # Only the last substep's derived fields are read, so the others need not compute them (sensors, say): 9 % faster
+    # Only the last substep's derived fields are read, so the others do not compute them (such as sensors): 9 % faster
     # training of the Go1 on an H200, for four seconds more of compiling.
     if num_substeps > 1:
       data = data.replace(**dict.fromkeys(self.derived))

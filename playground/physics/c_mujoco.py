@@ -19,7 +19,7 @@ class CPhysics(Physics):
   """MuJoCo's own `mj_forward` and `mj_step`, called back from jitted code; see `Physics`.
 
   A state is complete (`STATE_FIELDS`), so every call sets all of it and nothing is left over from the one before.
-  Within a control step MuJoCo computes in double precision; what a task keeps between them is single.
+  Within a control step MuJoCo computes in double precision; the state between two steps is single.
   """
 
   def __init__(self, mj_model: mujoco.MjModel, *, derived: tuple[str, ...]):

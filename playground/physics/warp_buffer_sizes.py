@@ -17,7 +17,7 @@ _REPORTS = 50  # of the progress of a rollout, which takes minutes on a CPU
 _CCD = 1 << 4  # mujoco_warp's OverflowType.CCD
 
 Act = Callable[[Any, jax.Array], jax.Array]  # (observation [N, ...], key) -> actions [N, action_size]
-Batch = Any  # a task as `playground.envs.wrappers.wrap_for_training` wraps it, and what it steps (`envs.base.State`)
+Batch = Any  # a task that `playground.envs.wrappers.wrap_for_training` wraps; its state is an `envs.base.State`
 State = Any
 
 

@@ -13,7 +13,7 @@ _GOAL_IN_KEYFRAME = (0.25, 0.16, 0)
 
 
 def build_in_hand_scene(robot: Any) -> mujoco.MjSpec:
-  """Puts a cube in a hand, a goal (a mocap body) beside it and a floor 0.25 m below, which only the cube meets.
+  """Puts a cube in a hand, a goal (a mocap body) beside it and a floor 0.25 m below, which collides with the cube only.
 
   The hand's keyframe `home` is completed with where cube and goal are. After the hand's own sensors come those of the
   `cube` (position, orientation, velocities, angular acceleration, up), `palm_position` and each `<finger>_tip_position`
@@ -25,7 +25,7 @@ def build_in_hand_scene(robot: Any) -> mujoco.MjSpec:
       (position in the keyframe, m).
 
   Raises:
-    ConfigError: a key or the file is missing or invalid, it lacks keyframe or site, or `start` has not three numbers.
+    ConfigError: a key or the file is missing or invalid, it lacks keyframe or site, or `start` is not three numbers.
   """
   check_keys(robot, ("mjcf", "cube", "sensors"), "hand")
   if len(robot.cube.start) != 3:

@@ -83,7 +83,7 @@ def build_scene(
   """Puts a robot on a terrain.
 
   Args:
-    mjcf: the robot's MJCF, see `find_mjcf`; of ours the name is enough, e.g. `go1`.
+    mjcf: the robot's MJCF, see `find_mjcf`; for ours the name, e.g. `go1`.
     terrain: a key of `TERRAINS`. Its ground is geom 0, named `floor`.
     parameters: of the terrain, by name.
     collision: a key of `COLLISIONS`.

@@ -1,4 +1,4 @@
-"""Scenes on a table or floor: an arm, the gripper on it and what it handles, each described once and put together here.
+"""Scenes on a table or floor: an arm, its gripper and objects, each described once and put together here.
 
 A part's file (`robots/<name>/*.xml`, `robots/props/*.xml`) holds that part alone, with default classes of its own. The
 arm's file also holds the solver's options and a frame `flange` for the gripper. Bodies come in the order in which parts

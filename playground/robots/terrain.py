@@ -1,4 +1,4 @@
-"""The ground: a plane, or one height field, which both MJX backends collide with the same cost whatever its shape.
+"""The ground: a plane, or one height field, whose shape does not change the cost of collisions in either MJX backend.
 
 A terrain is a function of `TERRAINS`. It adds the geom `floor` to a scene and returns how high the ground rises where
 robots start (m, at most; the flat ground's height is 0). Its keyword arguments are its parameters, in metres.

@@ -14,7 +14,7 @@ from playground.mdp.legged import LeggedContext, LeggedRobot
 from playground.physics.backend import PhysicsData, mjx
 from playground.robots.scene import build_scene, check_keys, set_gains
 
-# What an action is added to: the joints' default pose, their position, or their target in the step before.
+# The base of an action: the joints' default pose, their position, or their target in the step before.
 _ACTION_BASES: dict[str, Callable[[LeggedRobot, PhysicsData], jax.Array]] = {
   "default_pose": lambda robot, data: robot.default_pose,
   "joint_pos": lambda robot, data: data.qpos[7:],

@@ -51,7 +51,7 @@ def dropped(c: ArmContext) -> jax.Array:
 def grippers_at_box_exp(c: ArmContext) -> jax.Array:
   """exp(-10 d), d from the left gripper to the box's top, m, until it is passed; then twice that of the right one.
 
-  While it is passed the right gripper's, of the distance to the box's bottom, counts beside the left one's.
+  While the box is passed the right gripper's term, of the distance to the box's bottom, is added to the left one's.
   """
   left = _nearness(c.site_pos("box_top"), c.site_pos("left/gripper"))
   return left * (c.object_pos[0] < _PASS_X) + _right_holds(c)

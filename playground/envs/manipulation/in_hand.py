@@ -18,7 +18,7 @@ from playground.robots.in_hand import build_in_hand_scene
 
 _AWAY = (-100.0, -100.0, -100.0)  # m, place of the goal's marker in tasks without a goal
 
-# What an action is added to: the targets that hold the keyframe `home`, or those of the step before.
+# The base of an action: the targets that hold the keyframe `home`, or those of the step before.
 _ACTION_BASES: dict[str, Callable[[Hand, PhysicsData], jax.Array]] = {
   "home": lambda hand, data: hand.init_ctrl,
   "last_target": lambda hand, data: data.ctrl,

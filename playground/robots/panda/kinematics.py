@@ -96,7 +96,7 @@ def within_limits(q: jax.Array) -> jax.Array:
 
 
 def _to_rounding(cosine: jax.Array) -> jax.Array:
-  """Takes a cosine back to 1 that rounding took beyond it, at the border of what the arm reaches."""
+  """Clips a cosine that rounding took beyond 1, at the border of the arm's reach."""
   return jnp.where(jnp.abs(cosine) < 1 + 1e-5, jnp.clip(cosine, -1.0, 1.0), cosine)
 
 
