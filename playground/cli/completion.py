@@ -45,12 +45,12 @@ SHELLS = tuple(_SCRIPTS)
 
 
 def script(shell: str) -> str:
-  """Returns what a shell evaluates to complete our commands."""
+  """Returns the script that a shell evaluates to complete the commands."""
   return _SCRIPTS[shell].replace("PROGRAMS", " ".join(PROGRAMS))
 
 
 def candidates(line: str, parser: argparse.ArgumentParser) -> list[str]:
-  """Returns what the last word of a command line can become, sorted.
+  """Returns the completions of the last word of a command line, sorted.
 
   Args:
     line: the command line up to the cursor.

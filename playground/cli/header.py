@@ -1,4 +1,4 @@
-"""The first lines of a run: task, algorithm, folder, and what differs from the defaults."""
+"""Formats the first lines of a run: task, algorithm, folder, and differences from the defaults."""
 
 from collections.abc import Iterator
 

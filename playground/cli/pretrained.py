@@ -97,7 +97,7 @@ def add_policy(path: str, note: str = "") -> int:
 
 
 def _status(scores: dict[str, float]) -> catalog.Status:
-  """How far the policy gets in C MuJoCo, by the measures of the catalogue."""
+  """Returns the status of the policy in C MuJoCo, by the measures of the catalogue."""
   measured = {"falls_per_episode": "episode_fall", "success": "episode_success"}
   row = {column: str(scores[name]) for column, name in measured.items() if name in scores}
   return catalog.status({"note": "", "final_return": str(scores["episode_reward"]), **row})

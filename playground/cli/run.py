@@ -1,8 +1,8 @@
 """`playground-run`: composes a run's configuration, checks it, trains.
 
-The flags are Hydra's, except `--help`, `--verbose` and `--version`. `--cfg job` and training share one composition;
-`--hydra-help`, `--info`, `--shell-completion` and `hydra.` keys go to Hydra's app. `-m` is ours: a sweep of jobs, each
-in a process of its own (`playground.sweep`).
+The flags are Hydra's, except `--help`, `--verbose`, `--version` and `-m`. `--cfg job` and training share one
+composition; `--hydra-help`, `--info`, `--shell-completion` and `hydra.` keys go to Hydra's app. `-m` starts a sweep,
+whose jobs run in separate processes (`playground.sweep`).
 """
 
 import argparse
@@ -136,7 +136,7 @@ def _downloaded(override: str) -> str:
 
 
 def _help(keys: Sequence[str], overrides: Sequence[str]) -> int:
-  """Prints our page, or what a key means."""
+  """Prints the page of `print_help`, or explains a key."""
   if not keys:
     from playground.cli.help import print_help  # imports rich
 
@@ -152,7 +152,7 @@ def _help(keys: Sequence[str], overrides: Sequence[str]) -> int:
 def _hydra_app(
   flags: Sequence[str], overrides: Sequence[str], config: RunConfig | None = None, verbose: bool = False
 ) -> int:
-  """Runs Hydra's app: shows its own configuration, or trains with settings of its own."""
+  """Runs Hydra's app, which shows Hydra's configuration, or trains with settings of `hydra.` keys."""
   codes = []
 
   def job(_: object) -> None:
@@ -186,7 +186,7 @@ def _refuse(message: str) -> NoReturn:
 
 
 def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
-  """Raises ConfigError for flags of Hydra that have no effect here, or none on their own."""
+  """Raises ConfigError for flags of Hydra that have no effect here, or only with another flag."""
   for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
     if getattr(args, name) is not None:
       _refuse(f"--{name.replace('_', '-')} is no option")

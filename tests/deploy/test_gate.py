@@ -58,7 +58,13 @@ def open_gate() -> Iterator[Gate]:
   """Of a server that other machines can reach."""
   gate = Gate("0.0.0.0", free_port())
   yield gate
-  gate.server.stop()
+  gate.close()
+
+
+def test_viser_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+  """Its banner has an address without the token."""
+  Gate("127.0.0.1", free_port()).close()
+  assert capsys.readouterr().out == ""
 
 
 def client(port: int, path: str = "/", **headers: str) -> ClientConnection:

@@ -98,6 +98,11 @@ class Gate:
     name = f"[{host}]" if ":" in host else socket.gethostname() if host in ("0.0.0.0", "::") else host
     self.url = f"http://{name}:{self.server.get_port()}/" + (f"?token={self._token}" if self._token else "")
 
+  def close(self) -> None:
+    """Stops the server."""
+    with contextlib.redirect_stdout(io.StringIO()):  # viser cannot switch off its message
+      self.server.stop()
+
   def check(self, request: Request) -> str:
     """Returns why a request is refused, "" if it is accepted."""
     if not hasattr(self, "server"):

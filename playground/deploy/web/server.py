@@ -26,8 +26,8 @@ class Watch:
     """
     need_port(host, port)
     self.session = session
-    gate = Gate(host, port, session.player.exported.contract["task"])
-    self.server, self.url = gate.server, gate.url
+    self._gate = Gate(host, port, session.player.exported.contract["task"])
+    self.server, self.url = self._gate.server, self._gate.url
     self.panel = Panel(self.server, session)
     self._now = time.perf_counter()
     self._drawn = 0.0
@@ -52,7 +52,7 @@ class Watch:
   def close(self) -> None:
     """Stops serving."""
     self.panel.close()
-    self.server.stop()
+    self._gate.close()
 
 
 def watch(session: Session, host: str, port: int, console: Console) -> None:
