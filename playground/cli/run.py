@@ -116,8 +116,6 @@ def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
   trust(*trusted)
   common = command_lines(overrides)
   configs = compose_all([overrides, *([*common, *run] for run in others)])
-  if configs[0].hardware.devices is None:  # a CPU is one device to JAX: here it is one for each agent
-    os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(len(configs)))
   from playground.envs.options import impl_on_gpu
   from playground.physics.warp_kernels import prestart
 

@@ -1,8 +1,6 @@
 """Trains several agents in one process and one compiled program; each is a run of its own on disk."""
 
 import contextlib
-import dataclasses
-import math
 import sys
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -12,7 +10,7 @@ import jax
 from jax.stages import Compiled
 
 from playground.errors import CheckpointError, ConfigError, HardwareError, PlaygroundError
-from playground.hardware.mesh import device_memory, make_mesh
+from playground.hardware.mesh import device_memory
 from playground.hardware.setup import Hardware, setup
 from playground.learning.evaluation import Recording
 from playground.learning.loop import CompiledFunctions, Loop
@@ -120,17 +118,6 @@ def _train_group(
   if any(member.error for member in members):
     return 2
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
-
-
-def on_cpu(hardware: Hardware, count: int) -> Hardware:
-  """Returns the devices of `count` agents: on a CPU one each where JAX has as many, so that they train in parallel.
-
-  An agent's environments are not divided, since the devices of a CPU are the same cores.
-  """
-  if hardware.facts["platform"] != "cpu" or hardware.mesh.size == 1:
-    return hardware
-  size = count if count <= hardware.mesh.size else math.gcd(count, hardware.mesh.size)
-  return dataclasses.replace(hardware, mesh=make_mesh(size), facts={**hardware.facts, "num_devices": size})
 
 
 def memory_needed(program: CompiledFunctions, hardware: Hardware) -> str:

@@ -5,16 +5,12 @@ import itertools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pandas as pd
 import pytest
-from jax.sharding import Mesh
 
 from playground.config import RunConfig, compose
-from playground.hardware.setup import Hardware
-from playground.runs import together
 from playground.runs.callbacks import RunCallbacks
 from playground.runs.programs import program_of
 from playground.runs.run_dir import RunDirectory
@@ -132,18 +128,6 @@ def test_a_population_goes_on_from_the_step_that_all_have(tmp_path: Path, monkey
   for run, table in zip(cut.values(), tables, strict=True):
     theirs = pd.read_csv(run.metrics_csv).filter(regex="^(?!time/)")
     pd.testing.assert_frame_equal(theirs, table.filter(regex="^(?!time/)"), check_like=True)
-
-
-@pytest.mark.parametrize(
-  ("platform", "devices", "agents", "used"),
-  [("cpu", 8, 8, 8), ("cpu", 8, 3, 3), ("cpu", 1, 3, 1), ("cpu", 2, 4, 2), ("cpu", 2, 3, 1), ("gpu", 8, 3, 8)],
-)
-def test_on_a_cpu_each_agent_has_a_device(
-  platform: str, devices: int, agents: int, used: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-  monkeypatch.setattr(together, "make_mesh", lambda size: SimpleNamespace(size=size))
-  hardware = Hardware(cast(Mesh, SimpleNamespace(size=devices)), None, {"platform": platform})
-  assert together.on_cpu(hardware, agents).mesh.size == used
 
 
 @pytest.mark.parametrize(
