@@ -216,6 +216,7 @@ class Long(Cartpole):
     ("rewards.hip_splay.weight=-0.1", "no function 'hip_splay' is registered.* Did you mean 'joint_deviation_l2'?"),
     ("rewards.joint_devation_l2.weight=-0.1", "Did you mean 'joint_deviation_l"),
     ("rewards.action_l2={}", r"env\.rewards\.action_l2\.weight is missing: every term of env\.rewards has one"),
+    ("rewards.action_l2={weight: {}}", r"env\.rewards\.action_l2\.weight=\{\} must be a number"),
     ("rewards.action_l2.weight=big", r"env\.rewards\.action_l2\.weight=big must be a number from"),
     ("rewards.feet_slip_l2.params.joints=a", r"params\.joints does not exist: feet_slip_l2 takes no parameters"),
     ("rewards.feet_clearance.params.targt=1", r"takes target\. Did you mean 'target'"),

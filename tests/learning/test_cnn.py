@@ -121,7 +121,7 @@ def test_shifts_move_a_trajectory_as_one_and_repeat_edges() -> None:
   ("settings", "message"),
   [
     ({"policy_obs_key": "stat"}, r"policy_obs_key='stat' must be an entry.*Did you mean 'state'"),
-    ({"value_obs_key": "pixels/eye"}, r"must be an entry .* that is no picture: state, privileged_state\.$"),
+    ({"value_obs_key": "pixels/eye"}, r"must be an entry .* that is no image: state, privileged_state\.$"),
     ({"estimated_obs_key": "stat"}, r"estimated_obs_key='stat' must be an entry.*Did you mean 'state'"),
     ({"estimated_obs_key": "state"}, "estimated_obs_key='state' is what the actor reads: estimate another entry"),
     ({"estimated_obs_key": "state", "policy_hidden_layer_sizes": ()}, "from images by the first .* lacks one"),

@@ -13,6 +13,7 @@ import pytest
 
 from playground.cli.replay import replay
 from playground.config import compose
+from playground.learning import algorithm
 from playground.learning.checkpoints import find_checkpoints
 from playground.runs.callbacks import NonfiniteError
 from playground.runs.run_dir import RunDirectory
@@ -59,7 +60,10 @@ def test_nan_is_counted_dumped_and_kept_out(
 
 
 @pytest.mark.parametrize("agent", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
-def test_too_many_rejected_gradient_steps_stop_the_run(tmp_path: Path, cache: Path, agent: str) -> None:
+def test_too_many_rejected_gradient_steps_stop_the_run(
+  tmp_path: Path, cache: Path, agent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  monkeypatch.setattr(algorithm, "check", lambda config, key: None)  # which refuses an infinite factor
   run = tmp_path / "run"
   config = compose([*TASK, f"agent={agent}", f"run_dir={run}"])
   config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, reward_scaling=math.inf))  # pyright: ignore[reportCallIssue]
@@ -69,8 +73,9 @@ def test_too_many_rejected_gradient_steps_stop_the_run(tmp_path: Path, cache: Pa
 
 
 def test_a_run_says_how_many_gradient_steps_it_left_out(
-  tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+  tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+  monkeypatch.setattr(algorithm, "check", lambda config, key: None)  # which refuses an infinite factor
   config = compose([*TASK, "on_nonfinite.max_fraction=1", f"run_dir={tmp_path / 'run'}"])
   config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, reward_scaling=math.inf))  # pyright: ignore[reportCallIssue]
   assert train(config) == 0
