@@ -223,7 +223,7 @@ class PPOConfig(OnPolicyConfig):
     float, at_least_0(), "factor on the error (Huber) in estimating network.estimated_obs_key"
   ] = 1.0
   targets: Annotated[
-    Literal["minibatch", "epoch"], "when targets and advantages are computed again; normalised over what they are of"
+    Literal["minibatch", "epoch"], "when targets and advantages are computed; advantages are then normalised"
   ] = "minibatch"
   clip_advantages: Annotated[float | None, positive(), "largest normalised advantage; null: they are not clipped"] = (
     None
