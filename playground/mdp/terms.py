@@ -169,11 +169,10 @@ def bind_one(kind: str, key: str, name: str, entry: Any) -> Term:
   params = check_params(func, entry.get("params") or {}, f"{key}.params", _LEADING[kind])
   hints = typing.get_type_hints(options, include_extras=True)
   values = {field: plain(entry.get(field)) for field in options._fields}
-  absent = {field: (None, {}) if field in options._field_defaults else (None,) for field in values}
   given = {
     field: _checked(f"{key}.{field}", value, hints[field])
     for field, value in values.items()
-    if value not in absent[field]
+    if value is not None and (value != {} or field not in options._field_defaults)
   }
   return Term(name, key, func, params, options(**given))
 
