@@ -5,7 +5,6 @@ import importlib
 import io
 import os
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from playground.extras import install_command
+from playground.hardware.gpus import query_gpus
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.runs.provenance import package_version
 from playground.runs.wandb_tracker import logged_in
@@ -132,13 +132,8 @@ def _devices() -> Iterator[Finding]:
 
 def _nvidia() -> tuple[str, str]:
   """Returns the GPUs' names and the driver's version, or empty strings."""
-  command = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
-  try:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
-  except (OSError, subprocess.TimeoutExpired):
-    return "", ""
-  rows = [tuple(map(str.strip, line.rpartition(",")[::2])) for line in done.stdout.splitlines() if "," in line]
-  if done.returncode or not rows:
+  rows = [line.rpartition(", ")[::2] for line in query_gpus("name,driver_version")]
+  if not rows:
     return "", ""
   return f"{len(rows)} x {rows[0][0]}", rows[0][1]
 
