@@ -277,13 +277,19 @@ class Checkpoint:
     expected = describe(template)
     if expected != found:
       raise CheckpointError(f"{self.path} does not fit this run: {_first_difference(expected, found)}.")
-    numbered = self._read(item, lambda: self._arrays(item))
+    leaves = self.arrays(item)
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+  def arrays(self, item: str) -> list[np.ndarray]:
+    """Returns the arrays of an item in the order of the meta data's `leaves`. Raises what `restore` does for damage."""
+    found = self.meta["leaves"][item]
+    numbered = self._read(item, lambda: self._read_arrays(item))
     leaves = [np.asarray(numbered.get(_number(i), np.zeros(shape, dtype))) for i, (_, shape, dtype) in enumerate(found)]
     if checksum(leaves) != self.meta["sha256"].get(item):
       raise DamagedCheckpointError(f"{self.path} is damaged: the checksum of its {item!r} does not match.")
     if (broken := _first_nonfinite(found, leaves)) is not None:
       raise DamagedCheckpointError(f"{self.path} cannot be used: its {item}{broken} holds NaN or infinite values.")
-    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+    return leaves
 
   def _read(self, item: str, read: Callable[[], T]) -> T:
     """Returns the result of reading an item; distinguishes damage from errors of the operating system."""
@@ -312,7 +318,7 @@ class Checkpoint:
     return None
 
   @_quiet_threads()
-  def _arrays(self, item: str) -> dict[str, np.ndarray]:
+  def _read_arrays(self, item: str) -> dict[str, np.ndarray]:
     options = ocp.CheckpointManagerOptions(
       read_only=True, step_format_fixed_length=12, multiprocessing_options=_alone()
     )
@@ -405,6 +411,30 @@ def _return_of(folder: Path) -> float | None:
     return Checkpoint(folder).meta.get("return")
   except DamagedCheckpointError:
     return None
+
+
+def round_policy(folder: str | Path, chosen: Callable[[str], bool]) -> None:
+  """Rounds arrays of a checkpoint's item 'policy' to bfloat16's 8 significant bits; their dtype stays.
+
+  The files are compressed: those of rounded arrays take about half the space.
+
+  Args:
+    folder: the checkpoint.
+    chosen: whether to round the array of that name, such as ".params.value['params']['hidden_0']['kernel']".
+
+  Raises:
+    CheckpointError: as `Checkpoint` does.
+  """
+  checkpoint = Checkpoint(folder)
+  arrays, meta = checkpoint.arrays("policy"), checkpoint.meta
+  for i, (name, _, dtype) in enumerate(meta["leaves"]["policy"]):
+    if chosen(name):
+      arrays[i] = np.asarray(arrays[i].astype(jax.numpy.bfloat16).astype(dtype))
+  with _quiet_threads(), ocp.StandardCheckpointer() as checkpointer:
+    checkpointer.save(checkpoint.path / "policy", _numbered(arrays), force=True)
+  meta["sha256"]["policy"] = checksum(arrays)
+  meta["meta_sha256"] = _meta_checksum(meta)
+  (checkpoint.path / "meta" / "metadata").write_text(json.dumps(meta))
 
 
 def describe(tree: PyTree) -> list[Leaf]:

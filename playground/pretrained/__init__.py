@@ -121,6 +121,11 @@ def copy_policy(run: Path, folder: Path) -> None:
   shutil.copytree(step, folder / "checkpoints" / step.name, ignore=shutil.ignore_patterns("state", "replay"))
 
 
+def _is_critic(name: str) -> bool:
+  """Whether an array of a checkpoint is learned and not the actor's: acting does not read it, fine-tuning does."""
+  return name.startswith(".params.") and not name.startswith(".params.policy")
+
+
 def _forget_machine(folder: Path) -> None:
   """Removes the paths and the name of the machine from a policy's configuration and manifest."""
   config = folder / "config.yaml"
@@ -136,6 +141,8 @@ def _forget_machine(folder: Path) -> None:
 def add(run: Path, task: str, facts: Section) -> Path:
   """Copies a run's policy into the package and writes its card.
 
+  The critic is rounded to bfloat16's precision, which halves its files; actions stay the same.
+
   Args:
     run: a run directory with `export/policy.onnx`.
     task: its task.
@@ -144,9 +151,13 @@ def add(run: Path, task: str, facts: Section) -> Path:
   Returns:
     The folder.
   """
+  from playground.learning.checkpoints import round_policy  # imports JAX, which composing a run must not
+
   folder = POLICIES / task
   shutil.rmtree(folder, ignore_errors=True)
   copy_policy(run, folder)
+  for checkpoint in (folder / "checkpoints").iterdir():
+    round_policy(checkpoint, _is_critic)
   _forget_machine(folder)
   (folder / "export").mkdir()
   for name in ("policy.onnx", "policy.yaml"):

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from rich.console import Console
@@ -10,6 +11,7 @@ from playground import pretrained
 from playground.cli.pretrained import add_policy, show_policies
 from playground.config import compose
 from playground.errors import ConfigError
+from playground.learning.checkpoints import Checkpoint
 from playground.runs.restore_plan import weights_of
 from playground.runs.train import train
 from tests.runs.helpers import TASK
@@ -29,6 +31,9 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
   assert (card["status"], card["note"]) == ("open", "cut short")
   assert card["training"]["sampled"] > 0 and card["training"]["mode"] > 0
   assert not checkpoint.has("state")
+  exact, shipped = Checkpoint(run / "checkpoints" / checkpoint.path.name).arrays("policy"), checkpoint.arrays("policy")
+  for (name, *_), before, after in zip(checkpoint.meta["leaves"]["policy"], exact, shipped, strict=True):
+    np.testing.assert_allclose(after, before, rtol=2**-8 if name.startswith(".params.value") else 0, err_msg=name)
   texts = [path.read_text() for name in ("*.yaml", "*.json", "export/*.yaml") for path in folder.glob(name)]
   assert len(texts) >= 5 and str(tmp_path) not in "".join(texts), "paths of this machine"
   console = Console(record=True, width=120)

@@ -333,14 +333,14 @@ def test_what_may_pass_is_tried_again(
 ) -> None:
   checkpoint = Checkpoint(save(tmp_path, 10)[0])
   problems = [problem] * (2 if passes else 9)
-  arrays = Checkpoint._arrays
+  arrays = Checkpoint._read_arrays
 
   def read(self: Checkpoint, item: str) -> Any:
     if problems:
       raise problems.pop()
     return arrays(self, item)
 
-  monkeypatch.setattr(Checkpoint, "_arrays", read)
+  monkeypatch.setattr(Checkpoint, "_read_arrays", read)
   monkeypatch.setattr(checkpoints, "_RETRY_AFTER_S", (0.0, 0.0))
   if passes:
     checkpoint.restore("policy", like(POLICY))
