@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Do policies walk? The runs that the question still needs, for a lent GPU, what matters most first:
-# benchmarks/walk.sh [results folder]. Planned for one H200 and 25 minutes, which end within the second sweep.
-# Stopped with SIGTERM the runs save; the same command goes on where it ended. Needs playground-run on PATH.
+# benchmarks/walk.sh [results folder]. Planned for one H200 and 25 minutes a call, each going on where the last one ended:
+# stopped with SIGTERM the runs save. Needs playground-run on PATH.
 set -euo pipefail
 out=${1:-results/walk}
 four_at_a_time="launcher.slots_per_gpu=4 launcher.mps=true"
@@ -9,12 +9,15 @@ four_at_a_time="launcher.slots_per_gpu=4 launcher.mps=true"
 # Each alone on the GPU, for these have goals in minutes. Keep the policies: those of seed 1 are lost.
 playground-run -m sweep=humanoids sweep_dir="$out/humanoids"
 
+# What is below public PPO, and the Go1's policy.
+playground-run -m sweep=below_public launcher.slots_per_gpu=3 launcher.mps=true sweep_dir="$out/below_public"
+
 # Goal: HumanoidRun 600.
 playground-run -m sweep=reppo_fast_td3 $four_at_a_time sweep_dir="$out/reppo_fast_td3"
 playground-run -m sweep=ppo_robust $four_at_a_time sweep_dir="$out/ppo_robust"
 
 # In C MuJoCo: 20 episodes of each without a fall, with the gait's measures.
-for job in "$out"/humanoids/jobs/*/; do
+for job in "$out"/humanoids/jobs/*/ "$out"/below_public/jobs/*/; do
   playground eval "$job" --episodes 128 --deterministic
   playground play "$job" --episodes 20
 done
