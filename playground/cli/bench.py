@@ -14,8 +14,8 @@ OTHERS = {name: f"playground.benchmark.{name}" for name in ("golden", "report", 
 
 
 def main() -> None:
-  """Runs a command and exits: 0 done, 1 something failed, 2 for what the user can act on, 3 time up with more to do."""
-  signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that what was started is ended
+  """Runs a command and exits: 0 done, 1 failed, 2 an error that the user can act on, 3 time up with jobs left."""
+  signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # SystemExit ends the child processes
   try:
     code = _main(sys.argv[1:])
   except (PlaygroundError, OSError) as error:

@@ -31,11 +31,11 @@ def evaluate_run(
 
   Args:
     path: a run directory, or one of its checkpoints.
-    episodes: how many; the run's `num_eval_envs` if None.
-    seed: of the evaluation.
-    deterministic: whether the policy acts with its mode instead of sampling (the run's own setting if False).
-    video: where to render the first episode to (.mp4).
-    camera: the video's, see `render_video`; None is the run's `video.camera`.
+    episodes: number of episodes; None is the run's `agent.num_eval_envs`.
+    seed: of the episodes.
+    deterministic: True acts on the distribution's mode, False as the run's `agent.deterministic_eval` says.
+    video: the .mp4 to render the first episode to.
+    camera: of the video, see `render_video`; None is the run's `video.camera`.
 
   Returns:
     The exit code, 0.

@@ -21,10 +21,10 @@ _EXAMPLES = {
   "playground-run resume=results/go1_joystick/<date_time>": "continue a run",
   "playground-run -m env=CartpoleBalance,WalkerWalk 'seed=range(3)'": "a sweep: six runs",
 }
-# Groups of the page, and what each chooses.
+# Groups on the page, with their help.
 _GROUPS = {
   "env": "the task; `playground list` shows all",
-  "experiment": "a task with what it is trained with",
+  "experiment": "a task with its training settings",
   "agent": "the algorithm",
   "robot": "the robot of a task that takes several",
   "randomization": "domain randomisation",
@@ -47,7 +47,7 @@ _FLAGS = {
 
 
 def print_help() -> None:
-  """Prints the page, as wide as the terminal."""
+  """Prints the help page, as wide as the terminal."""
   console = Console(highlight=False)
   console.print(Text("Train a policy. `playground train` is the same.", style="bold"))
   console.print(f"  {_USAGE}\n", markup=False, soft_wrap=True)
@@ -72,7 +72,7 @@ def _parts() -> Iterator[tuple[str, list[tuple[str, ...]]]]:
 
 
 def _options(group: str) -> str:
-  """Lists the options of a group; of many, the number and a few examples."""
+  """Lists the options of a group; for more than `_MANY`, their number and a few examples."""
   names = [name for name in listed_options(group, config_roots()) if "/" not in name and not name.startswith("_")]
   if len(names) <= _MANY:
     return ", ".join(names)

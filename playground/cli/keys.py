@@ -18,7 +18,7 @@ from playground.settings import Plain, Section, Setting
 from playground.text import join
 
 _WIDE = 160  # columns, without a terminal
-_SECTIONS = {"robot": "env.robot", "randomization": "env.events"}  # of groups that set a section of env
+_SECTIONS = {"robot": "env.robot", "randomization": "env.events"}  # group -> section of env that it sets
 _FILES = ("env", "robot", "curriculum")  # groups whose files explain keys in comments
 
 
@@ -27,7 +27,7 @@ def show_keys(prefix: str, overrides: Sequence[str]) -> int:
 
   Args:
     prefix: a section (agent), a key (agent.learning_rate), a term (env.rewards.action_rate_l2) or a group.
-    overrides: what the configuration is composed from, as for playground-run.
+    overrides: as for playground-run.
 
   Returns:
     The exit code, 0.

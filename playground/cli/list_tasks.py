@@ -19,8 +19,8 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   """Prints the tasks that match the filters.
 
   Args:
-    names: tasks to list; one of another package has only its name.
-    filters: by name of `FILTERS`, the value that a task must have; None takes any.
+    names: tasks to list; a task of another package has only its name.
+    filters: the value that a task must have, by name of `FILTERS`; None takes any.
     as_json: whether to print JSON instead of a table.
 
   Returns:

@@ -47,7 +47,7 @@ def main() -> None:
     _check_numbers(args)
     code = args.command(args)
   except KeyboardInterrupt:
-    code = 130  # as a shell counts it
+    code = 130  # the code of a shell for SIGINT
   except BrokenPipeError:  # `playground list | head`
     sys.stderr.close()
     code = 0
@@ -115,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
   evaluate.add_argument("--episodes", type=int, help="episodes to run (default: the run's agent.num_eval_envs)")
   evaluate.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
   evaluate.add_argument(
-    "--deterministic", action="store_true", help="act on the distribution's mode (default: sample actions)"
+    "--deterministic", action="store_true", help="act on the distribution's mode (default: agent.deterministic_eval)"
   )
   evaluate.add_argument("--video", metavar="FILE", help="also render an episode to this .mp4")
   evaluate.add_argument("--camera", metavar="NAME", help=_CAMERA)
@@ -133,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
   play.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
   shown = _add_places(play, "also render an episode to this .mp4")
   shown.add_argument("--web", action="store_true", help="show it in the browser instead")
-  view = add("view", _view, "Look at a task without a policy, in the browser.")
+  view = add("view", _view, "Show a task in the browser, without a policy.")
   view.add_argument("task", help="a task of `playground list`")
   view.add_argument("overrides", nargs="*", help="as for playground-run, such as terrain=stairs")
   view.add_argument(
@@ -162,7 +162,7 @@ def _parser() -> argparse.ArgumentParser:
   tune.add_argument("--run", help="a run or checkpoint whose policy acts, beside random actions")
   tune.add_argument("--envs", type=int, default=256, help="environments (default: %(default)s)")
   tune.add_argument("--steps", type=int, default=500, help="policy steps in each environment (default: %(default)s)")
-  replay = add("replay", "cli.replay:replay", "Repeat the step that was NaN or infinite.")
+  replay = add("replay", "cli.replay:replay", "Repeat a run's step that was NaN, infinite or too large.")
   replay.add_argument("file", metavar="dump", help="a run's nan_dump/step_*.npz")
   for builds_tasks in (show, keys, evaluate, export, play, view, sweep, tune, replay):
     builds_tasks.add_argument(
@@ -172,7 +172,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_places(parser: argparse.ArgumentParser, video: str) -> argparse._MutuallyExclusiveGroup:
-  """Adds the options of where a policy or a task is shown; returns the group of those that exclude each other."""
+  """Adds the options that choose where to show a policy or a task; returns the group of the exclusive ones."""
   shown = parser.add_mutually_exclusive_group()
   shown.add_argument("--video", metavar="FILE", help=video)
   shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
@@ -183,7 +183,7 @@ def _add_places(parser: argparse.ArgumentParser, video: str) -> argparse._Mutual
 
 
 def _call(place: str) -> Command:
-  """A command that is a function, `module:function`, whose parameters have the names of the arguments."""
+  """Returns a command that calls `module:function` with the arguments by name."""
   module, _, function = place.partition(":")
 
   def command(args: argparse.Namespace) -> int:
@@ -196,7 +196,7 @@ def _call(place: str) -> Command:
 
 
 def _named(args: argparse.Namespace, *others: str) -> dict[str, Any]:
-  """The arguments by name, without these others and what all commands have."""
+  """Returns the arguments by name, without `others` and those that every command has."""
   return {name: value for name, value in vars(args).items() if name not in ("command", "trust", *others)}
 
 

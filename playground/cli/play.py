@@ -60,12 +60,12 @@ def play(
     interval_events: with `agent`: whether pushes and other interval events act.
     episodes: number of episodes to measure.
     seed: of the episodes.
-    video: where to render the first episode to (.mp4).
-    camera: the video's, see `render_video`.
+    video: the .mp4 to render the first episode to.
+    camera: of the video, see `render_video`.
     viewer: whether to show the policy in MuJoCo's viewer instead of measuring it.
     web: whether to show it in the browser instead.
-    host: the address that the browser's page is served at.
-    port: the port that the browser's page is served at.
+    host: address that the page in the browser is served at.
+    port: port of that address.
     console: for the output.
 
   Returns:
@@ -139,9 +139,9 @@ class Opened:
 
   Attributes:
     exported: the policy, or a script.
-    env: its task on C MuJoCo.
-    folder: where results go; None writes no results.
-    trained: the checkpoint, if it came from a run.
+    env: the policy's task on C MuJoCo.
+    folder: folder of the results; None writes no results.
+    trained: the policy's checkpoint; None without a run.
   """
 
   exported: ActingPolicy
@@ -214,7 +214,7 @@ def _table(contract: Contract, episodes: int, scores: Mapping[str, float]) -> Ta
   if trained:
     backend = _BACKENDS.get(origin.get("impl"), "")
     table.add_column(f"{backend}in training, at {trained['steps']:,} steps", justify="right")
-    table.caption = "Here the model as it is and the policy's mode; in training as that was configured."
+    table.caption = "C MuJoCo: nominal model, mode of the policy. In training: as configured."
   for name, value in scores.items():
     beside = [f"{trained[name]:.4g}" if name in trained else ""] if trained else []
     table.add_row(name.removeprefix("episode_"), f"{value:.4g}", *beside)

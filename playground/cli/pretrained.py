@@ -41,13 +41,13 @@ def add_policy(path: str, note: str = "") -> int:
 
   Args:
     path: a run directory.
-    note: what else the card should say of the training, such as that the run was cut short.
+    note: a remark on the training for the card, such as that the run was stopped early.
 
   Returns:
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run, or a policy that has no export.
+    PlaygroundError: no such run, or a policy without an ONNX form.
     ConfigError: the run has no evaluation at its newest checkpoint.
   """
   run = RunDirectory.open(path)
@@ -97,7 +97,7 @@ def add_policy(path: str, note: str = "") -> int:
 
 
 def _status(scores: dict[str, float]) -> catalog.Status:
-  """Returns the status of the policy in C MuJoCo, by the measures of the catalogue."""
+  """Returns the catalogue's status for a policy's scores in C MuJoCo."""
   measured = {"falls_per_episode": "episode_fall", "success": "episode_success"}
   row = {column: str(scores[name]) for column, name in measured.items() if name in scores}
   return catalog.status({"note": "", "final_return": str(scores["episode_reward"]), **row})

@@ -33,4 +33,4 @@ def replay(file: str) -> int:
 
 
 def _listed(fields: list[str]) -> str:
-  return "NaN, infinite or absurd in " + "; ".join(fields) if fields else "all finite"
+  return "NaN, infinite or too large in " + "; ".join(fields) if fields else "all finite"

@@ -105,8 +105,8 @@ def _main(argv: Sequence[str]) -> int:
 def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
   """Trains several runs in one program (`playground.runs.together`); `--` separates their overrides.
 
-  `--exploit-every` and `--explore` in front of the first make them a population.
-  What holds for the whole command (`trust`, `hardware.cache_dir`) stands in the first.
+  `--exploit-every` and `--explore` before the first run's overrides make the runs a population. Overrides of the whole
+  command (`trust`, `hardware.cache_dir`) are among the first run's.
   """
   parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
   parser.add_argument("--exploit-every", type=int, default=0)
@@ -128,7 +128,7 @@ def _together(overrides: Sequence[str], others: Sequence[Sequence[str]]) -> int:
 
 
 def _downloaded(override: str) -> str:
-  """Downloads a policy on W&B and returns the override with its path: a configuration never names W&B."""
+  """Downloads a policy from W&B and returns the override with its path: a configuration never names W&B."""
   key, equals, value = override.partition("=")
   return f"{key}={local_path(value)}" if key == "init_from" and equals else override
 
@@ -184,7 +184,7 @@ def _refuse(message: str) -> NoReturn:
 
 
 def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
-  """Raises ConfigError for flags of Hydra that have no effect here, or only with another flag."""
+  """Raises ConfigError for flags of Hydra that have no effect here, or that need another flag."""
   for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
     if getattr(args, name) is not None:
       _refuse(f"--{name.replace('_', '-')} is no option")

@@ -31,7 +31,7 @@ def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_v
   Args:
     task: a task, or `randomization=<name>` alone for its events.
     overrides: as for playground-run.
-    views: instead of tables, the image file to write, of the camera's view on randomised models.
+    views: image file to write instead of the tables: the camera's view on randomised models.
     num_views: models in the image.
 
   Returns:
@@ -177,7 +177,7 @@ def function_and_source(func: Callable[..., object], known: str = "") -> str:
   path = Path(inspect.getsourcefile(target) or "?")
   depth = target.__module__.count(".") + (2 if path.stem == "__init__" else 1)
   lines = inspect.getsourcelines(sys.modules[target.__module__])[0]
-  assigned = (i for i, text in enumerate(lines, 1) if text.startswith(f"{target.__name__} = "))  # as a helper's result
+  assigned = (i for i, text in enumerate(lines, 1) if text.startswith(f"{target.__name__} = "))  # `name = helper(...)`
   place = f"{'/'.join(path.parts[-depth:])}:{next(assigned, inspect.getsourcelines(target)[1])}"
   return place if target.__name__ == known else f"{target.__qualname__} {place}"
 

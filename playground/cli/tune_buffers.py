@@ -13,11 +13,11 @@ from playground.physics.warp_buffer_sizes import ROOM, Act, BufferSizes, measure
 from playground.runs.loaded_policy import load_policy
 from playground.runs.progress import Progress
 
-# By key of a task's config: what the buffer holds, and how much of it was used.
+# Key of a task's config -> content of the buffer, and its largest use as text.
 _BUFFERS: dict[str, tuple[str, Callable[[BufferSizes], str]]] = {
   "njmax": ("constraint rows of one environment", lambda sizes: str(sizes.constraints)),
   "naconmax_per_env": ("contacts or candidate pairs, mean of the environments", lambda sizes: f"{sizes.contacts:.2f}"),
-  "naccdmax_per_env": ("of these the convex ones, to a power of 2", lambda sizes: str(sizes.convex)),
+  "naccdmax_per_env": ("convex ones of these, rounded up to a power of 2", lambda sizes: str(sizes.convex)),
 }
 
 
@@ -27,10 +27,10 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   Args:
     task: its name.
     overrides: as for playground-run.
-    run: a run or checkpoint of the task whose policy acts, beside a random one; without overrides the task is as the
-      run had it.
-    envs: environments.
-    steps: policy steps of each.
+    run: a run or checkpoint of the task whose policy acts, beside random actions; without overrides, the task has the
+      run's configuration.
+    envs: number of environments.
+    steps: policy steps in each environment.
 
   Returns:
     The exit code, 0.

@@ -242,7 +242,7 @@ class RunCallbacks:
       self._dumped = True
       dump = write_dump(self._run_dir.nan_dump, step, captured, self._config.resolved)
       where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
-      self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or absurd.{where}")
+      self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or too large.{where}")
     check_fraction(bad * self._env.action_repeat / max(taken, 1), self._config.on_nonfinite.max_fraction, step, where)
 
 
@@ -272,7 +272,7 @@ def check_fraction(fraction: float, allowed: float, step: int, where: str = "") 
   """Raises NonfiniteError when more than a share of the environment steps before `step` was not finite."""
   if fraction > allowed:
     raise NonfiniteError(
-      f"{fraction:.1%} of the environment steps before step {step:,} went NaN, infinite or absurd, more than "
+      f"{fraction:.1%} of the environment steps before step {step:,} went NaN, infinite or too large, more than "
       f"on_nonfinite.max_fraction={allowed:g}.{where}"
     )
 

@@ -47,8 +47,8 @@ def test_nan_is_counted_dumped_and_kept_out(
   assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy))
 
   assert replay(str(dump)) == 0
-  recorded, replayed = capsys.readouterr().out.split("replayed on cpu with impl=jax: NaN, infinite or absurd in ")
-  assert "recorded: NaN, infinite or absurd in" in recorded
+  recorded, replayed = capsys.readouterr().out.split("replayed on cpu with impl=jax: NaN, infinite or too large in ")
+  assert "recorded: NaN, infinite or too large in" in recorded
   assert "['qvel']: " in recorded
   assert "['data'].qvel: " in replayed
 
@@ -87,7 +87,7 @@ def test_a_run_says_how_many_gradient_steps_it_left_out(
 def test_too_many_nan_stop_the_run(tmp_path: Path, cache: Path, refused: Callable[..., str]) -> None:
   run = tmp_path / "run"
   sentence = refused(*UNSTABLE, "on_nonfinite.max_fraction=0.001", f"run_dir={run}")
-  assert "went NaN, infinite or absurd, more than on_nonfinite.max_fraction=0.001" in sentence
+  assert "went NaN, infinite or too large, more than on_nonfinite.max_fraction=0.001" in sentence
   (dump,) = (run / "nan_dump").iterdir()
   assert f"playground replay {dump}" in sentence
   status = RunDirectory(run).status
