@@ -17,13 +17,13 @@ from playground.settings import plain
 from playground.text import first_docstring_line
 
 FORMAT = "playground-policy/3"
-Contract = dict[str, Any]  # types of the YAML file, and of its section `env`
+Contract = dict[str, Any]  # the content of the YAML file, or of its section `env`
 
 _VALUES = {
   "rgb": "red, green and blue, 0 to 255",
   "gray": "the mean of red, green and blue, 0 to 255",
-  "depth": "255 * min(1, distance / {farthest} m) along the optical axis, 0 where nothing is",
-  "segmentation": "the number of the geom that is seen, counted from 1 in the order of the model, 0 where nothing is",
+  "depth": "255 * min(1, distance / {farthest} m) along the optical axis, 0 where no geom is",
+  "segmentation": "1 + id of the visible geom in the model, 0 where no geom is",
 }
 _CONSTANT_BASES = ("default_pose", "home", "zero")
 _FAR = 1e6  # an action beyond all limits
@@ -41,9 +41,9 @@ def describe_policy(
 
   Args:
     env: the task.
-    env_config: its resolved `env` section.
-    task: its name.
-    origin: where the policy comes from: run, step, commit.
+    env_config: the run's resolved `env` section.
+    task: name of the task.
+    origin: the policy's run, agent, steps, commit and last evaluation.
     inputs: shapes of the observation groups that the actor reads.
     state: any state of one environment, to test how actions become `ctrl`.
 
@@ -86,10 +86,10 @@ def describe_policy(
 
 
 def check_contract(contract: Contract) -> None:
-  """Checks the entries of a contract, which may have been written or changed by others: types and values.
+  """Checks types and values of a contract, which another program may have written or changed.
 
   Raises:
-    CheckpointError: an entry that is missing or invalid.
+    CheckpointError: an entry is missing or invalid.
   """
   _check(contract, "task", lambda x: isinstance(x, str), "a task's name")
   _check(contract, "env", lambda x: isinstance(x, Mapping) and _names(x), "a mapping")
@@ -204,7 +204,7 @@ def _camera(env: Env, entry: str) -> dict[str, object]:
 
 
 def _delays(config: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-  """Returns the delays that the task simulates, by dotted key."""
+  """Yields the delays that the task simulates, by dotted key."""
   for key, value in config.items():
     if key in OPTIONS:  # an observation term's delay is in its row
       continue
@@ -233,7 +233,7 @@ def _action(env: Env, config: Contract, state: State) -> dict[str, object]:
 
 
 def _home(mj_model: mujoco.MjModel, config: Contract) -> tuple[str, np.ndarray]:
-  """Returns the reference pose and its name."""
+  """Returns the name of the reference pose, and its `qpos` [nq]."""
   keyframes = [mj_model.key(i).name for i in range(mj_model.nkey)]
   if not keyframes:
     return "qpos0", mj_model.qpos0

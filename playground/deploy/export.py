@@ -15,7 +15,7 @@ from playground.errors import PlaygroundError
 from playground.extras import need
 from playground.files import need_folder, replacing, write_text
 
-TOLERANCE = 1e-5  # largest difference of an action from the trained policy's
+TOLERANCE = 1e-5  # largest difference between an exported and a trained policy's actions
 _ENVS, _DECISIONS = 8, 125  # 1000 observations
 
 
@@ -26,18 +26,18 @@ class ParityError(PlaygroundError):
 def export_run(path: str, *, out: str | None = None, console: Console | None = None) -> int:
   """Exports a run's newest checkpoint, or the one given.
 
-  The exported policy must give the same actions on 1000 observations of the trained one in C MuJoCo.
+  The exported policy must return the trained policy's actions on 1000 observations in C MuJoCo.
 
   Args:
     path: a run directory, or one of its checkpoints.
-    out: the folder to write to; by default `export/` in the run's.
+    out: the folder to write to; by default `export/` in the run directory.
     console: for the output.
 
   Returns:
     The exit code, 0.
 
   Raises:
-    ParityError: its actions differ; nothing is written.
+    ParityError: the exported policy's actions differ; nothing is written.
     PlaygroundError: no such run or checkpoint, a policy without an ONNX form, or a folder that is not writable.
   """
   console = console or Console()
@@ -64,10 +64,15 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
 
 
 def check_parity(exported: ExportedPolicy, obs: Mapping[str, np.ndarray], actions: np.ndarray) -> float:
-  """Returns the largest difference of an action.
+  """Returns the largest absolute difference between an exported policy's actions and those of the trained one.
+
+  Args:
+    exported: the policy to check.
+    obs: inputs of the actor by group, [N, ...].
+    actions: the trained policy's, [N, action_size].
 
   Raises:
-    ParityError: it is above `TOLERANCE`, or not a number.
+    ParityError: the difference is above `TOLERANCE`, or NaN.
   """
   error = float(np.abs(exported.actions(obs) - actions).max())
   if not error <= TOLERANCE:

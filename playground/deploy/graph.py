@@ -1,4 +1,4 @@
-"""A trained actor as an ONNX graph: normalisation, layers, the first half of the output, tanh (or all, clipped)."""
+"""Builds the ONNX graph of a trained actor: normalisation, layers, mean of the Gaussian, tanh."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -21,7 +21,7 @@ _LAYER_NORM_EPSILON = 1e-6  # Flax's default
 
 
 def input_names(entries: Collection[str]) -> dict[str, str]:
-  """Returns the graph's names of the observation groups that an actor reads; `obs` is the vector."""
+  """Returns the graph's input name of each observation group of an actor: `obs` for the vector or a sole image."""
   alone = len(entries) == 1
   names = {entry: re.sub(r"[^A-Za-z0-9_]", "_", entry) for entry in entries}
   return {entry: name if entry.startswith(PIXELS) and not alone else INPUT for entry, name in names.items()}
@@ -38,10 +38,10 @@ def policy_graph(
   """Builds the graph of a deterministic policy.
 
   Args:
-    params: of the actor, as Flax has them: of its MLP `hidden_<i>` with `kernel` [in, out] and `bias` [out], where its
-      layers are normalised `LayerNorm_<i>` with `scale` and `bias`; of an actor that sees, `output` is the last layer,
-      and for each camera there are the layers of its CNN.
-    inputs: shapes of the observation groups that it reads, in its order: images, then the vector.
+    params: Flax parameters of the actor. Layers of its MLP are `hidden_<i>` with `kernel` [in, out] and `bias` [out],
+      and `LayerNorm_<i>` with `scale` and `bias` if its layers are normalised. An actor with images has `output` as
+      its last layer, and a CNN for each camera (`cnn_name`).
+    inputs: shapes of the observation groups that the actor reads, in its order: images, then the vector.
     activation: of the hidden layers, as in `agent.network.activation`.
     normalization: mean and std of the vector, [n] each; None without normalisation.
     cnn: settings of the CNN, if there are images.

@@ -14,12 +14,12 @@ _MEANING = {"env": (*_ENV, *_CONTROL), "agent": ("name", "network", "normalize_o
 
 
 class Menu:
-  """The checkpoints on disk, which training adds and removes.
+  """Lists the checkpoints on disk, while training adds and removes them.
 
-  A stage of a chain is left out, with a sentence, if its policies do not fit the task of the newest stage.
+  A stage of a chain whose policies do not fit the task of the newest stage is left out, and reported once.
 
   Attributes:
-    trained: the first checkpoint.
+    trained: the checkpoint that was loaded first.
   """
 
   def __init__(self, folder: Path, trained: LoadedPolicy, say: Callable[[str], object]):
@@ -41,7 +41,7 @@ class Menu:
       return None
 
   def label(self, path: Path) -> str:
-    """Returns the label of a checkpoint: trained control steps, in a chain after the stage's name."""
+    """Returns the label of a checkpoint: its environment steps, in a chain after the stage's name."""
     stage = path.parents[1]
     name = "" if stage == self._folder else f"{stage.name.partition('_')[2]} "
     return f"{name}{int(path.name):,}"

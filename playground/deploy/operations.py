@@ -1,4 +1,4 @@
-"""ONNX operations of a trained actor: activations, and the CNN for images of a camera."""
+"""Builds the ONNX operations of a trained actor: activations, and the CNN of a camera's images."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -94,8 +94,8 @@ _POOLS: dict[str, Callable[[Chain, list[int]], None]] = {
 def _normalize_channels(graph: Chain) -> None:
   """Normalises each channel to mean 0 and std 1.
 
-  It works in steps, with means of rows' means: ONNX Runtime's InstanceNormalization subtracts the mean last, and sums
-  over a whole image lose digits; both errors are too large for a policy with steep actions.
+  The mean is that of the rows' means. ONNX Runtime's InstanceNormalization subtracts the mean last, and sums over a
+  whole image lose digits: both errors are too large for a policy with steep actions.
   """
   x = graph.value
   _mean_of_picture(graph)
@@ -111,14 +111,14 @@ def _normalize_channels(graph: Chain) -> None:
 
 
 def _mean_of_picture(graph: Chain) -> None:
-  """Returns the mean of each channel, [1, C, 1, 1] of [1, C, H, W]."""
+  """Reduces an image [1, C, H, W] to the mean of each channel, [1, C, 1, 1]."""
   graph.apply("ReduceMean", axes=[3])
   graph.apply("ReduceMean", axes=[2])
 
 
 def see(graph: Chain, params: Mapping[str, PyTree], cnn: CNNConfig, size: list[int]) -> None:
-  """Maps an image [1, H, W, C] uint8 of size (H, W) to features [1, F]."""
-  same = {"auto_pad": "SAME_UPPER"}  # on both sides, an odd one below and on the right, as in XLA
+  """Applies a camera's CNN to an image [1, H, W, C] uint8 of size (H, W); the output is features [1, F]."""
+  same = {"auto_pad": "SAME_UPPER"}  # pads both sides, an odd pixel below and on the right, as XLA does
   graph.apply("Cast", to=TensorProto.FLOAT)
   graph.apply("Transpose", perm=[0, 3, 1, 2])
   if cnn.normalize_channels:

@@ -17,7 +17,7 @@ _TERM = "reward/"  # prefix of metrics that are reward terms
 
 
 class Player:
-  """One environment under an exported policy.
+  """Runs one environment with an exported policy.
 
   Attributes:
     env: the task.
@@ -83,7 +83,7 @@ class Player:
     return self.state
 
   def show_present(self) -> None:
-    """Interpolates poses from the present state on."""
+    """Starts the interpolation of poses at the present state."""
     self.previous_qpos = np.asarray(self.state.data.qpos)
 
   @property
@@ -92,7 +92,7 @@ class Player:
 
   @property
   def task_command(self) -> np.ndarray:
-    """The present command, of the task or of the user."""
+    """The present command of the task or of the user: forward m/s, left m/s, turn rad/s."""
     return np.asarray(self.state.info[_COMMAND]) if self.command is None else self.command
 
   def push(self, speed: float) -> None:

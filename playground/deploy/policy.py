@@ -1,4 +1,4 @@
-"""An exported policy: `policy.onnx`, run by ONNX Runtime on one core, and its contract `policy.yaml`."""
+"""Runs an exported policy, `policy.onnx` with its contract `policy.yaml`, in ONNX Runtime on one core."""
 
 import hashlib
 import time
@@ -15,7 +15,7 @@ from playground.envs.base import Observation
 from playground.errors import CheckpointError
 from playground.extras import need
 
-Seen = Observation | np.ndarray | Mapping[str, np.ndarray]  # by a policy: observations with any leading axes
+Seen = Observation | np.ndarray | Mapping[str, np.ndarray]  # inputs of a policy, with any leading axes
 
 
 class ActingPolicy(Protocol):
@@ -28,7 +28,7 @@ class ActingPolicy(Protocol):
     ...
 
   def act(self, policy: object, obs: Observation, key: jax.Array) -> jax.Array:
-    """Returns the same actions inside jitted code, as evaluations call a policy."""
+    """Returns actions [..., action_size] inside jitted code, as evaluations call a policy."""
     ...
 
 
@@ -55,7 +55,7 @@ class ExportedPolicy:
     told = {row["name"]: row["shape"] for row in facts["inputs"]} | {facts["output"]: [1, facts["action_size"]]}
     found = {end.name: end.shape for end in (*self._session.get_inputs(), *self._session.get_outputs())}
     if found != told:
-      raise CheckpointError(f"The policy is not the one that its contract tells of: {found}, and not {told}.")
+      raise CheckpointError(f"The policy has other inputs or outputs than its contract: {found} instead of {told}.")
     own = hashlib.sha256(model).hexdigest()
     if facts.get("sha256", own) != own:  # older exports have none
       raise CheckpointError("The policy and its contract are not of one export (sha256): export the run again.")
@@ -67,7 +67,7 @@ class ExportedPolicy:
     """Reads `<name>.onnx` and `<name>.yaml` beside it.
 
     Raises:
-      CheckpointError: a file is missing, or is not of `playground export`.
+      CheckpointError: a file is missing, or was not written by `playground export`.
     """
     path = Path(path).expanduser()
     for file in (path, path.with_suffix(".yaml")):

@@ -47,7 +47,7 @@ class ScriptedPolicy:
     return (self._scale * self._generator.uniform(-1, 1, shape)).astype(np.float32)
 
   def act(self, policy: object, obs: Observation, key: jax.Array) -> jax.Array:
-    """Returns the same actions inside jitted code, as evaluations call a policy."""
+    """Returns actions [..., action_size] inside jitted code, as evaluations call a policy."""
     del policy
     return self._scale * jax.random.uniform(key, (*self._batch(obs), self._action_size), minval=-1.0)
 

@@ -21,7 +21,7 @@ _MOST_REQUESTS = 100  # that may wait; further requests are dropped
 
 
 class Session:
-  """Environments of one task side by side, advanced in time.
+  """Steps environments of one task in real time.
 
   One thread calls `advance` and `carry_out`. Other threads may set `paused`, `speed` and `selected`, and `ask` for the
   rest.
@@ -29,8 +29,8 @@ class Session:
   Attributes:
     players: the environments. Changing the terrain replaces all of them.
     selected: index of the environment that is plotted and followed.
-    trained: the run's policy that acts; None without a run.
-    following: `LATEST` or `BEST` to load that checkpoint when training writes it, None to keep the present one.
+    trained: the acting policy of a run; None without a run.
+    following: `LATEST` or `BEST` to load that checkpoint when training writes it, None to keep the acting one.
     paused: whether time stands still.
     speed: simulated seconds per second.
     on_step: functions that are called with the selected environment after each of its policy steps.
@@ -39,7 +39,7 @@ class Session:
   def __init__(
     self, env: Env, exported: ActingPolicy, seed: int, menu: Menu | None = None, following: str | None = LATEST
   ):
-    """Starts an episode of a policy; `menu` holds its checkpoint, if it is a run's."""
+    """Starts an episode of a policy; `menu` lists the checkpoints of its run, None without a run."""
     self._seed = seed
     self.players = [Player(env, exported, seed)]
     self.selected = 0
@@ -79,7 +79,7 @@ class Session:
       self._requests.get()()
 
   def advance(self, seconds: float) -> None:
-    """Advances by so many seconds at the chosen speed."""
+    """Advances by `seconds * speed` simulated seconds, unless paused."""
     if self.paused:
       return
     self._due += seconds * self.speed
@@ -138,15 +138,15 @@ class Session:
 
   @property
   def acting(self) -> str:
-    """Control steps that the acting policy was trained for, after its stage's name in a curriculum."""
+    """Environment steps of the acting policy's training, after its stage's name in a curriculum."""
     if self._menu is None or self.trained is None:
       return f"{self.player.exported.contract['origin']['steps']:,}"
     return self._menu.label(self.trained.checkpoint.path)
 
   def choices(self) -> dict[str, str | Path]:
-    """Returns what `choose_checkpoint` takes, by label: `LATEST`, `BEST` if there is one, and checkpoints, newest last.
+    """Returns the choices of `choose_checkpoint` by label: `LATEST`, `BEST` if there is one, checkpoints, newest last.
 
-    The acting checkpoint is always among them, even if it was deleted. Empty without a run.
+    The acting checkpoint is always included, even if it was deleted. Without a run there are no choices.
     """
     if self._menu is None or self.trained is None:
       return {}
@@ -163,7 +163,7 @@ class Session:
       self._act_as(choice)
 
   def follow(self) -> None:
-    """Changes to the newest or best checkpoint if `following` says so; raises CheckpointError if it is unreadable."""
+    """Loads a new checkpoint that `following` selects; raises CheckpointError if the checkpoint is unreadable."""
     if self.following is None or self._menu is None:
       return
     wanted = self._menu.best() if self.following == BEST else self._menu.checkpoints()[-1]

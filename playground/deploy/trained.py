@@ -34,11 +34,16 @@ def load_exact(path: str | Path) -> LoadedPolicy:
 
 
 def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:
-  """Runs the policy's mode with the task's noise, and records it.
+  """Rolls out the policy's mode with the task's noise, and records inputs and actions.
+
+  Args:
+    trained: the policy and its task.
+    num_envs: number of environments.
+    decisions: policy steps in each environment.
 
   Returns:
-    The actor's inputs, by group [num_envs * steps, ...], its actions, [..., action_size], and a state of one
-    environment.
+    The actor's inputs by group, [num_envs * decisions, ...], its actions, [num_envs * decisions, action_size], and
+    the last state of one environment.
   """
   batch, networks = wrap_for_training(trained.env), trained.trainer.networks
 
@@ -56,7 +61,7 @@ def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[s
 
 
 def export_policy(trained: LoadedPolicy, state: State | None = None) -> ExportedPolicy:
-  """Exports the policy in memory; `state` is any of one environment (after a reset if None)."""
+  """Exports the policy in memory; `state` is any state of one environment (None takes one after a reset)."""
   need("deploy", "onnx", "onnxruntime")
   policy, agent, networks = jax.device_get(trained.policy), trained.config.agent, trained.trainer.networks
   params, seen = networks.mlp(policy.params.policy, policy.normalizer if agent.normalize_observations else None)

@@ -27,7 +27,7 @@ _HELP = (
 
 
 def need_display() -> None:
-  """Raises HardwareError without a screen."""
+  """Raises HardwareError if no window can be opened here."""
   if not sys.platform.startswith("linux"):
     return
   display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")

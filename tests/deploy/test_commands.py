@@ -116,8 +116,8 @@ def test_a_damaged_policy_and_one_of_another_task(
   for content, told, said in [
     (b"", contract, "is no model that ONNX Runtime can read"),
     (model[:-9], contract, "is no model that ONNX Runtime can read"),
-    (model, contract.replace("shape: [1, 5]", "shape: [1, 6]"), "{'obs': [1, 5], 'continuous_actions': [1, 1]}, and"),
-    (model, contract.replace("action_size: 1", "action_size: 2"), "is not the one that its contract tells of"),
+    (model, contract.replace("shape: [1, 5]", "shape: [1, 6]"), "{'obs': [1, 5], 'continuous_actions': [1, 1]} instead of"),
+    (model, contract.replace("action_size: 1", "action_size: 2"), "has other inputs or outputs than its contract"),
   ]:
     (tmp_path / "policy.onnx").write_bytes(content)
     (tmp_path / "policy.yaml").write_text(told)
@@ -256,7 +256,7 @@ def test_one_sentence_each(
     (["export", str(tmp_path), "--out", "/proc/nowhere/at/all"], "cannot be written"),
     (["play", str(tmp_path), "--video", "a.gif"], "--video=a.gif must be a file that ends in .mp4"),
     (["play", str(tmp_path), "--video", str(tmp_path / "cut.yaml" / "a.mp4")], "cut.yaml is not a folder"),
-    (["play", str(tmp_path), "--camera", "fixed"], "--camera=fixed is of the video that --video=<file> asks for"),
+    (["play", str(tmp_path), "--camera", "fixed"], "--camera=fixed needs --video=<file>"),
     (["play", str(tmp_path), "--viewer"], "--viewer needs a display"),
     (["export", str(tmp_path)], "holds no checkpoint"),
     (["export", str(tmp_path), "--out", str(tmp_path / "cut.yaml")], "cut.yaml is not a folder"),

@@ -1,1 +1,1 @@
-"""`playground play --web`: a policy in the browser, drawn and steered through viser."""
+"""Shows and controls a policy in the browser, through viser (`playground play --web`)."""

@@ -48,7 +48,7 @@ class Pad:
 
   @classmethod
   def read(cls, note: str) -> "Pad":
-    """Parses the script's state; an invalid one is that of a gamepad at rest."""
+    """Parses the script's state; an invalid state gives a gamepad at rest."""
     try:
       said = msgspec.json.decode(note, type=_Note)
     except msgspec.MsgspecError:
@@ -70,7 +70,7 @@ class Gamepads:
     """Starts listening.
 
     Args:
-      server: the browsers'.
+      server: viser's server.
       ask: queues a function, to call between two policy steps.
       steer: called with `Pad.sticks` when they have moved.
       buttons: called when a button is pressed, by its number.

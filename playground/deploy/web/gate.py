@@ -1,6 +1,6 @@
 """Restricts who can connect to the viewer in the browser, and which messages they can send.
 
-viser accepts every connection: of a web page from another site (websockets have no same-origin policy), and of every
+viser accepts every connection: from a web page of another site (websockets have no same-origin policy), and from every
 machine on the network if the viewer listens there. The gate checks requests and messages before viser handles them, in
 the hooks that `websockets` has for this purpose.
 """
@@ -76,10 +76,10 @@ _DECODER = msgspec.msgpack.Decoder(
 
 
 class Gate:
-  """The gate of one server.
+  """Checks the requests and messages to one viser server.
 
   Attributes:
-    server: viser's.
+    server: viser's server.
     url: the address to open, with the token if connections need one.
   """
 
@@ -88,8 +88,8 @@ class Gate:
 
     Args:
       host: the address to listen at.
-      port: its port.
-      title: of the page.
+      port: the port to listen at.
+      title: title of the page.
     """
     self._title = title
     self._host, self._cookie = host, f"playground-{port}"

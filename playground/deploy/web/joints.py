@@ -1,4 +1,4 @@
-"""Sliders of joints and of actions: to pose the robot, and to act in place of the policy."""
+"""Adds sliders of joints, which pose the robot, and of actions, which act in place of the policy."""
 
 import mujoco
 import numpy as np
@@ -57,13 +57,13 @@ class Joints:
         _show(slider, float(player.state.data.qpos[address]))
 
   def _act(self) -> None:
-    """Makes the sliders or the policy act."""
+    """Selects the source of actions: the sliders or the policy."""
     values = np.array([slider.value for slider in self.actions], np.float32) if self.by_hand.value else None
     for player in self._session.players:
       player.manual_action = values
 
   def _pose(self, address: int) -> None:
-    """Moves a joint to its slider's position, unless the slider only shows the present one."""
+    """Moves a joint to its slider's position, unless the slider shows the joint's present position."""
     session, slider = self._session, self.joints[address]
 
     def pose() -> None:

@@ -1,4 +1,4 @@
-"""The viewer's controls: sliders, buttons, menus, and keys for most of them.
+"""Adds the viewer's controls: sliders, buttons, menus, and keys for most of them.
 
 Keys and gamepads move the sliders, and only the sliders set the command.
 """
@@ -54,13 +54,13 @@ _DEFAULT_RANGE = 1.0  # m/s and rad/s, of the sliders if the task has no range
 
 
 class Panel:
-  """The controls of a session, in tabs.
+  """Shows the controls of a session, in tabs.
 
   Attributes:
     view: draws the scene.
-    plots: of rewards, observations and actions.
+    plots: charts of rewards, observations and actions.
     joints: sliders of joints and actions.
-    recorder: of videos.
+    recorder: records videos.
   """
 
   def __init__(self, server: viser.ViserServer, session: Session):

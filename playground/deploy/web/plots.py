@@ -1,4 +1,4 @@
-"""Plots of the last seconds: reward terms, an observation group or the actions, one small chart for each."""
+"""Plots the last seconds of reward terms, an observation group or the actions, one small chart for each."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -24,11 +24,11 @@ Values = Callable[[Player], np.ndarray]
 
 
 class Plots:
-  """A menu of quantities, and the charts of the chosen one.
+  """Draws the charts of the quantity that a menu chooses.
 
   Attributes:
     choice: the menu.
-    charts: by title.
+    charts: the charts, by title.
   """
 
   def __init__(self, gui: viser.GuiApi, session: Session, tab: viser.GuiTabHandle):

@@ -25,9 +25,9 @@ class Recorder:
     """Prepares for recordings, without starting one.
 
     Args:
-      server: whose browsers get the video.
-      session: what to record.
-      camera: returns the model's camera to film with, None for the default.
+      server: sends the video to its browsers.
+      session: the session to record.
+      camera: returns the model's camera of the video, None for the default.
       say: shows a sentence in the browsers.
     """
     self._server, self._session, self._camera, self._say = server, session, camera, say

@@ -1,4 +1,4 @@
-"""The viewer in the browser: a server, and the loop that advances time."""
+"""Serves the viewer to browsers, and runs the loop that advances time."""
 
 import time
 
@@ -16,7 +16,7 @@ _LONGEST = 0.1  # s of simulation per frame, at most; a slow machine falls behin
 
 
 class Watch:
-  """A session in the browser."""
+  """Serves a session to browsers, and advances it."""
 
   def __init__(self, session: Session, host: str, port: int):
     """Starts serving.

@@ -24,7 +24,7 @@ _COLORS = {
   True: ((14, 19, 30), (56, 66, 84), (66, 72, 84), (44, 50, 62)),
 }
 _SIDE, _COUNT = 0.5, 80  # m, of a square of the floor; squares in a row
-_BELOW = 0.1  # m, of the plane behind the squares' edge under them: a nearer one hides them where depth is coarse
+_BELOW = 0.1  # m, from the squares down to mjviser's plane: a nearer one hides squares where the depth buffer is coarse
 _APART = 0.06  # m, between the robot and the arrows above it
 _ARROWS = {"commanded": (40, 160, 90), "actual": (40, 90, 200)}  # velocities, green and blue
 _SHOWN_AT_FIRST = {"velocity": True, "contacts": False, "follow": True, "dark": False}
@@ -39,8 +39,8 @@ class View:
   Attributes:
     shown: whether velocity arrows and contacts are drawn, the camera follows a walking robot, and the page is dark.
     scene: mjviser's scene of the task.
-    squares: of the floor, light ones and dark ones; none on a terrain.
-    planes: mjviser's, below the squares.
+    squares: the floor's light and dark squares; none on a terrain.
+    planes: mjviser's planes, below the squares.
     arrows: of the commanded and the actual velocity, for a robot that follows commands.
     boxes: the controls of `shown`.
     num_envs: the control of the number of environments.
@@ -125,7 +125,7 @@ class View:
     model, number = player.env.mj_model, len(self._session.players)
     fresh, self._model = self._model is not model, model
     self._server.scene.reset()
-    self.scene = ViserMujocoScene(self._server, copy.copy(model), num_envs=number)  # which changes the model's colours
+    self.scene = ViserMujocoScene(self._server, copy.copy(model), num_envs=number)  # it recolours geoms
     self._data = mujoco.MjData(self.scene.mj_model)
     self._walks = walks(model)
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
@@ -171,7 +171,7 @@ class View:
         self.squares.append(squares)
 
   def _add_copies(self) -> list[tuple[viser.BatchedGlbHandle, np.ndarray]]:
-    """Draws what is fixed to the world once more for each other environment; mjviser draws it once.
+    """Draws the geoms fixed to the world for each further environment; mjviser draws them once.
 
     Returns:
       Handles, and their positions in an environment.
@@ -260,7 +260,7 @@ class View:
     return model.body_rootid[model.geom_bodyid] == model.body_rootid[self._root]
 
   def _add_controls(self) -> None:
-    """Adds the cameras, and what can be shown and hidden; the geometry groups are mjviser's."""
+    """Adds the menu of cameras and the boxes of `shown`; mjviser adds those of geom and site groups."""
     gui, model = self._server.gui, self.scene.mj_model
     if self._folder is not None:
       self._folder.remove()
@@ -288,13 +288,13 @@ class View:
 
 
 def _sky(zenith: tuple[int, int, int], horizon: tuple[int, int, int]) -> np.ndarray:
-  """An image that goes from the colour of the zenith to that of the horizon [256, 2, 3]."""
+  """Returns an image [256, 2, 3] uint8 that fades from the zenith's colour to the horizon's."""
   share = np.clip(np.linspace(0, 2, 256), 0, 1)[:, None, None]
   return np.repeat((1 - share) * zenith + share * horizon, 2, axis=1).astype(np.uint8)
 
 
 def _squares(odd: bool) -> tuple[np.ndarray, np.ndarray]:
-  """Vertices and faces of a chessboard's even or odd squares about the origin."""
+  """Returns vertices [4N, 3] and faces [2N, 3] of a chessboard's even or odd squares about the origin."""
   x, y = (axis.ravel() for axis in np.meshgrid(*[np.arange(-_COUNT // 2, _COUNT // 2)] * 2))
   corners = np.stack([x, y], -1)[(x + y) % 2 == odd][:, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
   vertices = np.pad(corners.reshape(-1, 2) * _SIDE, ((0, 0), (0, 1)))
