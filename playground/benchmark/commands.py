@@ -128,7 +128,7 @@ class Pixels(OfTasks):
       raise ConfigError("compared=true is of CartpoleBalanceVision alone: leave tasks= and suite= away.")
     for task in self.chosen():
       if not self.configured(task).env.vision.enable:
-        raise ConfigError(f"{task} sees nothing: add env.vision.enable=true env.vision.camera=<name>.")
+        raise ConfigError(f"{task} has no images: add env.vision.enable=true env.vision.camera=<name>.")
 
   def jobs(self, devices: int) -> list[Measurement]:
     jobs = []

@@ -57,7 +57,7 @@ def check_vision(keys: Iterable[str], resolved: Section) -> None:
   """Raises ConfigError where `keys` of a command line set `env.vision` of a task without vision."""
   unused = [key for key in keys if key.startswith("env.vision.") and key != "env.vision.enable"]
   if unused and not uses_vision(resolved["env"]):
-    raise ConfigError(f"{unused[0]}: this task sees nothing. Add env.vision.enable=true env.vision.camera=<name>.")
+    raise ConfigError(f"{unused[0]}: this task has no images. Add env.vision.enable=true env.vision.camera=<name>.")
 
 
 def _check_xla_flags(flags: object) -> None:

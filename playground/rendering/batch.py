@@ -20,7 +20,7 @@ from playground.rendering.video import camera_names
 
 Pictures = dict[str, jax.Array]
 Context = Any  # of MuJoCo-Warp, which has no public type for it
-Rendered = tuple[dict[str, Pictures], jax.Array]  # by camera; and a zero that depends on them
+Rendered = tuple[dict[str, Pictures], jax.Array]  # images by camera, and a zero that depends on them
 _KINDS = ("rgb", "depth", "segmentation")
 
 
@@ -29,11 +29,11 @@ class View:
   """Settings of the images, the same for every environment.
 
   Attributes:
-    cameras: names.
+    cameras: names of the model's cameras.
     width: of each image, pixels.
     height: of each image, pixels.
-    kinds: `rgb`, `depth` and `segmentation`, any of them.
-    shadows: whether lights cast them (those with `castshadow`).
+    kinds: any of `rgb`, `depth` and `segmentation`.
+    shadows: whether lights with `castshadow` cast shadows.
     textures: whether materials show textures or only colours.
     geom_groups: groups of the visible geoms.
   """
@@ -99,7 +99,7 @@ class BatchRenderer:
     return pictures, data.replace(time=data.time + token)
 
   def _draw(self, lenses: bool, own: mjx.Model, model: mjx.Model, data: PhysicsData) -> Rendered:
-    """Returns the result of `_render` for a batch [N] of states; `own` tells which model fields have that axis."""
+    """Returns the result of `_render` for a batch [N] of states; `own` marks the model fields with a batch axis."""
 
     @jax.custom_batching.custom_vmap
     def draw(model: mjx.Model, data: PhysicsData) -> Rendered:

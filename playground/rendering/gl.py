@@ -1,4 +1,4 @@
-"""Finds an OpenGL backend without a screen. Never imports mujoco here: a broken GL library kills the process."""
+"""Finds an OpenGL backend that needs no display. Never imports mujoco: a broken GL library kills the process."""
 
 import functools
 import os
@@ -28,7 +28,8 @@ _OFF = ("disable", "disabled", "off", "false", "0")  # values that mean "no GL" 
 def withhold_gl() -> None:
   """Stores the user's MUJOCO_GL for the child processes that render.
 
-  A process that trains renders nothing, yet `import mujoco` fails in it if the backend named there is not installed.
+  A process that trains renders nothing, yet its `import mujoco` fails if MUJOCO_GL names a backend that is not
+  installed.
   """
   if "MUJOCO_GL" in os.environ:
     os.environ[_ASKED] = os.environ.pop("MUJOCO_GL")
@@ -36,7 +37,7 @@ def withhold_gl() -> None:
 
 @functools.cache
 def find_gl() -> str | None:
-  """Returns a value of MUJOCO_GL with which MuJoCo draws here, or None; probed once per process, in subprocesses.
+  """Returns a value of MUJOCO_GL with which MuJoCo renders here, or None; probed once per process, in subprocesses.
 
   The user's own MUJOCO_GL comes first (and `MUJOCO_GL=disable` means none). Then come EGL, OSMesa and, if there is a
   display, GLFW on Linux, and CGL (macOS) and GLFW elsewhere.
@@ -60,6 +61,6 @@ def works(backend: str, timeout_s: float = 60.0) -> bool:
 
 
 def gl_environment(backend: str) -> dict[str, str]:
-  """Returns this process's environment for a child that draws with `backend`."""
+  """Returns this process's environment for a child that renders with `backend`."""
   # MuJoCo sets PYOPENGL_PLATFORM itself and refuses one that contradicts MUJOCO_GL.
   return {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}

@@ -1,7 +1,7 @@
 """Renders a recorded trajectory to MP4 in a child process, so that no GL crash or hang reaches the run.
 
-`python -m playground.rendering.video <out.mp4> <scratch> <pipe>` is the child, which `render_video` starts with the
-trajectory as its standard input; $MUJOCO_GL chooses how it draws. The child owns the scratch folder. It removes the
+`render_video` starts the child, `python -m playground.rendering.video <out.mp4> <scratch> <pipe>`, with the trajectory
+as standard input; $MUJOCO_GL chooses the child's renderer. The child owns the scratch folder. The child removes the
 folder and ends when its parent dies for any reason, which closes the other end of the pipe.
 """
 
@@ -122,7 +122,7 @@ def need_place(video: str | None, camera: str | None = None) -> Path | None:
   """
   if video is None:
     if camera is not None:
-      raise ConfigError(f"--camera={camera} is of the video that --video=<file> asks for.")
+      raise ConfigError(f"--camera={camera} needs --video=<file>.")
     return None
   path = Path(video).expanduser()
   need_file(path, ".mp4", f"--video={video}")
@@ -142,7 +142,7 @@ def camera_names(model: "mujoco.MjModel") -> list[str]:
 
 
 def frame_stride(dt: float) -> int:
-  """Returns the rows between two frames, so that playback is real time at no more than `MAX_FPS`."""
+  """Returns the rows of `qpos` per frame, so that playback is real time at no more than `MAX_FPS`."""
   return max(1, math.ceil(1 / (MAX_FPS * dt) - 1e-6))
 
 
@@ -161,7 +161,7 @@ def _pack(mj_model: "mujoco.MjModel", qpos: np.ndarray, **arrays: Any) -> bytes:
 
 
 def _work(out_path: Path, scratch: Path, pipe: int) -> None:
-  """Runs in the child: makes the video in its scratch folder and moves it to its path."""
+  """Renders the video in the child's scratch folder, then copies it to its path."""
   scratch.mkdir(mode=0o700)
   threading.Thread(target=_end_with_parent, args=(scratch, pipe), daemon=True).start()
   try:
@@ -186,7 +186,7 @@ def _end_with_parent(scratch: Path, pipe: int) -> None:
 
 
 def _render(trajectory: io.BytesIO, out_path: Path) -> None:
-  """Draws and encodes."""
+  """Renders a trajectory and encodes it as MP4."""
   import imageio_ffmpeg
   import mujoco
 

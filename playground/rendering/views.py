@@ -18,13 +18,13 @@ _GAP = 2  # pixels between two views
 
 
 def save_views(env: Env, events: Mapping[str, object], path: str | Path, count: int = 16, seed: int = 0) -> Path:
-  """Writes `count` views as one image.
+  """Writes `count` views as one image, and returns its path.
 
   Args:
     env: a task with images in its observation.
     events: `env.events`, see `Randomizer`.
     path: the .png to write.
-    count: views, all rendered at once.
+    count: number of views, all rendered at once.
     seed: of episodes and models.
 
   Raises:
@@ -39,7 +39,7 @@ def save_views(env: Env, events: Mapping[str, object], path: str | Path, count: 
   sizes = env.observation_size
   if not isinstance(sizes, Mapping) or not any(key.startswith(PIXELS) for key in sizes):
     have = ", ".join(camera_names(env.mj_model)) or "none"
-    raise ConfigError(f"The task sees nothing: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
+    raise ConfigError(f"The task has no images: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
   model = Randomizer(env.mj_model, events).sample_batch(jax.random.split(model_key, count))
   state = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)

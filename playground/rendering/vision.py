@@ -1,4 +1,4 @@
-"""Camera images as an observation of any task."""
+"""Adds camera images to the observation of any task."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -20,19 +20,18 @@ _MAX_GEOMS = 255  # ids that fit in a byte, besides the value for no geom
 
 
 class Vision(Wrapper):
-  """Adds the observation `pixels/<camera>` to a task's own: uint8 [height, width, channels].
+  """Adds the observation group `pixels/<camera>`, uint8 [height, width, channels], to a task for one environment.
 
-  The agent chooses the groups that it reads (`agent.network.policy_obs_key`). Like the task it is for one environment.
-  An image shows the state of its observation. With `frames` above 1 the last images are stacked, the newest last; they
-  come from the last observation, so all are of one episode, whose first observation repeats the first image.
-  Brightness, a factor on all pixels, is drawn for every episode; an auto-reset, which restores the first observation,
-  restores its brightness for this step.
+  The agent chooses the groups that it reads (`agent.network.policy_obs_key`). An image shows the state that its
+  observation describes. With `frames` above 1, the last images of the episode are stacked, the newest last; the first
+  observation repeats the first image. Brightness, a factor on all pixels, is drawn for every episode. An auto-reset
+  restores the first observation with its brightness; the next step draws a new one.
   """
 
   jitted, observation_size = Env.jitted, Env.observation_size
 
   def __init__(self, env: Env):
-    """`env`: a task whose config has `vision`, see `VisionConfig` in `envs/options.py`.
+    """Takes a task whose config has `vision`, see `VisionConfig` in `envs/options.py`.
 
     Raises:
       ConfigError: no camera, one that does not exist, or invalid settings.

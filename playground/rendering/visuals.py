@@ -20,7 +20,7 @@ MENAGERIE = {
   "spot": ("boston_dynamics_spot", "spot"),
   "t1": ("booster_t1", "t1"),
 }
-_DRAWN = 3  # geoms of groups below are drawn
+_DRAWN = 3  # geoms of lower groups are drawn
 
 
 def drawn_model(env: Env, visuals: str) -> mujoco.MjModel:
@@ -28,8 +28,8 @@ def drawn_model(env: Env, visuals: str) -> mujoco.MjModel:
 
   Args:
     env: the task.
-    visuals: `primitives`, the task's own model, or `menagerie`, the same with the robot's meshes (downloaded once by
-      the package mujoco-menagerie). The simulation is the same.
+    visuals: `primitives`, the task's own model, or `menagerie`, that model with the robot's meshes (downloaded once by
+      the package mujoco-menagerie). The simulation does not change.
 
   Raises:
     UnknownNameError: no such visuals.

@@ -32,7 +32,7 @@ def test_every_size_and_number_is_a_job_under_the_papers_conditions() -> None:
 
 
 def test_a_task_without_a_camera_is_refused() -> None:
-  with pytest.raises(ConfigError, match=r"CartpoleBalance sees nothing: add env.vision.enable=true"):
+  with pytest.raises(ConfigError, match=r"CartpoleBalance has no images: add env.vision.enable=true"):
     Pixels(tasks=("CartpoleBalance",)).check()
   camera = ("env.vision.enable=true", "env.vision.camera=fixed")
   Pixels(tasks=("CartpoleBalance",), overrides=camera).check()

@@ -23,7 +23,7 @@ def test_pictures_lie_in_rows_with_gaps() -> None:
 
 def test_what_cannot_be_shown(tmp_path: Path) -> None:
   blind = registry.load("CartpoleBalance")
-  with pytest.raises(ConfigError, match=r"sees nothing: add env.vision.enable=true .* of fixed, lookatcart"):
+  with pytest.raises(ConfigError, match=r"has no images: add env.vision.enable=true .* of fixed, lookatcart"):
     save_views(blind, {}, tmp_path / "views.png")
   with pytest.raises(ConfigError, match=r"--views=views\.jpg must be a file that ends in \.png\."):
     save_views(blind, {}, "views.jpg")

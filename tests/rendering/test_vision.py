@@ -155,5 +155,5 @@ def test_the_settings_are_there_for_every_task() -> None:
     compose(["env=Go1JoystickFlatTerrain", "env.vision.frames=0"])
   for blind in ("env=Go1JoystickFlatTerrain", "env=CartpoleBalanceVision env.vision.enable=false"):
     compose(blind.split())
-    with pytest.raises(ConfigError, match=r"env.vision.camera: this task sees nothing. Add env.vision.enable=true"):
+    with pytest.raises(ConfigError, match=r"env.vision.camera: this task has no images. Add env.vision.enable=true"):
       compose([*blind.split(), "env.vision.camera=track"])
