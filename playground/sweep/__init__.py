@@ -1,6 +1,6 @@
 """Sweeps of runs: `playground-run -m` and `playground sweep`.
 
-The state of a sweep is in files, so its process may die; the same command runs what is missing:
+The state of a sweep is in files. If the sweep's process dies, the same command runs the missing jobs:
 
 ```
 <sweep_dir>/
@@ -10,10 +10,10 @@ The state of a sweep is in files, so its process may die; the same command runs 
 ```
 
   plan      command line -> jobs, composed and checked
-  folder    those files
-  worker    one job in one process: started by a launcher, on whatever machine
+  folder    the files above
+  worker    one job in one process, started by a launcher on any machine
   local, slurm, ray     launchers: start workers
-  runner    the loop that hands jobs to a launcher and waits for them; measurements of `playground-bench` use it, too
+  runner    the loop that starts jobs through a launcher and waits for them; `playground-bench` uses it, too
   search    Optuna instead of every combination
   view      the output of a running sweep
   report    tables, curves and the page

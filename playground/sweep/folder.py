@@ -1,4 +1,4 @@
-"""The files of a sweep, and the states of its jobs."""
+"""Reads and writes the files of a sweep and the states of its jobs."""
 
 import contextlib
 import dataclasses
@@ -34,11 +34,11 @@ class Job:
   """One process of a sweep or benchmark.
 
   Attributes:
-    name: of its folder.
-    overrides: its arguments, to which the worker adds its folder.
+    name: name of the job's folder.
+    overrides: the job's arguments, to which the worker adds the folder.
     varies: the values in which the sweep's jobs differ, by key.
     needs: number of GPUs; None is one if there is any.
-    steps: its budget of environment steps.
+    steps: budget of environment steps.
   """
 
   name: str
@@ -55,7 +55,7 @@ class Job:
       number: position in the sweep.
       overrides: command line.
       varying: the keys in which jobs differ.
-      config: configuration.
+      config: the run's configuration.
 
     Raises:
       ConfigError: the run needs several machines.
@@ -85,7 +85,7 @@ def _value(config: RunConfig, key: str) -> Plain:
 
 @dataclasses.dataclass(frozen=True)
 class JobState:
-  """The state of a job; `where`, `attempt` and the times (ISO 8601) are those of its last start."""
+  """The state of a job; `where`, `attempt` and the times (ISO 8601) are those of the job's last start."""
 
   status: Status = "queued"
   reason: str = ""
@@ -102,12 +102,12 @@ class JobState:
     try:
       end = datetime.datetime.fromisoformat(self.ended) if self.ended else datetime.datetime.now(datetime.UTC)
       return (end - datetime.datetime.fromisoformat(self.started)).total_seconds()
-    except (ValueError, TypeError):  # no time, or one without a zone: damaged
+    except (ValueError, TypeError):  # no time, or one without a zone: the record is damaged
       return None
 
 
 class JobFolder:
-  """A job's run directory, and the record that its worker keeps there."""
+  """Reads and writes a job's run directory and the worker's record in it."""
 
   def __init__(self, path: Path):
     self.path = path
@@ -140,7 +140,7 @@ class JobFolder:
     self.write(status=status, attempt=self.record.get("attempt", 0))
 
   def state(self) -> JobState:
-    """Returns the job's state, also if its worker was killed before it recorded one."""
+    """Returns the job's state, even if its worker was killed before it recorded the end."""
     record = self.record
     fields = {f.name: record[f.name] for f in dataclasses.fields(JobState) if f.name in record}
     state = JobState(**fields)
@@ -161,7 +161,7 @@ class JobFolder:
       yield lock
 
   def locked(self) -> bool:
-    """Whether a process runs the job, on this machine or another that shares its folder."""
+    """Whether a process runs the job, on this machine or on another that shares the folder."""
     return is_locked(self.path / "job.lock")
 
   def progress(self) -> tuple[int | None, float | None]:
@@ -181,17 +181,17 @@ class JobFolder:
 
 @dataclasses.dataclass
 class SweepDirectory:
-  """A sweep on disk. Get one from `create` or `open`.
+  """A sweep on disk; `create` or `open` returns one.
 
   Attributes:
-    path: its folder.
-    name: of the sweep.
-    command: the command line, for people.
+    path: folder of the sweep.
+    name: name of the sweep.
+    command: the command line, to show to users.
     settings: the overrides of the sweep itself.
-    lines: the overrides of its jobs, with several values each.
-    jobs: its jobs.
-    cwd: the folder it was started in: relative paths in overrides start there.
-    created: when (ISO 8601).
+    lines: the overrides of the jobs, with several values each.
+    jobs: the jobs.
+    cwd: the working directory of the command, where relative paths in overrides start.
+    created: time of creation (ISO 8601).
   """
 
   path: Path
@@ -251,13 +251,13 @@ class SweepDirectory:
     return {job.name: self.folder(job).state() for job in self.jobs}
 
   def add(self, job: Job) -> None:
-    """Adds a job of a search."""
+    """Adds a job that a search has drawn."""
     self.jobs.append(job)
     self._write()
 
   @contextlib.contextmanager
   def controlled(self) -> Iterator[None]:
-    """Holds the sweep while the block runs; raises CheckpointError if another process does."""
+    """Locks the sweep while the block runs; raises CheckpointError if another process holds the lock."""
     with locking(self.path / "sweep.lock") as lock:
       if lock is None:
         raise CheckpointError(
@@ -273,7 +273,7 @@ class SweepDirectory:
 
 
 def _check(content: Plain) -> None:
-  """Raises KeyError, TypeError or ValueError for a sweep.yaml of another form than `create` writes."""
+  """Raises KeyError, TypeError or ValueError if a sweep.yaml does not have the form that `create` writes."""
   texts = lambda key, value: _need(key, value, list) and [_need(key, text, str) for text in value]
   _need("it", content, dict)
   for key, kind in {"name": str, "cwd": str, "jobs": list}.items():

@@ -21,7 +21,7 @@ MEMORY_FRACTION = 0.9  # of a GPU, shared among its slots; the rest is for Warp 
 
 @dataclasses.dataclass(frozen=True)
 class Slot:
-  """A slot for one job: a share of a GPU (None without one, `ALL` those visible here) and CPU cores."""
+  """A slot for one job: a GPU (None without one, `ALL` for all that are visible here) and CPU cores."""
 
   number: int
   gpu: str | None
@@ -29,7 +29,7 @@ class Slot:
 
 
 def make_slots(gpus: Sequence[str], slots_per_gpu: int, cores: Sequence[int], cores_per_job: int) -> list[Slot]:
-  """Divides a machine: slots alternate between GPUs, so that jobs spread first; cores are divided evenly."""
+  """Divides a machine into slots, which alternate between GPUs so that jobs spread; cores are divided evenly."""
   places = [gpu for _ in range(slots_per_gpu) for gpu in gpus] or [None] * max(1, len(cores) // cores_per_job)
   each = len(cores) // len(places)
   share = lambda i: tuple(cores[i * each : (i + 1) * each]) if each else tuple(cores)
@@ -46,7 +46,7 @@ def pick(free: Sequence[Slot], needs: int | None) -> list[Slot] | None:
 
 
 class LocalLauncher:
-  """See `runner.Launcher`."""
+  """Implements `runner.Launcher` on this machine."""
 
   outlives = False
 
@@ -63,7 +63,7 @@ class LocalLauncher:
     self._command = tuple(command)
     self._workers: dict[str, subprocess.Popen[bytes]] = {}
     self._taken: dict[str, list[Slot]] = {}
-    for job in sweep.jobs:  # jobs that outlived the process that started them
+    for job in sweep.jobs:  # jobs that outlived an earlier launcher
       folder = sweep.folder(job)
       if folder.locked():
         numbers = folder.record.get("slots", [])
@@ -130,7 +130,7 @@ class LocalLauncher:
   def kill(self) -> None:
     for job in self._sweep.jobs:
       if self._at_work(job.name):
-        # The worker sees its job end; a worker of an earlier start is no child of ours, but its job ends, too.
+        # The worker sees its job end; a worker of an earlier start is no child process, but its job ends, too.
         pid = self._sweep.folder(job).record.get("job_pid")
         with contextlib.suppress(ProcessLookupError, PermissionError):
           os.killpg(pid, signal.SIGKILL) if pid else None

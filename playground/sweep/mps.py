@@ -1,4 +1,4 @@
-"""NVIDIA's Multi-Process Service: processes that share a GPU run concurrently on it instead of in turns."""
+"""Runs NVIDIA's Multi-Process Service, with which processes that share a GPU run concurrently instead of in turns."""
 
 import contextlib
 import hashlib
@@ -26,7 +26,7 @@ def control_program() -> str:
 
 
 def _make_own(folder: Path) -> None:
-  """Makes a folder in one that all users share; raises HardwareError if another user owns it."""
+  """Makes a private folder in a shared one; raises HardwareError if another user owns or can read it."""
   with contextlib.suppress(FileExistsError):
     folder.mkdir(mode=0o700)
   found = folder.lstat()
@@ -37,9 +37,9 @@ def _make_own(folder: Path) -> None:
 
 
 class MultiProcessService:
-  """The service for one sweep, of all GPUs that the driver has.
+  """Runs the service of one sweep, on all GPUs of the driver.
 
-  A restarted sweep finds the service that its earlier jobs still use.
+  A restarted sweep uses the service of its earlier jobs, if they still run.
   """
 
   def __init__(self, sweep: Path):

@@ -73,7 +73,7 @@ def _lines(overrides: Sequence[str]) -> tuple[list[str], SweepSettings, list[lis
     The overrides of the sweep, the settings they make, and the overrides of its jobs, one list for each listed job.
 
   Raises:
-    ConfigError: what `configs.expand`, `split` and `listed_jobs` raise; a search of listed jobs.
+    ConfigError: the overrides or the sweep file are invalid, or a search has listed jobs.
   """
   settings, lines = configs.split(configs.expand(overrides))
   chosen, listed = configs.compose_settings(settings), configs.listed_jobs(overrides)
@@ -83,7 +83,7 @@ def _lines(overrides: Sequence[str]) -> tuple[list[str], SweepSettings, list[lis
 
 
 def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
-  """The sweep file's name, or the names of the jobs' runs."""
+  """Returns the sweep file's name, or the names of the jobs' runs."""
   for text in overrides:
     if text.startswith("sweep="):
       return text.partition("=")[2]
@@ -92,7 +92,11 @@ def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
 
 
 def _find(path: str | None, name: str, lines: Sequence[str], jobs: Sequence[Job]) -> SweepDirectory | None:
-  """Finds an earlier sweep of the same jobs."""
+  """Returns an earlier sweep of the same jobs; None without one.
+
+  Raises:
+    ConfigError: `path` holds a sweep of other jobs.
+  """
   if path is not None:
     if not (Path(os.path.expanduser(path)) / "sweep.yaml").exists():
       return None
@@ -139,10 +143,10 @@ def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> SweepSettin
 
 
 def _is_plain(setting: str) -> bool:
-  """Whether a setting of a sweep.yaml, which another user may have written, is harmless.
+  """Returns whether a setting of a sweep.yaml, which another user may have written, is harmless.
 
-  Text that goes to a scheduler must be one word; a list may be lines of shell, but for `launcher.explore`, which holds
-  keys; CMA-ES keeps pickles in the sweep's study.
+  Text that a scheduler gets must be one word. A list may hold lines of shell, except `launcher.explore`, which holds
+  keys. CMA-ES stores pickles in the sweep's study.
   """
   override = configs.parse_with_hydra(setting)
   value = override.value()

@@ -22,12 +22,12 @@ except ImportError:
 
 _CORES = 4  # of a job, unless launcher.cores_per_job is set
 
-# Ray puts the current folder first on its workers' path, where a stray yaml.py would win: use this one.
+# Ray puts the working directory first on its workers' path, where a stray yaml.py would be imported: start it here.
 _PACKAGES = Path(__file__).parents[2]
 
 
 class RayLauncher:
-  """See `runner.Launcher`."""
+  """Implements `runner.Launcher` on a Ray cluster."""
 
   outlives = False
   _owned = False  # whether this launcher made the process's connection
@@ -42,7 +42,7 @@ class RayLauncher:
 
   @staticmethod
   def check(config: RayConfig, jobs: Sequence[Job]) -> None:
-    """See `runner.Launcher`; connects to the cluster or starts one, until `close` or the end of the process."""
+    """See `runner.LauncherClass`; connects to the cluster or starts one, until `close` or the process's end."""
     if not ray.is_initialized():
       address = config.address or os.environ.get("RAY_ADDRESS")
       try:
@@ -87,7 +87,7 @@ class RayLauncher:
 
 
 def _knock(address: str | None) -> None:
-  """Raises OSError if nothing listens at an address of host and port: Ray itself tries for most of a minute."""
+  """Raises OSError if nothing listens at an address of host and port; Ray itself retries for most of a minute."""
   place = urlsplit(address if address and "//" in address else f"//{address or ''}")
   if place.hostname and place.port:
     socket.create_connection((place.hostname, place.port), timeout=10.0).close()

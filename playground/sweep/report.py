@@ -1,4 +1,4 @@
-"""The result of a sweep: a row for each job, mean and confidence interval for each group of seeds, curves, a page."""
+"""Writes the result of a sweep: rows of jobs, mean and confidence interval of each group of seeds, curves, a page."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 AVERAGED = ("final_return", "final_mode_return", "best_return", "steps_per_second", "wall_clock_s")
 FIGURES = (*AVERAGED, "final_sampled_return", "steps")  # of a run's summary.json
 SEED = "seed"  # jobs of a group differ in the seed
-PANEL = "env"  # returns of tasks are not comparable: each task has a panel of its own
+PANEL = "env"  # returns of tasks are not comparable, so each task has its own panel
 POINTS = 200  # of a mean curve
 AXES = {  # file -> (column, its unit in the drawing, label)
   "curves_over_steps.png": ("step", 1e6, "million environment steps"),
@@ -40,7 +40,7 @@ AXES = {  # file -> (column, its unit in the drawing, label)
 
 
 def write_result(sweep: SweepDirectory, notify: Callable[[str], None] = print) -> list[Path]:
-  """Writes sweep.csv, groups.csv, curves and report.html from the jobs' files so far; returns the files."""
+  """Writes sweep.csv, groups.csv, curves and report.html from the jobs' present files; returns the files written."""
   jobs = collect(sweep)
   groups = group(jobs, group_keys(sweep))
   files = [sweep.path / "sweep.csv", sweep.path / "groups.csv"]
@@ -87,7 +87,7 @@ def group(jobs: "pd.DataFrame", keys: Sequence[str]) -> "pd.DataFrame":
 
   Args:
     jobs: from `collect`.
-    keys: the keys in which groups differ; none is one group.
+    keys: the keys in which groups differ; without keys there is one group.
 
   Returns:
     The keys, `jobs` (how many finished), and for each figure its mean and `<figure>_ci95`, half the width of the 95 %
@@ -121,7 +121,7 @@ def mean_curve(curves: "Sequence[tuple[np.ndarray, np.ndarray]]") -> "tuple[np.n
   import numpy as np
 
   low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
-  grid = np.linspace(min(low, high), high, POINTS)  # over time, a job may have ended before another's first evaluation
+  grid = np.linspace(min(low, high), high, POINTS)  # over time, a job may end before another's first evaluation
   values = np.stack([np.interp(grid, x, y) for x, y in curves])
   half = t_factor(len(curves)) * values.std(axis=0, ddof=1) if len(curves) > 1 else np.zeros(POINTS)
   return grid, values.mean(axis=0), half

@@ -1,6 +1,6 @@
 """Runs jobs: starts them through a launcher, waits for them, and shows their states.
 
-Sweeps and benchmarks (`benchmark/jobs.py`) use it. It reads all states from the jobs' folders, so a restarted runner
+Sweeps and benchmarks (`benchmark/jobs.py`) use this runner. All states are in the jobs' folders, so a restarted runner
 starts the missing jobs and waits for running ones.
 """
 
@@ -46,7 +46,7 @@ _CLASSES = {
 
 
 class Launcher(Protocol):
-  """Starts workers. A job's result is in its folder; the launcher only knows whether the job may still run.
+  """Starts workers. A job's result is in the job's folder; the launcher only knows whether the job may still run.
 
   Attributes:
     outlives: whether jobs continue when the process that started them ends.
@@ -55,7 +55,7 @@ class Launcher(Protocol):
   outlives: bool
 
   def start(self, job: Job) -> bool:
-    """Starts a job, or returns False if there is no free slot now."""
+    """Starts a job and returns True; returns False if no slot is free now."""
     ...
 
   def busy(self, job: Job) -> bool:
@@ -63,7 +63,7 @@ class Launcher(Protocol):
     ...
 
   def kill(self) -> None:
-    """Ends all jobs at once, saved or not."""
+    """Kills all jobs at once; they may lose unsaved steps."""
 
   def close(self) -> None:
     """Waits for the jobs that do not outlive this process, and frees resources."""
@@ -73,7 +73,7 @@ class LauncherClass(Protocol[ConfigT]):
   """The constructor of a launcher."""
 
   def __call__(self, sweep: SweepDirectory, config: ConfigT, command: Sequence[str] = COMMAND) -> Launcher:
-    """Takes a sweep, settings, and the command that runs a job's overrides; raises as `check`."""
+    """Takes a sweep, settings, and the command that runs a job's overrides; raises the errors of `check`."""
     ...
 
   def check(self, config: ConfigT, jobs: Sequence[Job]) -> None:
@@ -92,7 +92,7 @@ def run_sweep(
   """Runs the unfinished jobs of a sweep and writes its result.
 
   Args:
-    sweep: on disk.
+    sweep: the sweep on disk.
     settings: of the sweep (`configs/sweep.yaml`).
     command: program that gets the jobs' overrides.
     console: for the output.

@@ -1,6 +1,6 @@
-"""Search instead of every combination: Optuna draws each job's values and learns from its result.
+"""Searches hyperparameters: Optuna draws each job's values and learns from the job's result.
 
-The study is a file in the sweep's folder (`study.log`), a trial is one of its jobs; both can be resumed.
+The study is a file in the sweep's folder (`study.log`), a trial is one of the sweep's jobs; both can be resumed.
 """
 
 from collections.abc import Callable, Sequence
@@ -89,7 +89,7 @@ class Search:
     return job
 
   def tell(self, job: Job, folder: JobFolder) -> None:
-    """Records a job's result; an interrupted job stays open."""
+    """Records a job's result; the trial of an interrupted job stays open."""
     state = folder.state().status
     if state == "preempted":
       return
@@ -97,7 +97,7 @@ class Search:
     (trial,) = [t for t in self._study.get_trials(deepcopy=False) if t.user_attrs.get("job") == job.name][-1:]
     if trial.state == TrialState.RUNNING:
       self._study.tell(trial.number, value, state=TrialState.FAIL if value is None else None)
-    elif value is not None:  # it failed at first, and succeeded in a second start
+    elif value is not None:  # the job failed at first, and finished after a second start
       again = optuna.create_trial(
         params=trial.params, distributions=trial.distributions, value=value, user_attrs=trial.user_attrs
       )
@@ -136,7 +136,11 @@ def distribution(override: HydraOverride) -> CategoricalDistribution | FloatDist
 
 
 def first_values(lines: Sequence[str]) -> list[str]:
-  """Returns the overrides of an example job: the first value of each list, the low end of each interval."""
+  """Returns the overrides of an example job: the first value of each list, the low end of each interval.
+
+  Raises:
+    ConfigError: no override has several values.
+  """
   overrides, drawn = [], False
   for line in lines:
     override = parse_with_hydra(line)

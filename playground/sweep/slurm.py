@@ -36,7 +36,7 @@ QUEUE_S = 5.0  # s between queries of Slurm
 
 @dataclasses.dataclass
 class SlurmJob:
-  """The callable that submitit runs: a worker that saves and is queued again."""
+  """Runs a worker under submitit; the job saves and is queued again on preemption."""
 
   folder: Path
   command: tuple[str, ...]
@@ -52,13 +52,13 @@ class SlurmJob:
     return code
 
   def checkpoint(self) -> submitit.helpers.DelayedSubmission:
-    """Called by submitit in the middle of `__call__`, on preemption and shortly before the time limit."""
+    """Saves the job and requeues it; submitit calls this during `__call__`, on preemption and near the time limit."""
     if self._worker is not None:
       self._worker.interrupt("Slurm wants its place; it is queued again")
     return submitit.helpers.DelayedSubmission(dataclasses.replace(self))
 
   def _taken(self) -> bool:
-    """Whether the run, not submitit, got Slurm's preemption signal, and the job was not cancelled."""
+    """Returns whether the run, not submitit, got Slurm's preemption signal, and the job was not cancelled."""
     if JobFolder(self.folder).state().status != "preempted" or (self.folder.parents[1] / STOP_FILE).exists():
       return False
     job_id = os.environ.get("SLURM_JOB_ID")
@@ -66,7 +66,7 @@ class SlurmJob:
 
 
 class Queue:
-  """The user's jobs in Slurm's queue, by squeue, which works on every cluster; sacct needs accounting."""
+  """Queries the user's jobs with squeue, which works on every cluster; sacct needs accounting."""
 
   def __init__(self) -> None:
     self._states: dict[str, str] | None = {}
@@ -88,7 +88,7 @@ class Queue:
 
 
 class SlurmLauncher:
-  """See `runner.Launcher`."""
+  """Implements `runner.Launcher` on Slurm."""
 
   outlives = True
 
@@ -111,7 +111,7 @@ class SlurmLauncher:
 
   @staticmethod
   def check(config: SlurmConfig, jobs: Sequence[Job]) -> None:
-    """See `runner.Launcher`; sbatch checks whether the cluster can run a job."""
+    """See `runner.LauncherClass`; sbatch checks whether the cluster can run a job."""
     if not config.wait and config.max_parallel is not None:
       raise ConfigError("launcher.wait=false submits all jobs at once: leave launcher.max_parallel out.")
     if config.minutes * 60 <= _notice_s(config):
@@ -152,7 +152,7 @@ class SlurmLauncher:
       return False
     if not isinstance(submitted, submitit.SlurmJob):
       return not submitted.done()
-    return self._queue.state(submitted.job_id) is not None  # whatever it returned: Slurm may have requeued it
+    return self._queue.state(submitted.job_id) is not None  # whatever the worker returned: Slurm may have requeued it
 
   def kill(self) -> None:
     for job in self._sweep.jobs:
@@ -163,7 +163,7 @@ class SlurmLauncher:
     """Does nothing: jobs outlive this process."""
 
   def _submitted(self, job: Job, folder: JobFolder) -> "submitit.Job[int] | None":
-    """Returns submitit's handle of a job, also of one that an earlier process submitted."""
+    """Returns submitit's handle of a job, even if an earlier process submitted the job; None without one."""
     known = folder.path / "slurm_id"
     if job.name not in self.submitted and known.is_file() and _SLURM_ID.fullmatch(job_id := known.read_text()):
       self.submitted[job.name] = self._executor.job_class(self._folder, job_id)

@@ -15,7 +15,7 @@ from playground.text import quoted
 
 
 class TogetherLauncher(LocalLauncher):
-  """See `runner.Launcher`. Jobs with the same program share it (`program_of`); others get a process of their own."""
+  """Implements `runner.Launcher`. Jobs with the same program (`program_of`) share a process; others have their own."""
 
   def __init__(
     self, sweep: SweepDirectory, config: TogetherConfig, command: Sequence[str] = COMMAND, slots: Sequence[Slot] = ()
@@ -36,7 +36,7 @@ class TogetherLauncher(LocalLauncher):
         raise ConfigError(f"launcher.max_agents={config.max_agents} is below the {len(jobs)} jobs of the population.")
 
   def start(self, job: Job) -> bool:
-    if job.name in self._workers:  # with the first of its group
+    if job.name in self._workers:  # started with the first job of its group
       return True
     if job.name not in self._groups:  # a search has added it
       self._group([job])
@@ -44,7 +44,7 @@ class TogetherLauncher(LocalLauncher):
     return self._start(group, self._population if len(group) > 1 else ())
 
   def _group(self, jobs: Sequence[Job]) -> None:
-    """Finds jobs that can share a program, among those that are not done."""
+    """Groups the unfinished jobs that can share a program."""
     programs: dict[str, list[Job]] = {}
     for job in jobs:
       folder = self._sweep.folder(job)

@@ -1,4 +1,4 @@
-"""The output of a sweep: a live table on a terminal, a line for each change in a log."""
+"""Shows a running sweep: a live table on a terminal, a line for each change in a log."""
 
 import time
 from collections import Counter
@@ -12,7 +12,7 @@ from rich.text import Text
 
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
 
-ROWS = 30  # rows of the table: running, failed, and the newest other jobs
+ROWS = 30  # rows of the table, running and failed jobs first
 _COLORS = {"finished": "green", "running": "cyan", "failed": "red", "timeout": "red", "killed": "red"}
 
 
@@ -41,7 +41,7 @@ class View:
     self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
   def begin(self, states: Mapping[str, JobState], at_work: int, trials: int | None = None) -> None:
-    """Prints the states of the sweep; initial states of jobs are not printed later."""
+    """Prints the size and path of the sweep; `update` prints only jobs whose states change later."""
     self._seen = {name: (state.status, state.attempt) for name, state in states.items()}
     finished = sum(state.status == "finished" for state in states.values())
     already = f", {finished} finished already" if finished else ""
@@ -107,7 +107,7 @@ def status_table(sweep: SweepDirectory, states: Mapping[str, JobState], rows: in
 
 
 def _most_telling(jobs: Sequence[Job], states: Mapping[str, JobState], rows: int | None) -> list[Job]:
-  """Chooses running, failed and long jobs before the others, in the sweep's order."""
+  """Returns at most `rows` jobs in the sweep's order: running before failed before others, short before long."""
   if rows is None or len(jobs) <= rows:
     return list(jobs)
 

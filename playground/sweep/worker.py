@@ -1,7 +1,7 @@
-"""The process of a job, or of several that train together: starts or resumes it, watches it, records its end.
+"""Runs a job, or several that train together: starts or resumes it, watches it, records its end.
 
-Launchers start it on any machine; it needs only the sweep's folder. It holds the job's lock, so that no other worker
-runs the same job.
+Launchers start a worker on any machine; it needs only the sweep's folder. The worker holds the job's lock, so that no
+other worker runs the same job.
 """
 
 import argparse
@@ -26,7 +26,7 @@ POLL_S = 0.2
 
 
 def job_command(trusted: Sequence[str] = (), lines: Sequence[str] = ()) -> tuple[str, ...]:
-  """Returns the command of jobs, with trusted packages and overrides that sweep.yaml never holds (`is_of_command`)."""
+  """Returns the command of jobs, with trusted packages and the overrides that sweep.yaml omits (`is_of_command`)."""
   return (*COMMAND, *([f"trust=[{','.join(trusted)}]"] if trusted else []), *lines)
 
 
@@ -63,7 +63,7 @@ class Worker:
     """Runs the jobs to their end and returns the exit code; 0 if other workers run or finished them.
 
     Args:
-      where: the machine or devices, for people.
+      where: the machine or devices, to show to users.
       **fields: entries that the launcher adds to job.json.
     """
     sweep = SweepDirectory.open(self._sweep_path)
@@ -96,7 +96,7 @@ class Worker:
     return code
 
   def interrupt(self, reason: str) -> None:
-    """Stops the jobs, which saves them, and records it; for signal handlers that do not return to `run`."""
+    """Stops and saves the jobs, and records the reason; for signal handlers that do not return to `run`."""
     self.stop()
     if self._child is not None:
       self._watch(self._child)
@@ -213,7 +213,7 @@ def _signal(child: "subprocess.Popen[bytes]", signum: int, group: bool) -> None:
 
 
 def _last_line(log: Path) -> str:
-  """Returns the last line of a job's log, mostly its error."""
+  """Returns the last line of a job's log, which usually is the error."""
   lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
   return (lines or ["no output"])[-1][:300]
 
