@@ -42,8 +42,8 @@ def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[s
     decisions: policy steps in each environment.
 
   Returns:
-    The actor's inputs by group, [num_envs * decisions, ...], its actions, [num_envs * decisions, action_size], and
-    the last state of one environment.
+    The actor's inputs by group, [N, ...], and its actions, [N, action_size], of all N policy steps, and the last state
+    of one environment.
   """
   batch, networks = wrap_for_training(trained.env), trained.trainer.networks
 

@@ -38,7 +38,7 @@ class NonfiniteError(PlaygroundError):
 
 
 class RunCallbacks:
-  """The loop's callbacks for one run directory (`learning.loop.Callbacks`)."""
+  """Implements the loop's callbacks for one run directory (`learning.loop.Callbacks`)."""
 
   def __init__(
     self,
@@ -70,7 +70,7 @@ class RunCallbacks:
     self._evaluations = 0
     self._step = plan.step or 0
     self._return: float | None = None  # of the newest row
-    self._copied = False  # whether the policy has been replaced by another agent's since then
+    self._copied = False  # whether another agent's policy has replaced this one since that row
     self._recording: Recording | None = None
     self._rates: list[float] = []  # steps per second, by row
     self._rejected = 0  # gradient steps
@@ -159,7 +159,7 @@ class RunCallbacks:
     )
 
   def close(self, status: str = "failed") -> None:
-    """Closes the trackers and the video thread, once; without a status the run did not finish."""
+    """Closes the trackers and the video thread, once; the default status is that of a run that raised an error."""
     if not self._closed:
       self._closed = True
       if self._trace == "on":  # the run ended while it was traced
@@ -176,7 +176,7 @@ class RunCallbacks:
     chosen = "mode" if self._trainer.config.deterministic_eval else "sampled"
     own = np.isfinite(returns) & ~np.isfinite(column(PARENT))
     scores = [(float(value), int(step)) for value, step in zip(returns[own], steps[own], strict=True)]
-    # As for `checkpoints/best`: the last of equal ones, and never a policy without a checkpoint, as the untrained one.
+    # As for `checkpoints/best`: the last of equal returns, and no policy without a checkpoint (the untrained one).
     best_return, best_step = max((score for score in scores if score[1] > 0), default=(None, None))
     trained = np.isfinite(rate)
     taken = np.diff(steps, prepend=0)[trained]
@@ -233,7 +233,7 @@ class RunCallbacks:
       )
 
   def _check_numbers(self, step: int, taken: int, metrics: Metrics, captured: Step | None) -> None:
-    """Dumps the first non-finite step, and stops the run when there are too many of them."""
+    """Dumps the first non-finite step, and stops the run if too many steps are non-finite."""
     bad = metrics.get("training/nonfinite", 0.0)
     if not bad:
       return
@@ -247,7 +247,7 @@ class RunCallbacks:
 
 
 class NonMainCallbacks:
-  """Callbacks of a process that writes nothing (`learning.loop.Callbacks`): it stops when process 0 does."""
+  """Implements the loop's callbacks (`learning.loop.Callbacks`) in processes other than 0, which write nothing."""
 
   def __init__(self, config: RunConfig, env: Env, interrupts: Interrupts, step: int | None):
     self._allowed = config.on_nonfinite.max_fraction
@@ -269,7 +269,7 @@ class NonMainCallbacks:
 
 
 def check_fraction(fraction: float, allowed: float, step: int, where: str = "") -> None:
-  """Raises NonfiniteError when more than a share of the environment steps before `step` was not finite."""
+  """Raises NonfiniteError if the fraction of non-finite environment steps before `step` is above `allowed`."""
   if fraction > allowed:
     raise NonfiniteError(
       f"{fraction:.1%} of the environment steps before step {step:,} went NaN, infinite or too large, more than "
@@ -281,7 +281,7 @@ def check_updates(metrics: Metrics, allowed: float, step: int) -> int:
   """Counts a row's gradient steps that were skipped because they were not finite.
 
   Raises:
-    NonfiniteError: their share is above the limit.
+    NonfiniteError: the fraction of skipped gradient steps is above `allowed`.
   """
   bad, taken = (round(metrics.get(f"training/{name}", 0.0)) for name in ("nonfinite_updates", "gradient_steps"))
   if bad > allowed * taken:

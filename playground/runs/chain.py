@@ -1,8 +1,8 @@
-"""A chain of runs (fine-tuning): each stage starts from the previous stage's weights, with a new optimiser.
+"""Trains a chain of runs (fine-tuning): each stage starts from the previous stage's weights, with a new optimiser.
 
-Every stage is an ordinary run directory inside the chain's, `<chain>/<number>_<stage>/`. All of them are written, their
-configurations resolved, before the first is trained. So the remaining work is on disk, and a resumed chain resumes its
-first unfinished stage, whether that has started or not.
+Every stage is an ordinary run directory inside the chain's, `<chain>/<number>_<stage>/`. All stage directories are
+written, with resolved configurations, before the first stage is trained. So the remaining work is on disk, and a
+resumed chain resumes its first unfinished stage, whether that stage has started or not.
 
 The stages run one after another in this process. A child process for each would free its memory, too, but would
 start JAX and the device again for every stage, and would have to forward signals and the terminal.
@@ -49,8 +49,8 @@ def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) 
     The exit code, as of a run.
 
   Raises:
-    PlaygroundError: an error of a stage, which it names; an invalid stage raises before anything is trained or
-      written.
+    PlaygroundError: a stage failed; the message names the stage. An invalid stage raises before anything is trained
+      or written.
   """
   if config.resume is None:
     _check(config)
@@ -91,7 +91,7 @@ def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) 
 def _check(config: RunConfig) -> None:
   """Builds every stage, so that an invalid stage ends the chain before any is trained.
 
-  This traces each task's reset for the sizes of its observation: seconds, where a stage takes minutes.
+  Tracing a task's reset for its observation sizes takes seconds; training a stage takes minutes.
   """
   if config.resolved["run_dir"] is not None:
     RunDirectory(str(config.run_dir)).must_be_new()
@@ -128,7 +128,7 @@ def _compare(env: str, sizes: dict[str, object], before: str, theirs: dict[str, 
 def _lay_out(config: RunConfig) -> tuple[RunDirectory, list[RunConfig]]:
   """Makes the directories of the chain and its stages; returns the stages' configurations, as for resumed runs.
 
-  Process 0 makes them, the others wait for that.
+  Process 0 makes the directories; the other processes wait.
   """
   if is_main():
     chain = RunDirectory.claim(str(config.run_dir), numbered=config.resolved["run_dir"] is None)
@@ -155,8 +155,8 @@ def _write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
   """Writes metrics.csv, plots and summary.json of a chain from its stages' files.
 
   Args:
-    chain: its directory.
-    folders: of the stages, by name.
+    chain: directory of the chain.
+    folders: names of the stages' folders, by stage.
   """
   runs = {name: RunDirectory(chain.path / folder) for name, folder in folders.items()}
   _write_metrics(chain, runs)
@@ -182,7 +182,7 @@ def _write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
 
 
 def _stage(name: str, run: RunDirectory) -> dict[str, Plain]:
-  """Returns the result of a stage; None where it has none yet."""
+  """Returns the result of a stage; values that the stage has not reached are None."""
   status, summary = run.status.get("status", "not begun"), run.summary
   return {"name": name, "folder": run.path.name, "status": status, **{key: summary.get(key) for key in _OF_A_RUN}}
 

@@ -1,4 +1,4 @@
-"""metrics.csv: one row a log call, complete on disk as soon as `log` returns."""
+"""Writes and reads metrics.csv: one row for each call of `log`, complete on disk when `log` returns."""
 
 import csv
 import io
@@ -22,9 +22,9 @@ class Table(NamedTuple):
   """The content of a metrics.csv.
 
   Attributes:
-    columns: names, the first is `step`.
-    rows: by column; a value that is not a number is ''.
-    torn: whether the last line is incomplete, as after a SIGKILL; it is not among the rows.
+    columns: names of the columns; the first is `step`.
+    rows: cells by column; a cell that is not a number is ''.
+    torn: whether the last line is incomplete, as after a SIGKILL; `rows` omits this line.
     damage: description of any other damage, '' if there is none.
   """
 
@@ -122,7 +122,7 @@ def read_table(path: Path, known: Sequence[str] = ()) -> Table:
 
   Args:
     path: the file.
-    known: names of its first columns, if known from elsewhere; they override the header.
+    known: names of the first columns, which override the header; empty if unknown.
   """
   content, newline, rest = path.read_bytes().decode("utf-8", errors="replace").rpartition("\n")
   if not newline:
@@ -151,7 +151,7 @@ def read_table(path: Path, known: Sequence[str] = ()) -> Table:
 
 
 def _number(text: str) -> str:
-  """Returns the text of a number without quotes; '' if it is none."""
+  """Returns the text of a number without quotes; '' if the text is no number."""
   text = text.strip("\"' \r\ufeff")
   try:
     float(text)

@@ -39,7 +39,7 @@ def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[No
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[threading.Event]:
-  """Context with an event that these signals set: for loops in callbacks of C code, which swallow exceptions."""
+  """Context with an event that the signals of `on_signals` set, for callbacks of C code, which swallow exceptions."""
   received = threading.Event()
   with on_signals(lambda *_: received.set()):
     yield received
@@ -61,10 +61,10 @@ class Interrupts:
     self._handlers.close()
 
   def start_saving(self) -> None:
-    """Makes the first signal set a flag from now on. Raises `Interrupted` if there was a signal already.
+    """Makes the next signal set a flag. Raises `Interrupted` if there was a signal already.
 
-    Destructors and callbacks of C code swallow the exception that a signal raises in them; compilation has many of
-    both.
+    Destructors and callbacks of C code, of which compilation has many, swallow the exception that a signal raises in
+    them.
     """
     self.saving = True
     if self.signum is not None:

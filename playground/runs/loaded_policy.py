@@ -22,15 +22,15 @@ from playground.runs.run_dir import RunDirectory
 
 @dataclasses.dataclass(frozen=True)
 class LoadedPolicy:
-  """A checkpoint's policy.
+  """A checkpoint's policy, with its run, task and networks.
 
   Attributes:
     run_dir: the run's directory.
     config: the run's configuration.
-    checkpoint: of the policy.
+    checkpoint: the policy's checkpoint.
     env: the task as the run trained it, or as `load_task` made it.
     hardware: this machine's devices.
-    trainer: of the algorithm, whose `act(policy, obs, key, deterministic)` gives actions.
+    trainer: the algorithm's trainer, whose `act(policy, obs, key, deterministic)` returns actions.
     policy: networks and normaliser, on the devices.
   """
 

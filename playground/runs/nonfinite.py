@@ -16,12 +16,12 @@ from playground.settings import Section
 
 
 def write_dump(folder: Path, step: int, captured: Step | None, config: Section) -> Path | None:
-  """Writes the captured step as `step_<step>.npz`, with the run's config inside so that it can travel alone.
+  """Writes the captured step and the run's config as `step_<step>.npz`, which needs no other file to be replayed.
 
   Args:
-    folder: of the dump; made if needed.
-    step: control steps after which it was noticed.
-    captured: what to write.
+    folder: folder of the dump; made if needed.
+    step: environment steps of the run when the step was found.
+    captured: the captured step; None writes nothing.
     config: the run's resolved config.
 
   Returns:

@@ -1,4 +1,4 @@
-"""Learning curves of one run or chain, drawn from its metrics.csv."""
+"""Draws the learning curves of a run or chain from its metrics.csv."""
 
 from itertools import pairwise
 from pathlib import Path

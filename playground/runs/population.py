@@ -17,8 +17,8 @@ def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: S
   """Returns the population of the runs, None where `exploit_every` is 0.
 
   Raises:
-    ConfigError: there is one run only, their programs differ, or their tasks do, so that returns do not compare.
-    UnknownNameError: `explore` names a key that is no number of the agent, or no argument of the program.
+    ConfigError: there is only one run, or the runs differ in program or task, so that returns are not comparable.
+    UnknownNameError: a key of `explore` is not one of the agent's numbers that are arguments of the program.
   """
   if not exploit_every:
     return None

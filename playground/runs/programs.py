@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 
 def program_of(config: "RunConfig") -> str | None:
-  """Returns all that a run's compiled program depends on, as text; runs with equal texts can train together.
+  """Returns the settings that a run's compiled program depends on, as text; runs with equal texts can train together.
 
   Returns:
-    None for a run that trains alone: a chain, one that W&B tracks (it has one run a process), one that is profiled, and
-    one on several machines.
+    None for a run that trains alone: a chain, a run that W&B tracks (one run a process), a profiled run, and a run on
+    several machines.
   """
   alone = config.stages or config.tracking.wandb.enable or config.profile.enable or config.hardware.distributed.enable
   if alone:
@@ -34,7 +34,7 @@ def program_of(config: "RunConfig") -> str | None:
   names = [name for name in config.resolved if name not in ("seed", "run_dir", "resume", "init_from")]
   try:
     return _structure(config, names, config.init_from is not None)
-  except ConfigError:  # only the run's own configuration has it
+  except ConfigError:  # the run reports its invalid term when it starts
     return None
 
 
@@ -43,8 +43,8 @@ def stored_program(
 ) -> StoredProgram | None:
   """Returns the file of a run's compiled functions, named by the hash of everything that determines them.
 
-  These are the sections of the configuration that `train.prepare` builds from, without the numbers that are arguments;
-  the task's values and arrays; the code, the versions and the machine (`fingerprint`).
+  The hash covers the sections of the configuration that `train.prepare` builds from, without the numbers that are
+  arguments; the task's values and arrays; the code, the versions and the machine (`fingerprint`).
 
   Args:
     config: of the run.
@@ -53,15 +53,15 @@ def stored_program(
     from_policy: whether the initial state is made from a policy.
 
   Returns:
-    None where none is stored: without JAX's compilation cache, on several machines, on Warp (its functions hold
-    addresses of this process), and for a task from a notebook.
+    None where functions are not stored: without JAX's compilation cache, on several machines, on Warp (its functions
+    hold addresses of this process), and for a task from a notebook.
   """
   env, cache = trainer.env.unwrapped, hardware.facts["compilation_cache"]
   if not cache or "://" in str(cache) or is_multiprocess() or env.impl == "warp":
     return None
   placeholders = {name: np.ones_like(value) for name, value in trainer.settings.items()}
   task = env.with_settings(below("env", placeholders))
-  numbers = [env.config, *(getattr(env, name) for name in env.managers)]  # methods that are bound to `env` have them
+  numbers = [env.config, *(getattr(env, name) for name in env.managers)]  # methods bound to `env` refer to these
   try:
     parts = {
       "settings": _structure(config, ["env", "agent", "hardware", "video"], from_policy),

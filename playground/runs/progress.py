@@ -1,4 +1,4 @@
-"""Training progress: a bar on a terminal, an occasional plain line in a log file."""
+"""Shows training progress: a bar on a terminal, an occasional plain line in a log file."""
 
 import errno
 import sys
@@ -14,14 +14,14 @@ PLAIN_INTERVAL_S = 5.0
 
 
 class Progress:
-  """Steps done, steps/s, time left and last evaluation return of one training run.
+  """Shows the steps done, steps/s, time left and last evaluation return of one training run.
 
   Args:
     total_steps: the run's whole budget; a resumed run starts its bar where it continues.
     enabled: False shows no progress; `print` still prints.
     console: for the output; standard output by default.
     activity: label of the bar.
-    name: prefix of lines, if it is one of several runs.
+    name: prefix of lines, if several runs print.
   """
 
   def __init__(
@@ -78,7 +78,7 @@ class Progress:
     self._step = None  # the clock of steps/s must not count this phase
 
   def update(self, step: int, steps_per_second: float | None = None, last_return: float | None = None) -> None:
-    """Shows that `step` environment steps of the budget are done; missing values are measured or stay as they were."""
+    """Shows that `step` environment steps of the budget are done; missing values are measured or do not change."""
     now = time.monotonic()
     if steps_per_second is not None:
       self._steps_per_second = steps_per_second
@@ -114,7 +114,7 @@ class Progress:
 
 
 class _Terminal:
-  """A stream that ignores that its terminal is gone: SIGHUP follows, and the run saves."""
+  """Ignores write errors of a terminal that is gone: SIGHUP follows, and the run saves."""
 
   def __init__(self, stream: TextIO):
     self._stream = stream
@@ -138,7 +138,7 @@ class _Terminal:
 
 
 def format_return(value: float | None) -> str:
-  """Returns a return to four figures (998.8, 0.4512), `none` where there is none."""
+  """Formats a return with four digits (998.8, 0.4512); None gives `none`."""
   return "none" if value is None else f"{value:.1f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 

@@ -1,4 +1,4 @@
-"""Plans the start of a run: a new one, from its own last intact checkpoint, or from another run's weights."""
+"""Plans the start of a run: as a new run, from the run's last intact checkpoint, or from another run's weights."""
 
 import contextlib
 import dataclasses
@@ -23,10 +23,10 @@ from playground.runs.run_dir import RunDirectory
 
 
 def weights_of(path: str | Path) -> Checkpoint:
-  """The checkpoint that `path` names: a run's newest, one of its checkpoints, or `pretrained:<task>`.
+  """Returns the checkpoint that `path` names: a run's newest, one of its checkpoints, or `pretrained:<task>`.
 
   Raises:
-    PlaygroundError: there is none, it is damaged, or a pretrained policy's task has changed since.
+    PlaygroundError: the checkpoint is missing or damaged, or a pretrained policy's task has changed since.
   """
   checkpoint = Checkpoint(find_checkpoints(locate(str(path)))[0])
   folder = checkpoint.path.parents[1]
@@ -37,19 +37,20 @@ def weights_of(path: str | Path) -> Checkpoint:
 
 @dataclasses.dataclass
 class RestorePlan:
-  """The files found on disk before anything expensive starts, and then the state restored from them.
+  """Finds the files of a run before anything expensive starts, and then holds the state restored from them.
 
   Attributes:
     run_dir: directory of the resumed run, None for a new run.
-    checkpoints: the resumed run's, newest first.
+    checkpoints: checkpoints of the resumed run, newest first.
     weights: checkpoint of the weights of a new run.
     notices: sentences for the user about restored and skipped checkpoints.
     state: the restored training state, on the devices.
-    update: training steps done in it.
+    update: training steps at the restored checkpoint.
+    step: environment steps at the restored checkpoint.
     wall_clock_s: time of the run up to the checkpoint.
     policy: restored weights (host arrays) for a new run.
-    columns: of metrics.csv at the restored checkpoint.
-    settings: the agent's at the restored checkpoint, which population-based training may have changed.
+    columns: columns of metrics.csv at the restored checkpoint.
+    settings: the agent's settings at the restored checkpoint, which population-based training may have changed.
     began_s: age of the process when the run started.
   """
 
@@ -79,7 +80,7 @@ class RestorePlan:
       try:
         plan.checkpoints = find_checkpoints(config.resume)
       except NoCheckpointError:
-        if run_dir.status:  # else a chain made it, and starts it only now
+        if run_dir.status:  # without a status, a chain made the run and starts it now
           plan.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
         # Only a chain sets this in the `config` of a resumed run; the chain may have been moved.
         weights = config.init_from or run_dir.config["init_from"]
@@ -94,7 +95,7 @@ class RestorePlan:
 
   @contextlib.contextmanager
   def locked(self, config: RunConfig) -> Iterator[Self]:
-    """Locks the resumed run, if any; yields the plan of the current files, which the last holder may have changed.
+    """Locks the resumed run, if any; yields a plan of the current files, which another process may have changed.
 
     Raises:
       CheckpointError: another process writes the run.
@@ -119,7 +120,7 @@ class RestorePlan:
     """Restores the state or weights, checked against the algorithm and its shapes, before compilation.
 
     Raises:
-      CheckpointError: no checkpoint is whole, or the newest whole one cannot be read now or does not fit.
+      CheckpointError: no checkpoint is intact, or the newest intact one is unreadable now or does not fit.
     """
     if not self.checkpoints and self.weights is None:
       return

@@ -1,4 +1,4 @@
-"""The folder of one run: what was asked, on what it ran, how it ended. Layout in design §4."""
+"""Reads and writes the folder of one run: its configuration, machine, status and result."""
 
 import contextlib
 import datetime
@@ -24,7 +24,7 @@ RunStatus = Literal["running", "finished", "failed", "preempted"]
 
 
 class RunDirectory:
-  """Paths and records of one run. Get one from `create` (new run) or `open` (resume, eval)."""
+  """Holds the paths and records of one run; `create` makes a new run, `open` finds an existing one."""
 
   def __init__(self, path: str | Path):
     self.path = Path(os.path.expanduser(path))
@@ -50,7 +50,7 @@ class RunDirectory:
     Args:
       path: the folder.
       config: the resolved configuration.
-      overrides: the command line's.
+      overrides: overrides of the command line.
       numbered: whether to take a new folder `<path>_2`, `_3`, ... if the name is taken: for generated names, which
         several processes may choose in the same second.
 
@@ -63,7 +63,7 @@ class RunDirectory:
 
   @classmethod
   def claim(cls, path: str | Path, numbered: bool = False) -> "RunDirectory":
-    """Makes the folder, as `create` does; it is a run only once `write_config` has been called."""
+    """Makes the folder, as `create` does; the folder becomes a run when `write_config` is called."""
     run = cls(path)
     if not numbered:
       run.must_be_new()
@@ -83,7 +83,7 @@ class RunDirectory:
 
   @classmethod
   def open(cls, path: str | Path) -> "RunDirectory":
-    """Returns the run that lies at `path`.
+    """Returns the run at `path`.
 
     Raises:
       CheckpointError: there is no such folder, or it is not a readable run.
@@ -136,8 +136,8 @@ class RunDirectory:
   def write_manifest(self, **fields: object) -> None:
     """Records this process: git state, package versions, host, and `fields` (device, precision, seed, timings, …).
 
-    A resumed run may sit on another machine or commit, so the manifests of earlier starts are kept, oldest first,
-    under `earlier_starts`.
+    A resumed run may use another machine or commit, so `earlier_starts` keeps the manifests of earlier starts, oldest
+    first.
     """
     earlier = self.manifest
     starts = [*earlier.pop("earlier_starts", []), *([earlier] if earlier else [])]
@@ -157,16 +157,16 @@ class RunDirectory:
     write_json(self.path / "status.json", content)
 
   def note_loss(self, reason: str) -> None:
-    """Records that a run failed because one of its processes was lost, maybe the one that writes here."""
+    """Records that a run failed because one of its processes, possibly the main one, was lost."""
     if self.status.get("status") == "running":  # this machine may not have the folder
       self.set_status("failed", f"{reason} resume={self.path} continues")
 
   @contextlib.contextmanager
   def locked(self) -> Iterator[None]:
-    """Makes this process the only one that writes the run while the block runs.
+    """Locks the run: only this process writes it while the block runs.
 
     Raises:
-      CheckpointError: another process writes it.
+      CheckpointError: another process writes the run.
     """
     if self._locked:  # by a block around this one
       yield
@@ -185,9 +185,9 @@ class RunDirectory:
 
   @contextlib.contextmanager
   def recorded(self) -> Iterator[None]:
-    """Locks the run and keeps `status.json` true, whatever ends the block.
+    """Locks the run, and records in `status.json` how the block ends.
 
-    A block that ends well has written the summary.
+    A block that completes must have written the summary.
     """
     with self.locked():
       try:

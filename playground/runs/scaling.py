@@ -1,4 +1,4 @@
-"""`hardware.scale_envs`: gives each device the work of a single-device run."""
+"""Scales a run by the number of devices, so that each has the work of a single-device run (`hardware.scale_envs`)."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -14,10 +14,10 @@ SCALED = ("num_envs", "batch_size")
 
 
 def scale_envs(config: "RunConfig", devices: int) -> "tuple[RunConfig, str]":
-  """Multiplies environments and batch by the number of devices, and so the steps of a training step.
+  """Multiplies environments and batch, and so the environment steps of a training step, by the number of devices.
 
-  The result, which is saved with the run, has the scaled sizes and `scale_envs: false`, so that a run that is resumed
-  on other devices keeps them.
+  The result, which is saved with the run, has the scaled sizes and `scale_envs: false`, so a run that is resumed on
+  other devices keeps its sizes.
 
   Returns:
     The configuration, its stages' included, and a sentence about the change.

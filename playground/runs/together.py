@@ -1,4 +1,4 @@
-"""Trains several agents in one process and one compiled program; each is a run of its own on disk."""
+"""Trains several agents in one process and one compiled program; each agent has its own run directory."""
 
 import contextlib
 import sys
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explore: Sequence[str] = ()) -> int:
   """Trains runs that have the same program, new or to resume.
 
-  A run that fails, for non-finite numbers or its disk, ends alone. Runs at different steps (an earlier start was
-  interrupted between two of them) are trained in turn, those of the same step together. A population continues from the
-  newest step that all of them have.
+  A run that fails (non-finite numbers, a full disk) ends alone. Runs at different steps (an earlier start was
+  interrupted between two runs) are trained one group after another, those of the same step together. A population
+  continues from the newest step that all its runs have.
 
   Args:
     configs: of the runs.
@@ -124,7 +124,7 @@ def memory_needed(program: CompiledFunctions, hardware: Hardware) -> str:
   """Returns a sentence on the memory that training takes.
 
   Raises:
-    HardwareError: a device has less.
+    HardwareError: a device has less memory than that.
   """
   needs, limit = cast(Compiled, program.train).memory_analysis(), device_memory(hardware.mesh)
   if needs is None or limit is None:
@@ -139,12 +139,12 @@ def memory_needed(program: CompiledFunctions, hardware: Hardware) -> str:
 
 
 class Member:
-  """One agent's run: the callbacks of the loop, which end with the first error while other runs continue.
+  """Implements the loop's callbacks for one agent's run, which ends at its first error while other runs continue.
 
   Attributes:
-    run_dir: of the run, locked while the context lasts.
-    name: of its folder.
-    error: why it failed, None if it did not.
+    run_dir: the run's directory, locked while the context lasts.
+    name: name of that directory.
+    error: reason of the run's failure; None without a failure.
   """
 
   def __init__(self, run_dir: RunDirectory, interrupts: Interrupts):

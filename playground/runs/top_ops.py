@@ -45,10 +45,10 @@ def write_top_ops(folder: Path) -> list[Op]:
 
 
 def top_ops(trace: Path) -> list[Op]:
-  """Operations of a Chrome trace (gzipped JSON), by self time: their duration without the operations nested in them.
+  """Returns the operations of a Chrome trace (gzipped JSON), sorted by self time: duration without nested operations.
 
-  On a GPU an operation is a kernel on one of the streams; on a CPU what XLA's threads report. The profiler keeps at
-  most a million events of a trace; others are missing in the table.
+  On a GPU an operation is a kernel on one of the streams; on a CPU an operation that XLA's threads report. The profiler
+  keeps at most a million events of a trace; the table lacks the others.
   """
   with gzip.open(trace, "rt", encoding="utf-8") as file:
     events: list[Event] = json.load(file)["traceEvents"]
@@ -89,7 +89,7 @@ def _lanes(events: Iterable[Event]) -> list[list[Event]]:
 
 
 def _is_operation(name: str) -> bool:
-  """Whether a host event is an operation, not one of the runtime (`ThreadpoolListener::Record`) or an end mark."""
+  """Returns whether a host event is an operation, not a runtime event (`ThreadpoolListener::Record`) or an end mark."""
   return "::" not in name and not name.startswith("end: ") and re.match(r"[a-z]", name) is not None and " " not in name
 
 

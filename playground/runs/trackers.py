@@ -1,4 +1,4 @@
-"""Trackers of metrics. A new tracker is one class with `log` and `close`, and one line in `make_trackers`."""
+"""Logs metrics. A new tracker is a class with `log` and `close`, and a line in `make_trackers`."""
 
 import math
 import time
@@ -13,7 +13,7 @@ from playground.settings import Section
 
 
 class Tracker(Protocol):
-  """A sink of metrics. Values are Python floats on the host: a tracker never waits for a device."""
+  """Records metrics. Values are Python floats on the host: a tracker never waits for a device."""
 
   def log(self, step: int, metrics: dict[str, float]) -> None:
     """Records `metrics` after `step` environment steps."""
@@ -25,10 +25,10 @@ class Tracker(Protocol):
 
 
 class TensorBoardTracker:
-  """Scalars for `tensorboard --logdir <run>`; on resume, points after `resume_step` are hidden by TensorBoard.
+  """Writes scalars for `tensorboard --logdir <run>`; on resume, TensorBoard hides points after `resume_step`.
 
-  It writes synchronously: tensorboardX's `SummaryWriter` has a thread, which ends at the first error (a full disk), and
-  the run would wait for it forever.
+  The tracker writes synchronously: the thread of tensorboardX's `SummaryWriter` ends at the first error (a full disk),
+  and the run would wait for the thread forever.
   """
 
   def __init__(self, folder: Path, resume_step: int | None = None):
@@ -57,7 +57,7 @@ class TensorBoardTracker:
 
 
 class TrackerGroup:
-  """Several trackers behind one `log`."""
+  """Logs to several trackers."""
 
   def __init__(self, csv: CsvTracker, others: Sequence[Tracker] = ()):
     self._csv = csv
@@ -84,7 +84,7 @@ def make_trackers(
   notify: Callable[[str], None] = print,
   columns: Sequence[str] = (),
 ) -> TrackerGroup:
-  """Builds the trackers that `config["tracking"]` asks for; metrics.csv is always written.
+  """Builds the trackers of `config["tracking"]`; metrics.csv is always written.
 
   Args:
     config: the whole resolved config, which W&B stores.

@@ -1,4 +1,4 @@
-"""One training run, from a resolved config to a finished run directory."""
+"""Trains one run, from a resolved config to a finished run directory."""
 
 import contextlib
 import dataclasses
@@ -43,7 +43,7 @@ from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.scaling import describe_division, scale_envs
 
-ROWS = 100  # rows of metrics.csv in a run, about: one for each call to the device
+ROWS = 100  # approximate rows of metrics.csv in a run; each call to the device makes one row
 
 
 def train(config: RunConfig) -> int:
@@ -82,7 +82,7 @@ def _train(config: RunConfig, interrupts: Interrupts, began_s: float = 0.0) -> i
 
 @dataclasses.dataclass
 class Training:
-  """The training of a process: one run, or several runs that share a program.
+  """Compiles and runs the training of a process: one run, or several runs that share a program.
 
   Attributes:
     env: the task.
@@ -107,13 +107,13 @@ class Training:
     return self.events[-1].update * self.trainer.steps_per_update
 
   def compile(self, plans: Sequence[RestorePlan]) -> CompiledFunctions:
-    """Compiles the functions; `plans` tell what each agent starts from."""
+    """Compiles the functions; `plans` hold the initial weights of each agent."""
     resets = any(event.reset for event in self.events)
     return compile_program(self.trainer, self.evaluate, self.draw, self._policies(plans), self.stored, resets)
 
   def run(self, loop: Loop, plans: Sequence[RestorePlan], interrupts: Interrupts) -> tuple[TrainState, bool]:
     """Trains from the start of the plans; returns the last state, and whether the schedule was completed."""
-    wait_for_all()  # processes compile at different speeds, and a first exchange on CPUs waits for half a minute only
+    wait_for_all()  # processes compile at different speeds, and the first collective on CPUs waits only half a minute
     interrupts.start_saving()
     if plans[0].state is None:
       return loop.run(loop.init(self._policies(plans)))
@@ -131,7 +131,7 @@ def prepare(
 
   Args:
     configs: of the run, or (`together`) of the runs of several agents.
-    plans: one for each run; restored states and notices go there.
+    plans: one for each run, which gets the restored state and notices.
     hardware: of the process.
     together: whether arrays have an axis of agents, even of length 1.
 
@@ -159,7 +159,7 @@ def prepare(
   for each, theirs in zip(plans, configs, strict=True):
     each.restore(trainer, theirs.agent_name, draw)
   trainer.settings = trainer.join([each.settings_over(own) for each, own in zip(plans, settings, strict=True)])
-  preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # one may find it damaged
+  preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # some may find it damaged
 
   num_updates = math.ceil(agent.num_timesteps / trainer.steps_per_update)
   events = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
@@ -223,10 +223,10 @@ def timings_of(program: CompiledFunctions, began_s: float) -> dict[str, float]:
 def cut_short(
   agent: AgentConfig, episode_length: int, events: Sequence[ScheduleEvent], steps_per_update: int
 ) -> list[str]:
-  """Warns in a sentence if full resets come before an episode can end.
+  """Returns a warning if full resets come before an episode can end, else nothing.
 
-  Full resets come closer with a smaller budget: a trial of a tenth of the steps covers a tenth as much of an episode,
-  and the policy never trains on later events (the next command, the second push).
+  The time between full resets shrinks with the budget: a run of a tenth of the steps covers a tenth as much of an
+  episode, and the policy never trains on later events (the next command, the second push).
 
   Args:
     agent: the algorithm's settings.

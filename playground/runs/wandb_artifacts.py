@@ -1,4 +1,4 @@
-"""Policies on Weights & Biases: `wandb:<entity>/<project>/<run>` wherever a command line names a run.
+"""Downloads policies from Weights & Biases, which a command line names as `wandb:<entity>/<project>/<run>`.
 
 A run with `tracking.wandb.upload=true` uploads its newest policy when it ends: an artifact with configuration, metrics
 and checkpoint, but without the arrays that only resuming needs. Only a command line can name an artifact: a saved
@@ -22,7 +22,7 @@ _DOWNLOADS = Path("results/wandb")
 
 
 def local_path(name: str) -> str:
-  """Returns the path of a name: artifacts are downloaded to `results/wandb/`, other names are paths.
+  """Returns the path of a run: artifacts are downloaded to `results/wandb/`, other names are paths already.
 
   Args:
     name: `wandb:<entity>/<project>/<run>` for the newest policy of a run, by its id or its display name;

@@ -1,4 +1,4 @@
-"""Weights & Biases: online if the user is logged in, offline otherwise; its failures never stop a run."""
+"""Logs to Weights & Biases, online if the user is logged in and offline otherwise; its failures never stop a run."""
 
 import contextlib
 import netrc
@@ -40,7 +40,7 @@ def logged_in() -> bool:
 
 
 def resolve_mode(mode: str) -> str:
-  """Returns the mode W&B is started in: `auto` follows $WANDB_MODE, then the login; online needs a login."""
+  """Returns the mode in which W&B starts: `auto` is $WANDB_MODE or online; online without a login is offline."""
   if mode == "auto":
     mode = os.environ.get("WANDB_MODE") or "online"
   # Online without a key would stop and ask for one.
@@ -48,9 +48,9 @@ def resolve_mode(mode: str) -> str:
 
 
 class WandbTracker:
-  """One W&B run for one run directory, the same one after every resume (its id is kept in `wandb_run_id`).
+  """Logs a run directory to one W&B run, the same one after every resume (the file `wandb_run_id` holds its id).
 
-  Steps logged again after a resume are the same numbers, and W&B ignores those it already has.
+  A resumed run logs the same numbers for its repeated steps, and W&B ignores steps that it already has.
 
   Args:
     options: `tracking.wandb` (project, entity, group, name, tags, mode).
