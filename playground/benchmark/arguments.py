@@ -1,4 +1,4 @@
-"""A command's arguments: `key=value` for the fields of a settings class, and overrides of the run's configuration."""
+"""Parses a command's arguments: `key=value` for the fields of a settings class, and overrides of the run's config."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -17,13 +17,13 @@ def parse(command: str, options: type[T], arguments: Sequence[str]) -> T:
   """Reads a command's arguments.
 
   Args:
-    command: its name, for messages.
+    command: name of the command, for messages.
     options: a settings class; a field `overrides` takes overrides of the run's configuration.
     arguments: `key=value` each.
 
   Raises:
-    ConfigError: another form, a repeated key, or a value of another type.
-    UnknownNameError: no such key.
+    ConfigError: an argument is not `key=value`, a key is repeated, or a value has another type.
+    UnknownNameError: a key does not exist.
   """
   known = dict(settings(options))
   takes_overrides = known.pop(OVERRIDES, None) is not None

@@ -1,4 +1,4 @@
-"""The commands: options and measurements of each."""
+"""Defines the commands: options and measurements of each."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from playground.paper import tasks_of
 
 RESULTS = Path("results/benchmarks")
 
-# Of the paper's pixel tables (appendix D): episodes of 3 and 4 s, for the Panda with randomisation.
+# Conditions of the paper's pixel tables (appendix D): episodes of 3 and 4 s, for the Panda with randomisation.
 PIXEL_CONDITIONS = {
   "CartpoleBalanceVision": ["env.ctrl_dt=0.04", "env.episode_length=75"],
   "PandaPickCubeCartesianVision": [
@@ -63,7 +63,7 @@ class Together(OfTasks):
 
 @dataclasses.dataclass(frozen=True)
 class Startup(OfTasks):
-  """From the command to the first update, with empty caches and again with full ones, evaluation compiled too."""
+  """Time from the command to the first update, with empty caches and then full ones, evaluation compiled too."""
 
   name = "startup"
   alone = True
@@ -77,7 +77,7 @@ class Startup(OfTasks):
 
 @dataclasses.dataclass(frozen=True)
 class Scaling(OfTasks):
-  """Environment and training steps/s and memory against the number of environments, one device."""
+  """Environment and training steps/s and memory over the number of environments, on one device."""
 
   num_envs: Annotated[Sequence[int], counts(1), "numbers of environments"] = (256, 1024, 4096, 16384)
 
@@ -95,7 +95,7 @@ class Scaling(OfTasks):
 
 @dataclasses.dataclass(frozen=True)
 class Breakdown(OfTasks):
-  """Where a training step's time goes: physics, task, episodes, inference, storing, update, added one by one."""
+  """Time of a training step by part: physics, task, episodes, inference, storing, update, added one by one."""
 
   name = "breakdown"
 
@@ -111,7 +111,7 @@ class Pixels(OfTasks):
 
   sizes: Annotated[Sequence[int], counts(1), "sides of the images"] = (32, 64, 128, 256)
   num_envs: Annotated[Sequence[int], counts(1), "numbers of environments"] = (1024,)
-  compared: Annotated[bool, "up to images in steps of 1/60 s, as the paper compares simulators; for Cartpole"] = False
+  compared: Annotated[bool, "Cartpole up to images, in steps of 1/60 s, as the paper compares simulators"] = False
 
   name = "pixels"
 
@@ -149,11 +149,11 @@ class Pixels(OfTasks):
 class Topology(OfRuns):
   """Training steps/s, and whole runs, on 1, 2, 4, ... devices, with hyperparameters unchanged and scaled."""
 
-  devices: Annotated[Sequence[int], counts(1), "numbers of devices; none is 1, 2, 4, ... as many as there are"] = ()
+  devices: Annotated[Sequence[int], counts(1), "numbers of devices; none is 1, 2, 4, ... up to all"] = ()
   hyperparameters: Annotated[Sequence[str], "scaled: environments and batch times the devices"] = ("fixed", "scaled")
   seeds: Annotated[int, count(1), "trainings timed, and whole runs of each, seeds 1 to this"] = 3
   num_timesteps: Annotated[
-    int | None, count(1, 1e12), "control steps of a whole run on each, after the rates; null is rates alone"
+    int | None, count(1, 1e12), "control steps of a whole run on each, after the rates; null measures only rates"
   ] = None
 
   name = "topology"
@@ -217,7 +217,7 @@ class BesidePeer(OfTasks):
   peer: Annotated[str, "the package to compare with"] = "playground020"
   peer_python: Annotated[str, "interpreter of the environment that it is installed in"] = "python3"
   peer_path: Annotated[str, "PYTHONPATH of that interpreter"] = ""
-  peer_menagerie: Annotated[str, "folder of its robot models, where it should not fetch them"] = ""
+  peer_menagerie: Annotated[str, "folder of its robot models, if it should not download them"] = ""
   backends: Annotated[Sequence[str], "the peer's backends; ours is the task's own choice"] = ("jax", "warp")
 
   agents = ("ppo",)  # that can be compared
@@ -238,7 +238,7 @@ class BesidePeer(OfTasks):
   def peer_job(
     self, measure: str, quantity: str, task: str, setting: Sequence[str], /, **arguments: object
   ) -> Measurement:
-    """A measurement of the peer; overrides are of our run and do not reach it."""
+    """Returns a measurement of the peer, which ignores the overrides of our run."""
     peer = {"name": self.peer, "python": self.peer_python, "path": self.peer_path, "menagerie": self.peer_menagerie}
     columns = self.columns(task, self.agent, setting, PEERS[self.peer].label)
     return Measurement(measure, {"task": task, "peer": peer, **arguments}, columns, {"quantity": quantity})
@@ -246,7 +246,7 @@ class BesidePeer(OfTasks):
 
 @dataclasses.dataclass(frozen=True)
 class Compare(BesidePeer):
-  """Ours and the public package's PPO, in turn, on one machine in one call; the best of the repeats counts."""
+  """Our PPO and the public package's, in turn, on one machine in one call; the best of the repeats counts."""
 
   repeats: Annotated[int, count(1), "turns"] = 3
 
@@ -267,11 +267,11 @@ class Compare(BesidePeer):
 
 @dataclasses.dataclass(frozen=True)
 class Learning(BesidePeer, OfRuns):
-  """Ours and the public package trained for as many steps, with their own evaluations: returns, wall-clock."""
+  """Returns and wall-clock of our package and the public one, trained for the same steps, each with its evaluation."""
 
   backends: Sequence[str] = ("warp",)
   num_timesteps: Annotated[
-    int | None, count(1, 1e12), "control steps that each side trains for; null is the task's own budget in 0.2.0's set"
+    int | None, count(1, 1e12), "control steps of each training; null is the task's budget in 0.2.0's set"
   ] = None
   seeds: Annotated[int, count(1), "trainings of each side, seeds 1 to this"] = 1
 
@@ -303,7 +303,7 @@ COMMANDS: dict[str, type[Measuring]] = {
 
 
 def run(command: Measuring) -> int:
-  """Measures; returns the exit code of `run_jobs`."""
+  """Runs a command's measurements and returns the exit code of `run_jobs`."""
   command.check()
   table = Table(Path(command.out) if command.out else RESULTS / f"{command.name}.csv")
   hardware = [text for text in command.overrides if text.startswith("hardware")]

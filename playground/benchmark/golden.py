@@ -25,8 +25,8 @@ class Options(Plan):
   """Trains the runs of a set and fails (exit code 1) where a metric's last value is outside its window."""
 
   set: Annotated[str, "cpu (2 cores, under 15 minutes) or gpu (one H200, under 30 minutes)"] = "cpu"
-  only: Annotated[Sequence[str], "names of runs, all of the set if none"] = ()
-  rerun: Annotated[bool, "train again what the CSV has already; false goes on where minutes= ended"] = True
+  only: Annotated[Sequence[str], "names of runs; none is all runs of the set"] = ()
+  rerun: Annotated[bool, "train runs again that the CSV has already; false continues where minutes= ended"] = True
   cache: bool = True
   table: Annotated[str | None, "YAML of the sets; null is benchmarks/golden.yaml"] = None
   out: Annotated[str | None, "CSV that rows are added to; null is results/benchmarks/golden.csv"] = None
@@ -38,10 +38,10 @@ class Golden:
   """A run and the expected results.
 
   Attributes:
-    name: of the run.
-    overrides: of `playground-run`.
-    windows: lowest and highest last value of a column of metrics.csv.
-    source: of the windows.
+    name: name of the run.
+    overrides: overrides of `playground-run`.
+    windows: lowest and highest last value, by column of metrics.csv.
+    source: source of the windows.
   """
 
   name: str
@@ -51,10 +51,13 @@ class Golden:
 
 
 def run(options: Options) -> int:
-  """Trains and judges; returns the exit code: 0, 1 for a failed run or a value outside, 3 if the time was up.
+  """Trains the runs and checks their values.
+
+  Returns:
+    The exit code: 0 if all are inside, 1 for a failed run or a value outside, 3 if the time was up.
 
   Raises:
-    PlaygroundError: an invalid option, or a file of sets that is not one.
+    PlaygroundError: an option is invalid, or the file holds no sets of runs.
   """
   check_limits(options)
   path = Path(options.table) if options.table else shipped("benchmarks") / "golden.yaml"
@@ -99,7 +102,7 @@ def measurement(golden: Golden, options: Options) -> Measurement:
 
 
 def setting(overrides: Sequence[str], metric: str) -> str:
-  """The column `setting` of a metric's row."""
+  """Returns the column `setting` of a metric's row."""
   return " ".join((*overrides, f"metric={metric}"))
 
 

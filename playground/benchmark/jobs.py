@@ -1,4 +1,4 @@
-"""Runs measurements as jobs of the sweep's runner, each in a process of its own; rows are written at once."""
+"""Runs measurements as jobs of the sweep's runner, each in its own process; rows are written at once."""
 
 import contextlib
 import dataclasses
@@ -33,13 +33,13 @@ Add = Callable[["Measurement", Row], None]  # takes a row of a measurement
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-  """One measurement.
+  """A call of a function of `measures`, and the rows that it emits.
 
   Attributes:
-    measure: a function of `measures`, `module:function`; without a function, `measure` of the module.
-    arguments: of that function; `seeds`, if it has them, shrinks to those not measured yet.
-    columns: of its rows (benchmark, task, agent, who, setting).
-    last: columns of its last row; there is one for each seed if it has seeds.
+    measure: the function, `module:function`; without a function, `measure` of the module.
+    arguments: arguments of that function; `seeds`, if present, shrinks to those not measured yet.
+    columns: columns of all rows (benchmark, task, agent, who, setting).
+    last: columns of the last row, which is emitted for each seed if there are seeds.
   """
 
   measure: str
@@ -48,7 +48,7 @@ class Measurement:
   last: Mapping[str, str]
 
   def left(self, table: Table, device: str) -> "Measurement | None":
-    """Returns the part that the table lacks for this device; None if there is none."""
+    """Returns the part that the table lacks for this device; None if the table has all of it."""
     row = {"device": device, **self.columns, **self.last}
     if "seeds" not in self.arguments:
       return None if table.has(row) else self
@@ -63,17 +63,17 @@ class Measurement:
 class Plan:
   """Settings of running measurements."""
 
-  rerun: Annotated[bool, "measure again what the CSV has already"] = False
+  rerun: Annotated[bool, "repeat measurements that the CSV has already"] = False
   minutes: Annotated[float | None, positive(), "stop after this long; the same command again measures the rest"] = None
   workers: Annotated[int, count(1), "processes at once: they compile side by side, a device times one at a time"] = 1
   gpus: Annotated[Sequence[int], counts(0), "GPUs that the processes are spread over; none is all of them to each"] = ()
   cache: Annotated[bool, "reuse compiled programs; compile and start times are then not those of a cold start"] = False
-  commit: Annotated[str | None, "what to record where there is no git"] = None
+  commit: Annotated[str | None, "commit to record without git"] = None
   note: Annotated[str, "added to the conditions of every row"] = ""
 
 
 class _RowView(View):
-  """Passes on each row as soon as its measurement prints it, and prints the reasons of failures."""
+  """Adds each row to the table as soon as its measurement prints it, and prints the reasons of failures."""
 
   def __init__(self, sweep: SweepDirectory, measurements: Sequence[Measurement], add: Add):
     super().__init__(sweep)
@@ -114,7 +114,7 @@ class _RowView(View):
 
 
 def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int, _RowView]:
-  """Runs measurements; returns the runner's exit code and their states."""
+  """Runs measurements; returns the runner's exit code and the view with their states."""
   gpus = list(map(str, plan.gpus)) or [ALL]
   slots = [Slot(number, gpus[number % len(gpus)], ()) for number in range(plan.workers)]
   with tempfile.TemporaryDirectory() as temporary:
@@ -136,7 +136,7 @@ def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int
 def probe(overrides: Sequence[str], gpus: Sequence[int]) -> tuple[int, dict[str, str]]:
   """Returns the number of devices of measurements, and their columns `device` and `versions`.
 
-  A child process finds them, since this one holds no device.
+  A child process queries the devices, so that this process holds none.
 
   Raises:
     HardwareError: the device does not work.
@@ -156,7 +156,7 @@ def run_jobs(measurements: Sequence[Measurement], table: Table, machine: Mapping
   """Runs the measurements that the table lacks.
 
   Returns:
-    0 when the table is complete, 1 after a failure, 3 when the time was up, 130 or 143 when interrupted.
+    0 when the table is complete, 1 after a failure, 3 if the time was up, 130 or 143 when interrupted.
   """
   todo = [left for each in measurements if (left := each if plan.rerun else each.left(table, machine["device"]))]
   if len(todo) < len(measurements):

@@ -1,4 +1,4 @@
-"""Options that the commands share, and their measurements."""
+"""Defines the options that the commands share, and builds their measurements."""
 
 import abc
 import dataclasses
@@ -37,7 +37,7 @@ class Measuring(Plan, abc.ABC):
     """Returns the measurements on a machine with this number of devices."""
 
   def check(self) -> None:
-    """Raises PlaygroundError for invalid options, before anything expensive."""
+    """Raises PlaygroundError for invalid options, before anything expensive starts."""
     check_limits(self)
     if self.alone and self.workers > 1:
       raise ConfigError(f"workers={self.workers}: {self.name} wants the machine to itself, workers=1.")
@@ -64,11 +64,11 @@ class OfTasks(Measuring):
       raise ConfigError(
         f"hardware.devices= is no override of {self.name}: only topology, with devices=, measures on several."
       )
-    for task in self.chosen() if self.overrides else self.chosen()[:1]:  # without any, all run unchanged
+    for task in self.chosen() if self.overrides else self.chosen()[:1]:  # without overrides, all tasks are valid
       self.configured(task)
 
   def chosen(self) -> list[str]:
-    """Returns the tasks of `suite` and `tasks`, each once, without tasks of a suite that this package lacks."""
+    """Returns the tasks of `suite` and `tasks`, each once; tasks of a suite that this package lacks are left out."""
     if not self.suite and not self.tasks:
       raise ConfigError(f"Name what to measure: tasks=CartpoleBalance,CheetahRun or suite={'|'.join(SUITES)}|all.")
     known = task_names()
@@ -82,9 +82,9 @@ class OfTasks(Measuring):
     return compose([f"env={task}", f"agent={self.agent}", *self.overrides, *more])
 
   def with_envs(self, task: str, count: int) -> list[str]:
-    """Returns overrides for a number of environments; PPO's batch grows if each would give less than a trajectory."""
+    """Returns overrides for a number of environments; PPO's batch grows until each fills a whole trajectory."""
     setting = [f"agent.num_envs={count}"]
-    if self.agent.startswith("ppo"):  # every environment gives whole trajectories, at least the tuned number
+    if self.agent.startswith("ppo"):  # an environment fills whole trajectories, at least the tuned number
       agent = self.configured(task).agent
       batch = agent.batch_size * max(1, -(-count // (agent.batch_size * agent.num_minibatches)))
       setting += [f"agent.batch_size={batch}"] * (batch != agent.batch_size)
@@ -98,7 +98,7 @@ class OfTasks(Measuring):
     return Measurement(measure, arguments, self.columns(task, self.agent, setting), {"quantity": QUANTITY[measure]})
 
   def on_one_device(self, job: Measurement) -> Measurement:
-    """Returns the measurement with one device for each process; `setting` omits it, as most tables have one."""
+    """Returns the measurement on one device for each process; `setting` omits the device, as most tables have one."""
     arguments = {**job.arguments, "overrides": [*job.arguments["overrides"], "hardware.devices=1"]}
     return dataclasses.replace(job, arguments=arguments)
 
@@ -118,7 +118,7 @@ class OfRuns(OfTasks):
     return [] if self.num_timesteps is None else [f"agent.num_timesteps={self.num_timesteps}"]
 
   def whole_run(self, task: str, agent: str, seed: int, setting: Sequence[str] = ()) -> Measurement:
-    """Returns a measurement of a whole training."""
+    """Returns the measurement of a whole run."""
     setting = [*setting, *self.budget()]
     texts = [*self.overrides, *setting]
     arguments = {"task": task, "agent": agent, "overrides": texts, "setting": texts, "seeds": [seed]}

@@ -1,4 +1,4 @@
-"""One row a number: the columns of every table that `playground-bench` writes, and the file that holds them."""
+"""Defines the columns of the tables that `playground-bench` writes, one row for each number, and their CSV files."""
 
 import csv
 import fcntl
@@ -12,52 +12,52 @@ from playground.errors import ConfigError
 
 COLUMNS = {
   "benchmark": "the command, such as throughput, together, startup, topology, chain, compare, learning or golden",
-  "task": "the task's name, of a chain the experiment's",
+  "task": "name of the task, or of a chain's experiment",
   "agent": "the option of agent, such as ppo, ppo_paper or sac",
   "who": "ours, or the peer's name and version",
-  "setting": "what differs from the task's own configuration, as overrides, and what the benchmark varies",
-  "seed": "of the training; empty where a number belongs to all seeds",
+  "setting": "overrides of the task's own configuration, and the values that the benchmark varies",
+  "seed": "of the training; empty if a number belongs to all seeds",
   "quantity": "what was measured, see QUANTITIES",
   "value": "the number",
   "unit": "its unit",
   "backend": "physics: jax or warp",
-  "devices": "how many took part",
-  "device": "their kind",
+  "devices": "number of devices",
+  "device": "kind of device",
   "precision": "of physics and networks",
   "versions": "Python, JAX, MuJoCo, MJX, Warp, driver",
-  "commit": "of our checkout, + where it had changes",
-  "conditions": "what else one needs to know to compare",
+  "commit": "of our checkout, with + if files had changes",
+  "conditions": "other conditions that matter for a comparison",
   "date": "UTC",
 }
 
 QUANTITIES = {
-  "training_steps_per_s": "control steps (action repeats counted) a second, of all agents: collecting and learning",
-  "env_steps_per_s": "control steps a second with random actions, episodes limited and reset, nothing learned",
+  "training_steps_per_s": "control steps (action repeats counted) a second of all agents: rollouts and updates",
+  "env_steps_per_s": "control steps a second with random actions, time limit and resets, without learning",
   "trace_s": "tracing the run's functions in Python",
-  "compile_s": "compiling them, side by side, after tracing; on a GPU Warp's kernels, too",
+  "compile_s": "compiling these functions in parallel, after tracing; on a GPU Warp's kernels, too",
   "start_to_first_update_s": "from the start of the process to the end of the first update",
-  "peak_memory_gib": "most memory that JAX's allocator held on one device (Warp's own is not in it)",
-  "used_memory_gib": "most memory in use on the GPU while it ran, what was in use before taken off (nvidia-smi)",
-  "seconds_per_step": "breakdown, pixels: time of one control step of one environment, with the parts so far",
+  "peak_memory_gib": "peak memory of JAX's allocator on one device (without Warp's own)",
+  "used_memory_gib": "peak memory in use on the GPU, minus the memory in use before (nvidia-smi)",
+  "seconds_per_step": "breakdown, pixels: time of one control step of one environment, with all parts added so far",
   "return": "mean return of one evaluation (agent.deterministic_eval); setting says after how many steps",
-  "mode_return": "the same where the policy acts by its mode",
-  "best_return": "best mean return of an evaluation, that of the untrained policy apart",
+  "mode_return": "mean return of one evaluation of the policy's mode",
+  "best_return": "best mean return of an evaluation, without that of the untrained policy",
   "final_return": "mean return of the last evaluation",
-  "final_mode_return": "the same where the policy acts by its mode",
+  "final_mode_return": "mean return of the last evaluation of the policy's mode",
   "golden_metric": "last value of the column of metrics.csv that setting names",
   "steps": "control steps trained",
-  "wall_clock_s": "of a run without compiling (conditions say where it is in), evaluations included",
+  "wall_clock_s": "of a run with evaluations, without compiling (unless conditions say otherwise)",
 }
 
 
 class Table:
-  """A CSV of rows that grows while measuring; every row is complete on disk as soon as it is added.
+  """Reads and appends to a CSV of rows; a row is complete on disk when `add` returns.
 
-  Several commands may add to one at the same time: each has the file to itself while it writes.
+  Several commands may add to one file at the same time: each locks the file while it writes.
   """
 
   def __init__(self, path: Path):
-    """Opens or begins the table; what a kill left of a half-written last row is dropped.
+    """Opens or creates the table; drops a last row that a killed process has not completed.
 
     Raises:
       ConfigError: the file holds something else, or is not writable.
@@ -74,7 +74,7 @@ class Table:
       self._rows = list(_rows_of(file))
 
   def add(self, row: Mapping[str, object]) -> None:
-    """Appends a row; columns it does not name are empty.
+    """Appends a row; missing columns are empty.
 
     Raises:
       KeyError: a column or quantity that the schema does not have.
@@ -93,17 +93,17 @@ class Table:
     self._rows.append(full)
 
   def has(self, wanted: Mapping[str, object]) -> bool:
-    """Whether there is a row with these columns."""
+    """Returns whether a row has these columns."""
     texts = {name: str(value) for name, value in wanted.items()}
     return any(all(row[name] == text for name, text in texts.items()) for row in self._rows)
 
   def rows(self, start: int = 0) -> list[dict[str, str]]:
-    """The rows from the `start`-th on, in the order in which they came."""
+    """Returns the rows from the `start`-th on, in the order of `add`."""
     return self._rows[start:]
 
   @contextmanager
   def _to_itself(self) -> Iterator[BinaryIO]:
-    """The file, to read and append to, while no other process or thread has it."""
+    """Yields the file, to read and append to, locked against other processes and threads."""
     try:
       self.path.parent.mkdir(parents=True, exist_ok=True)
       with self.path.open("a+b") as file:
@@ -122,7 +122,7 @@ def _rows_of(file: BinaryIO) -> Iterable[dict[str, str]]:
 
 
 def _end_last_row(file: BinaryIO) -> None:
-  """Drops what a kill left of a half-written row; one that only lacks its line's end, as editors leave it, stays."""
+  """Drops an incomplete last row; a row that only lacks its line's end, as editors leave it, gets one."""
   file.seek(0)
   whole, newline, rest = file.read().rpartition(b"\n")
   if rest and len(next(csv.reader([rest.decode("utf-8", "replace")]))) == len(COLUMNS):

@@ -1,4 +1,4 @@
-"""The process of one measurement: `python -m playground.benchmark.worker <json>`; its rows are lines on stdout."""
+"""Runs one measurement, `python -m playground.benchmark.worker <json>`, and prints its rows as lines."""
 
 import importlib
 import json
@@ -10,15 +10,15 @@ from pathlib import Path
 
 from playground.gc_pause import gc_paused
 
-ROW = "ROW "  # a line with a row begins with it; other lines are the libraries' own
+ROW = "ROW "  # prefix of a line with a row; libraries print other lines
 CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH", "CUDA_CACHE_PATH")
 
 
 class Rows(dict[str, object]):
-  """Columns that all rows of a measurement share, and the function that emits one.
+  """Holds the columns that all rows of a measurement share, and emits rows.
 
   Attributes:
-    lock: a file to hold while timing, where several measurements share a device; else None.
+    lock: a file to lock while timing, if several measurements share a device; else None.
   """
 
   lock: str | None = None
@@ -29,7 +29,7 @@ class Rows(dict[str, object]):
 
 
 def main() -> None:
-  """Runs a function of `measures`; an error that the user can act on is the reason of the job, others a traceback."""
+  """Runs a function of `measures`; records an error that the user can act on as the job's reason, and exits with 2."""
   from playground.errors import PlaygroundError
   from playground.files import write_json
 
@@ -38,7 +38,7 @@ def main() -> None:
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # else a GPU appears full from the start
   if not job["cache"]:
     os.environ |= {name: str(folder / name) for name in CACHES}
-  if job["shares"]:  # with the measurements that see the same GPUs
+  if job["shares"]:  # other measurements use the same GPUs
     gpus = re.sub(r"\W", "_", os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
     rows.lock = str(folder.parent / f"gpu{gpus}.lock")
   module, _, function = job["measure"].partition(":")

@@ -1,7 +1,7 @@
 """`playground-bench gate`: finds slowdowns by ratios within one run, which hold on any machine.
 
-Each check measures the processor time of a piece of our code and, in turns, that of a reference workload without our
-code that uses the machine in the same way; the ratio is compared with the committed one (`benchmarks/gate.csv`).
+Each check measures the processor time of a piece of our code and, in turns, that of a reference workload that uses the
+machine in the same way without our code. The ratio is compared with the committed one (`benchmarks/gate.csv`).
 """
 
 import csv
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 class Options:
   """Fails (exit code 1) where a quick set of ratios, measured on the CPU, is far above the committed ones."""
 
-  checks: Annotated[Sequence[str], "names of checks, those of the table if none"] = ()
+  checks: Annotated[Sequence[str], "names of checks; none is those of the table"] = ()
   repeats: Annotated[int, count(1), "turns of ours and the reference; the median of their ratios counts"] = 15
   update: Annotated[bool, "write the ratios measured into the table instead of comparing"] = False
   table: Annotated[str | None, "CSV of check, ratio, tolerance; null is benchmarks/gate.csv"] = None
@@ -51,7 +51,7 @@ TOLERANCE = 1.5  # two busy cores and other processors move a ratio by up to a t
 
 
 def run(options: Options) -> int:
-  """Measures and compares, or writes the table; returns the exit code."""
+  """Measures ratios and compares them, or writes them to the table; returns the exit code."""
   path = Path(options.table) if options.table else shipped("benchmarks") / "gate.csv"
   limits = _read(path)
   check_limits(options)
@@ -95,7 +95,7 @@ def judge(checks: "Mapping[str, Callable[[], Pair]]", limits: Mapping[str, Limit
 
 
 def measure(pair: "Pair", repeats: int) -> float:
-  """Returns the median over turns of our time over the reference's, measured right after each other."""
+  """Returns the ratio of our time to the reference's, the median over turns that measure one after the other."""
   for timed in pair:
     timed()
   return statistics.median(_seconds(pair[0]) / _seconds(pair[1]) for _ in range(repeats))

@@ -1,4 +1,4 @@
-"""The checks of the gate: small pieces of our code on the CPU, each with a reference."""
+"""Builds the checks of the gate: small pieces of our code on the CPU, each with a reference."""
 
 from collections.abc import Callable
 from functools import partial
@@ -24,7 +24,7 @@ LENGTH = 20  # control steps of one call
 
 
 def env_step(task: str, num_envs: int) -> Pair:
-  """A task's training step, over the same number of MJX steps of the same model."""
+  """Compares a task's wrapped environment step with the same number of MJX steps of the same model."""
   env = registry.load(task, overrides={"impl": "jax"})
   wrapped = wrap_for_training(env)
 
@@ -45,11 +45,11 @@ def env_step(task: str, num_envs: int) -> Pair:
 
 
 def training_step(agent: str, overrides: tuple[str, ...], layers: tuple[int, int, int]) -> Pair:
-  """A training step on CartpoleBalance, nearly all of it gradient steps, over matrix products of a network's size.
+  """Compares a training step on CartpoleBalance, mostly gradient steps, with matrix products of a network's size.
 
   Args:
     agent: ppo or sac.
-    overrides: sizes.
+    overrides: overrides of the agent's sizes.
     layers: rows, width and number of the products.
   """
   config = compose(["env=CartpoleBalance", f"agent={agent}", "env.impl=jax", *overrides])
