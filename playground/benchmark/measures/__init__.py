@@ -1,1 +1,1 @@
-"""The measurements that a worker runs: modules with `measure(rows, **arguments)`."""
+"""Holds the measurements that a worker runs: modules with `measure(rows, **arguments)`."""

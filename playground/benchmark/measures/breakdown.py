@@ -21,15 +21,15 @@ PARTS = {  # in the order they are added
   "physics": "MJX alone under a constant ctrl",
   "task": "control, pushes, observation, reward, termination",
   "episodes": "guarded numbers, time limit, auto-reset",
-  "pixels": "what cameras see, where the task has any",
+  "pixels": "camera images, if the task has any",
   "inference": "the actor instead of random actions",
-  "storing": "transitions kept, log-probabilities, sums of what ended (PPO)",
+  "storing": "transitions, log-probabilities, sums of ended episodes (PPO)",
   "update": "gradient steps: the whole training step",
 }
 TURNS = 3
-LENGTH = 20  # control steps of one call, where the algorithm has no unrolls
+LENGTH = 20  # control steps of one call, if the algorithm has no unrolls
 
-# (carry, model fields, key) -> (carry, what else must be computed)
+# (carry, model fields, key) -> (carry, other outputs, so that they are computed)
 Run = Callable[[PyTree, ModelFields, jax.Array], tuple[PyTree, PyTree]]
 Step = Callable[[PyTree, ModelFields, jax.Array], PyTree]
 
@@ -45,8 +45,8 @@ def measure(
 ) -> None:
   """Emits a row for each of `PARTS` up to `until`: seconds of a control step with all parts so far.
 
-  The parts take turns, and the best turn of each counts, since their differences matter. The memory is that of all
-  parts together: JAX's, and with `watch_memory` the GPU driver's.
+  The parts take turns, and the best turn of each counts, since their differences matter. Memory is that of all parts
+  together: JAX's, and with `watch_memory` the GPU driver's.
   """
   with used_memory(rows) if watch_memory else nullcontext():
     subject = Subject.build(rows, task, agent, overrides)
@@ -76,7 +76,7 @@ def measure(
 
 
 def _repeat(subject: Subject, run: Run, carry: PyTree) -> Callable[[int], PyTree]:
-  """Returns a function that repeats `run`, each time from its last state."""
+  """Returns a function that repeats `run`, each time from the last carry."""
   run = jax.jit(run, donate_argnums=0)
   carry = jax.tree.map(jnp.copy, carry)  # parts start from the same state, and each donates the buffers of its carry
 
@@ -104,7 +104,7 @@ def _train(subject: Subject, state: TrainState) -> Callable[[int], PyTree]:
 
 
 def _rolls(subject: Subject, state: TrainState, length: int) -> dict[str, tuple[Run, PyTree, int]]:
-  """Returns the parts before the update: function of `length` steps, its carry, control steps of each."""
+  """Returns the parts before the update, by name: function of `length` steps, its carry, control steps of each."""
   trainer, env = subject.trainer, subject.trainer.env
   task, repeat, num_envs = env.unwrapped, env.action_repeat, trainer.config.num_envs
   bare, policy = Vectorize(task), trainer.policy(state)
@@ -129,7 +129,7 @@ def _rolls(subject: Subject, state: TrainState, length: int) -> dict[str, tuple[
 
     return run
 
-  # As a step leaves it: a carry's structure must not change.
+  # The state after a step, because a carry's structure must not change.
   stepped = jax.jit(bare.step)(
     jax.jit(bare.reset)(jax.random.split(subject.key(0), num_envs), subject.model),
     jnp.zeros((num_envs, env.action_size)),

@@ -1,4 +1,4 @@
-"""This machine: device, driver, versions."""
+"""Describes this machine: device, driver, versions, GPU memory in use."""
 
 import contextlib
 import os
@@ -45,9 +45,9 @@ def versions() -> str:
 
 @contextlib.contextmanager
 def used_memory(rows: Rows, seed: int | None = None) -> Iterator[None]:
-  """Emits a row for the peak GPU memory during the block above that before it; none without a GPU.
+  """Emits a row for the peak GPU memory during the block, minus the memory before it; no row without a GPU.
 
-  It queries the driver twice a second, so that memory outside JAX (Warp's arrays, compiled code) counts.
+  A thread queries the driver twice a second, so that memory outside JAX (Warp's arrays, compiled code) counts.
   """
   ask = lambda: float(_query_gpu("memory.used") or "nan")
   before, most, ended = ask(), 0.0, threading.Event()

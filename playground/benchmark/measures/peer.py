@@ -44,7 +44,7 @@ def whole(
 ) -> None:  # fmt: skip
   """Emits rows like `runs.whole` for ours, with the peer's own evaluations.
 
-  Its wall-clock time differs: the peer compiles its training while it runs.
+  The peer's wall-clock time includes compiling: it compiles its training while it runs.
   """
   (seed,) = seeds
   job = {"task": task, "agent": agent, "backend": backend, "seed": seed}
@@ -60,15 +60,15 @@ def whole(
 
 
 def drive(rows: Rows, peer: dict[str, str], job: Mapping[str, object]) -> dict[str, Any]:
-  """Runs a job in the peer's driver, and fills in the columns that its rows share.
+  """Runs a job in the peer's driver, fills in the columns that its rows share, and returns the driver's result.
 
   Args:
     rows: columns of the rows.
-    peer: its `name`, `python` (interpreter), `path` (PYTHONPATH) and `menagerie` (folder of robot models).
+    peer: `name`, `python` (interpreter), `path` (PYTHONPATH) and `menagerie` (folder of robot models) of the peer.
     job: the driver's argument.
 
   Raises:
-    PeerFailedError: it failed, or was killed.
+    PeerFailedError: the driver failed, or was killed.
   """
   env = {**os.environ, "PYTHONPATH": peer["path"], "PEER_MENAGERIE": peer["menagerie"]}
   env.pop("JAX_COMPILATION_CACHE_DIR", None)  # the peer does not cache compiled programs
@@ -83,7 +83,7 @@ def drive(rows: Rows, peer: dict[str, str], job: Mapping[str, object]) -> dict[s
 
 
 def _epoch_steps(task: str, seconds: float) -> int:
-  """Returns control steps that take about `seconds`, from the paper's rate on its A100."""
+  """Returns the number of control steps that take about `seconds`, from the paper's rate on its A100."""
   rows = [row for suite in SUITES for row in paper_table(f"{suite}_throughput") if row["registry_env"] == task]
   rate = float(rows[0]["ppo_sps_mean"]) if rows else 250_000.0
   return math.ceil(1.5 * rate * seconds)

@@ -33,7 +33,7 @@ class RunFailedError(PlaygroundError):
 def startup(rows: Rows, task: str, agent: str, overrides: list[str], seconds: float) -> None:
   """Emits rows `cold` and `warm`: the same command twice in new processes, up to the first update that learns.
 
-  Evaluation is compiled, too; the one before training runs after the first training call, as in any run.
+  Evaluation is compiled, too. The evaluation before training runs after the first training call, as in any run.
   """
   del seconds  # measures one run unchanged
   chosen = [f"env={task}", f"agent={agent}", *overrides]
@@ -50,10 +50,10 @@ def startup(rows: Rows, task: str, agent: str, overrides: list[str], seconds: fl
 
 
 def whole(rows: Rows, task: str, agent: str, overrides: list[str], setting: list[str], seeds: list[int]) -> None:
-  """Emits a row for each evaluation, `step=<steps trained>`, then those of the whole run, the final return last.
+  """Emits a row for each evaluation, `step=<steps trained>`, then the rows of the whole run, the final return last.
 
-  The whole run, compilation included, has the device alone. `setting` is the measurement's, to which an
-  evaluation's row adds its step.
+  The run locks the device from its start, compilation included, to its end. An evaluation's row adds its step to
+  `setting`.
   """
   (seed,) = seeds
   with tempfile.TemporaryDirectory() as folder:
@@ -74,8 +74,8 @@ def whole(rows: Rows, task: str, agent: str, overrides: list[str], setting: list
 def chain(rows: Rows, experiment: str, overrides: list[str], runs: str, again: bool, seeds: list[int]) -> None:
   """Emits rows for each stage of a curriculum, `stage=<name>`, and for the whole, `stage=all`.
 
-  An unfinished run of the same experiment, overrides and seed is resumed; its times are sums over its starts. A
-  finished one is read, and its commit is the rows', unless `again` asks for a new one.
+  An unfinished run of the same experiment, overrides and seed is resumed; its times are sums over its starts. The rows
+  of a finished run have that run's commit; `again` starts a new run instead.
   """
   (seed,) = seeds
   run = _chain_run(Path(runs), experiment, overrides, seed, again)
@@ -107,13 +107,13 @@ def golden(rows: Rows, overrides: list[str], metrics: list[str], settings: list[
 
 
 def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
-  """Runs `playground-run` in a process of its own; raises RunFailedError with its last line."""
+  """Runs `playground-run` in its own process; raises RunFailedError with the last line of its output."""
   env = {key: value for key, value in os.environ.items() if key not in without}
   command = [*PYTHON, "-W", "ignore", "-c", "from playground.cli.run import main; main()", *overrides]
   with subprocess.Popen(
     command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace", env=env
   ) as process:
-    signal.signal(signal.SIGTERM, lambda *_: process.terminate())  # it saves, and this process waits
+    signal.signal(signal.SIGTERM, lambda *_: process.terminate())  # the run saves while this process waits
     out, errors = process.communicate()
   if process.returncode:
     lines = (errors or out).strip().splitlines()
@@ -122,7 +122,7 @@ def run_training(overrides: list[str], without: tuple[str, ...] = ()) -> None:
 
 
 def columns_of(manifest: Mapping[str, object]) -> dict[str, object]:
-  """Returns columns of a row, from a run's manifest."""
+  """Returns the columns `backend`, `devices` and `precision` of a run's rows, from its manifest."""
   precision = f"physics {manifest['matmul_precision']}, networks {manifest['network_precision']}"
   return {"backend": manifest["impl"], "devices": manifest["num_devices"], "precision": precision}
 
@@ -154,7 +154,7 @@ def _one_update(config: RunConfig) -> int:
 
 
 def _chain_run(runs: Path, experiment: str, overrides: list[str], seed: int, again: bool) -> RunDirectory:
-  """Returns the run directory, one for each set of overrides; with `again`, the first unfinished numbered one."""
+  """Returns the run directory of an experiment, overrides and seed; with `again`, the first unfinished numbered one."""
   digest = [hashlib.sha256(" ".join(overrides).encode()).hexdigest()[:8]] if overrides else []
   name = "_".join([experiment, *digest, f"seed_{seed}"])
   numbered = (name if number == 1 else f"{name}_{number}" for number in itertools.count(1))

@@ -1,4 +1,4 @@
-"""Shared by the measurements: a task with its trainer, clocks, and columns of this process."""
+"""Holds the parts that all measurements share: a task with its trainer, clocks, and columns of this process."""
 
 import contextlib
 import dataclasses
@@ -31,10 +31,14 @@ ONE_DEVICE = "hardware.devices=1"
 
 @dataclasses.dataclass
 class Subject:
-  """A task as `playground-run env=<task> agent=<agent> <overrides>` would train it.
+  """A task with its trainer, as `playground-run env=<task> agent=<agent> <overrides>` builds them.
 
   Attributes:
-    draw: (seed) -> randomised models of the training and of the evaluation; those of several agents from its seed on.
+    config: the run's configuration.
+    hardware: devices of this process.
+    env: the task.
+    trainer: trainer of the task and the algorithm.
+    draw: (seed) -> randomised models of training and evaluation; agent i of several uses seed + i.
   """
 
   config: RunConfig
@@ -45,7 +49,7 @@ class Subject:
 
   @classmethod
   def build(cls, rows: Rows, task: str, agent: str, overrides: Sequence[str], num_agents: int = 1) -> "Subject":
-    """Builds the subject, of one agent or several in one program, and fills in the columns that its rows share."""
+    """Builds task and trainer, of one agent or several in one program, and fills in the columns that rows share."""
     config = compose([f"env={task}", f"agent={agent}", *overrides])
     hardware = setup(config.hardware)
     if config.hardware.scale_envs:
@@ -76,7 +80,7 @@ class Subject:
     return self.draw(self.config.seed)[0]
 
   def key(self, seed: int) -> jax.Array:
-    """Returns a random key, on all devices; of several agents one each."""
+    """Returns a random key on all devices, or a key for each of several agents."""
     keys = [np.asarray(jax.random.PRNGKey(seed + i)) for i in range(max(self.trainer.num_agents, 1))]
     return put(self.trainer.join(keys), self.trainer.mesh, P())
 
@@ -100,11 +104,11 @@ def alone(lock: str | None) -> Iterator[None]:
 
 
 def rate(call: Callable[[int], PyTree], steps: int, seconds: float) -> tuple[float, float]:
-  """Measures a rate.
+  """Measures steps a second.
 
   Args:
     call: makes a number of repetitions and returns their result; already compiled.
-    steps: of one repetition.
+    steps: steps of one repetition.
     seconds: duration of the measurement, at least one repetition.
 
   Returns:

@@ -1,4 +1,4 @@
-"""Measures training alone, at full speed, as in the paper's throughput tables."""
+"""Measures training steps a second without evaluation, as in the paper's throughput tables."""
 
 from contextlib import nullcontext
 from functools import partial
@@ -29,14 +29,14 @@ def measure(
   includes no evaluation and no full reset. One compilation serves all seeds.
 
   Args:
-    rows: for the rows.
-    task: its name.
-    agent: an option of the group.
-    overrides: of the run's configuration.
-    seeds: of the trainings.
+    rows: emits the rows.
+    task: name of the task.
+    agent: an option of the group `agent`.
+    overrides: overrides of the run's configuration.
+    seeds: seeds of the trainings.
     seconds: duration of each measurement, at least one update.
     watch_memory: whether to query the GPU driver for the memory in use.
-    num_agents: agents in one program, each with a seed of its own; their steps are added up.
+    num_agents: agents in one program, each with its own seed; their steps are added up.
   """
   with used_memory(rows, seeds[0]) if watch_memory else nullcontext():
     subject = Subject.build(rows, task, agent, overrides, num_agents)

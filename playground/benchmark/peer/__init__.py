@@ -1,4 +1,4 @@
-"""Other packages to compare with; each is in an environment of its own, none is a dependency."""
+"""Lists other packages to compare with; each is in its own environment, none is a dependency."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ from playground.errors import ConfigError, UnknownNameError, nearest
 
 
 class Peer(NamedTuple):
-  """A package, and the program that drives it."""
+  """A package to compare with, and the program that drives it."""
 
   driver: Path
   distribution: str
@@ -28,13 +28,13 @@ def check_peer(peer: str, python: str, path: str, menagerie: str) -> None:
 
   Args:
     peer: one of `PEERS`.
-    python: interpreter of the environment that it is installed in.
+    python: interpreter of the peer's environment.
     path: PYTHONPATH of that interpreter.
-    menagerie: folder of robot models, one folder each; none if the package downloads them.
+    menagerie: folder of robot models, one folder each; empty if the package downloads them.
 
   Raises:
-    UnknownNameError: there is no such peer.
-    ConfigError: the interpreter does not exist, lacks the package, or the folder holds no robot.
+    UnknownNameError: the peer does not exist.
+    ConfigError: the interpreter does not exist or lacks the package, or the folder holds no robot.
   """
   if peer not in PEERS:
     raise UnknownNameError(f"peer={peer} does not exist: choose from {', '.join(PEERS)}.{nearest(peer, PEERS)}")

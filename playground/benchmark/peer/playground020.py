@@ -1,7 +1,7 @@
 """Drives the public package `playground` 0.2.0, in its own environment: `python playground020.py <json>`.
 
-Imports nothing of ours. Prints one line, `RESULT <json>`. The package is older than current JAX and MuJoCo, so a few
-names that it calls and that are gone are put back first.
+Imports no module of this package. Prints one line, `RESULT <json>`. The public package is older than current JAX and
+MuJoCo, so the driver first restores a few names that JAX and MuJoCo have removed.
 """
 
 import functools
@@ -24,12 +24,12 @@ import mujoco
 import numpy as np
 
 SIZES = ("num_envs", "batch_size", "num_minibatches", "grad_updates_per_step")
-Settings = dict[str, Any]  # what Brax's trainers take
+Settings = dict[str, Any]  # arguments of Brax's trainers
 EVALUATION = ("num_evals", "num_resets_per_eval", "num_eval_envs")
 
 
 def put_back_names() -> None:
-  """Restores what JAX and MuJoCo removed."""
+  """Restores names that the package calls and that JAX and MuJoCo have removed."""
   if not hasattr(jax, "device_put_replicated"):
     jax.device_put_replicated = replicate  # Brax's trainer
   clip = jnp.clip
@@ -45,7 +45,7 @@ def put_back_names() -> None:
 
 
 def replicate(tree: object, devices: Sequence[object]) -> object:
-  """A copy of every array on each device, under a leading axis, as pmap takes it."""
+  """Returns a copy of every array on each device, stacked on a leading axis as pmap expects."""
   mesh = jax.sharding.Mesh(np.asarray(devices), ("device",))
   sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
   spread = lambda leaf: jax.device_put(jnp.broadcast_to(leaf, (len(devices), *jnp.shape(leaf))), sharding)
@@ -53,7 +53,7 @@ def replicate(tree: object, devices: Sequence[object]) -> object:
 
 
 def use_menagerie(folder: str) -> None:
-  """Takes robot models from a folder, instead of fetching them."""
+  """Makes the package read robot models from a folder instead of downloading them."""
   import mujoco_playground._src.mjx_env as mjx_env  # pyright: ignore[reportMissingImports]
   from etils import epath
 
@@ -61,7 +61,7 @@ def use_menagerie(folder: str) -> None:
 
 
 def tuned(task: str, backend: str, agent: str) -> Settings:
-  """The package's own settings for a task; it has SAC's for DM Control only."""
+  """Returns the package's own settings for a task; for SAC only DM Control has settings."""
   from mujoco_playground import dm_control_suite, locomotion  # pyright: ignore[reportMissingImports]
   from mujoco_playground.config import dm_control_suite_params, locomotion_params, manipulation_params  # pyright: ignore[reportMissingImports]
 
@@ -73,7 +73,7 @@ def tuned(task: str, backend: str, agent: str) -> Settings:
 
 
 def load(task: str, backend: str, num_envs: int) -> object:
-  """The package's task on a backend; Warp's buffers are for 8192 environments, more of them need larger ones."""
+  """Returns the package's task on a backend; Warp's buffers, sized for 8192 environments, grow with more."""
   from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
 
   config = registry.get_default_config(task)
@@ -85,7 +85,7 @@ def load(task: str, backend: str, num_envs: int) -> object:
 
 
 def arguments_of(task: str, backend: str, seed: int, agent: str = "ppo") -> Settings:
-  """What Brax's trainer takes to train a task on one device as the package does."""
+  """Returns the arguments with which Brax's trainer trains a task on one device as the package does."""
   from mujoco_playground import registry, wrapper  # pyright: ignore[reportMissingImports]
 
   networks = importlib.import_module(f"brax.training.agents.{agent}.networks")
@@ -104,12 +104,12 @@ def arguments_of(task: str, backend: str, seed: int, agent: str = "ppo") -> Sett
 
 
 def in_words(arguments: Settings, *names: str) -> str:
-  """Settings in words."""
+  """Formats settings as text."""
   return ", ".join(f"{name} {arguments[name]}" for name in (*SIZES, *names) if name in arguments)
 
 
 def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: Callable[[], float]) -> dict[str, object]:
-  """Trains for some epochs of at least `steps` control steps, without evaluations or resets between."""
+  """Trains for `epochs` epochs of at least `steps` control steps, without evaluations or resets in between."""
   from brax.training.agents.ppo import train as ppo
 
   arguments, marks = arguments_of(task, backend, seed), []
@@ -138,10 +138,10 @@ def train(task: str, backend: str, seed: int, steps: int, epochs: int, age_s: Ca
 
 
 def learn(task: str, backend: str, seed: int, num_timesteps: int | None, agent: str) -> dict[str, object]:
-  """Trains to the end with the package's own evaluations and resets; None is its own budget.
+  """Trains with the package's own evaluations and resets; `num_timesteps` None is the package's own budget.
 
-  The clock starts when the evaluation before training is done. Brax has compiled and run that one by then; compiling
-  the training, all training and resets, and the evaluations after are in the time.
+  The clock starts after the evaluation before training, which Brax compiles and runs first. The time includes compiling
+  the training, training, resets and later evaluations.
   """
   brax = importlib.import_module(f"brax.training.agents.{agent}.train")
   arguments, evaluations, rates = arguments_of(task, backend, seed, agent), [], []
@@ -168,7 +168,7 @@ def learn(task: str, backend: str, seed: int, num_timesteps: int | None, agent: 
 
 
 def process_age_s() -> float:
-  """Seconds since this process was started; Linux."""
+  """Returns the seconds since this process started (Linux)."""
   started = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
   return float(Path("/proc/uptime").read_text().split()[0]) - started / os.sysconf("SC_CLK_TCK")
 

@@ -25,10 +25,10 @@ SECTIONS = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-  """One page, report.md and report.html: the paper's tables with our column, curves, bars, conditions."""
+  """Writes report.md and report.html: the paper's tables with our column, curves, bars, conditions."""
 
   out: Annotated[str, "folder of the page"] = "results/benchmarks"
-  rows: Annotated[Sequence[str], "folders whose CSVs it is made of"] = ROWS
+  rows: Annotated[Sequence[str], "folders of the CSVs to read"] = ROWS
   pages: Annotated[str | None, "instead: folder of the result pages (docs) whose tables of runs to rewrite"] = None
 
 
@@ -66,7 +66,7 @@ def run(options: Options) -> int:
 
 
 def page(evidence: Evidence) -> list[Block]:
-  """The page's blocks."""
+  """Returns the blocks of the page."""
   notes = sections.Notes()
   blocks: list[Block] = [Heading(1, TITLE)]
   blocks.append(Text(f"Made by `playground-bench report` from {', '.join(path.name for path in evidence.files)}."))

@@ -1,4 +1,4 @@
-"""Reads measurements: rows of all tables, and learning curves."""
+"""Reads measurements: the rows of all tables, and learning curves."""
 
 import csv
 import dataclasses
@@ -11,17 +11,17 @@ from playground.errors import ConfigError
 from playground.reporting.page import mean_and_ci95
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
 
-Row = dict[str, Any]  # the columns of a row as text, `value` as a number, `source`: the file, and a run's `note`
+Row = dict[str, Any]  # the columns as text, `value` as a number, the file as `source`, and a run's `note`
 
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-  """A number with its evidence.
+  """A mean of rows, with its confidence interval.
 
   Attributes:
-    mean: over the rows.
-    ci95: half the width of the confidence interval over seeds, None from one row.
-    rows: of the mean; they differ in seed and value only.
+    mean: mean value of the rows.
+    ci95: half the width of the 95 % confidence interval over seeds; None for one row.
+    rows: the rows, which differ only in seed and value.
   """
 
   mean: float
@@ -33,7 +33,7 @@ class Figure:
 
 
 class Evidence:
-  """All rows and curves below some folders."""
+  """Reads all rows and curves below some folders."""
 
   def __init__(self, folders: Sequence[Path]):
     self.files: list[Path] = []  # files with a used row
@@ -88,7 +88,7 @@ def _number(path: Path, text: str) -> float:
 
 
 def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
-  """Returns rows of a table in the columns of the schema; a table of whole runs has a column for each quantity."""
+  """Yields rows of a table in the columns of the schema; a table of whole runs has a column for each quantity."""
   if not lines or "task" not in lines[0]:
     return
   for line in lines:
@@ -104,7 +104,7 @@ def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
 def _curves(path: Path, lines: Sequence[dict[str, str]], column: str) -> dict[str, list[tuple[float, float]]]:
   """Returns learning curves of a file, (steps, return in `column`) by name, one for each run."""
   curves: dict[str, list[tuple[float, float]]] = {}
-  if (path.parent.parent / "config.yaml").is_file():  # a stage of a chain, whose own curve has it
+  if (path.parent.parent / "config.yaml").is_file():  # a stage of a chain; the chain's curve includes it
     return curves
   if lines and {"step", column} <= set(lines[0]):
     name = path.parent.name if path.stem == "metrics" else path.stem.removeprefix("curve_")

@@ -1,4 +1,4 @@
-"""The section on pixels: steps/s and their parts, beside the paper's and other simulators'."""
+"""Builds the section on pixels: steps/s and their parts, beside the paper's and other simulators'."""
 
 from collections.abc import Iterable, Mapping
 
@@ -9,7 +9,7 @@ from playground.paper import paper_table
 from playground.reporting.page import Block, Heading, Table, Text
 
 SEEN = {"episodes": "state", "pixels": "+ images", "inference": "+ inference", "update": "+ training"}
-PARTS = ("physics", "rendering", "inference", "policy update")  # what each of them adds, as the paper calls it
+PARTS = ("physics", "rendering", "inference", "policy update")  # the paper's names of the added parts
 MEMORY = "used_memory_gib"
 PAPER = ("paper, Madrona", "64", "1024")  # who, width of the images, environments
 _SIZES = ("env.vision.width", "env.vision.height", "agent.num_envs")
@@ -21,9 +21,9 @@ def pixels(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   """Builds the section of steps/s from pixels, beside the paper's and those that it quotes."""
   yield Heading(2, "From pixels")
   yield Text(
-    "Control steps a second with each part added; random actions before inference, a fresh policy after. The paper's: "
-    "one RTX 4090, Madrona, the mean of five runs; control steps of 0.04 s and episodes of 3 s for Cartpole, 0.05 s "
-    "and 4 s for the Panda, whose looks are randomised. `playground-bench pixels` sets the same."
+    "Control steps a second with each part added; random actions before inference, an untrained policy after. "
+    "The paper's: one RTX 4090, Madrona, the mean of five runs; control steps of 0.04 s and episodes of 3 s for "
+    "Cartpole, 0.05 s and 4 s for the Panda, whose appearance is randomised. `playground-bench pixels` sets the same."
   )
   speeds, shares, bars = [], [], []
   for (group, setting), parts in sorted(_ours(evidence).items()):

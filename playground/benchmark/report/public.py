@@ -1,4 +1,4 @@
-"""Our learning curves over those of public repositories (`benchmarks/public/`), tasks where we are below first."""
+"""Compares our learning curves with those of public repositories (`benchmarks/public/`)."""
 
 import dataclasses
 import math
@@ -24,11 +24,11 @@ _OTHER_EPISODES = "kengz/SLM-Lab"  # whose manipulation tasks have episodes of o
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-  """A learning curve and what it was measured under.
+  """A learning curve with its run and kind of action.
 
   Attributes:
     label: the run, or algorithm and repository.
-    actions: sampled or mode.
+    actions: sampled, mode, or as set in the run.
     points: (environment steps, return), steps ascending.
   """
 
@@ -38,7 +38,7 @@ class Curve:
 
 
 def beside_public(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """For each task our best run over public curves, and a table that begins with those where we are below."""
+  """Draws each task's best run of ours over public curves, and a table with the tasks where we are below first."""
   ours, theirs = our_best(evidence), public_curves()
   shared = sorted(set(ours) & set(theirs))
   if not shared:
@@ -83,7 +83,7 @@ class _Comparison:
 
   @property
   def ratio(self) -> float:
-    """Ours over theirs; infinite where they have nothing to divide by."""
+    """Our return divided by the public one; infinite if the public one is missing or not positive."""
     return self.score / self.equal[0] if self.equal and self.equal[0] > 0 else math.inf
 
   def cells(self) -> list[str]:
@@ -102,12 +102,12 @@ def _compared(task: str, curve: Curve, theirs: Sequence[Curve]) -> _Comparison:
 
 
 def is_ppo(public: Curve) -> bool:
-  """Whether a public curve is one of PPO; REPPO is another algorithm."""
+  """Returns whether a public curve is one of PPO; REPPO is another algorithm."""
   return public.label.startswith("PPO")
 
 
 def at(points: Points, steps: float) -> float | None:
-  """The return of a curve at `steps`: linear between its points, the last one beyond its end, None before it began."""
+  """Returns a curve's return at `steps`: linear between points, the last one beyond the end, None before the first."""
   if steps < points[0][0]:
     return None
   for (x0, y0), (x1, y1) in pairwise(points):
@@ -117,7 +117,7 @@ def at(points: Points, steps: float) -> float | None:
 
 
 def our_best(evidence: Evidence) -> dict[str, list[Curve]]:
-  """By task the curves that end highest, one for each algorithm and way to act."""
+  """Returns the curves of each task that end highest, one for each algorithm and kind of action."""
   found: dict[str, list[Curve]] = {}
   for actions, curves in ((_AS_SET, evidence.curves), ("mode", evidence.mode_curves)):
     for name, points in curves.items():
@@ -139,14 +139,14 @@ def our_best(evidence: Evidence) -> dict[str, list[Curve]]:
 
 
 def _agent_of(label: str) -> str:
-  """The algorithm that a run's name has, PPO if none."""
+  """Returns the algorithm in a run's name; `ppo` if the name has none."""
   found = _AGENT.search(label)
   return found.group() if found else "ppo"
 
 
 @cache
 def public_curves() -> dict[str, list[Curve]]:
-  """The public curves by task, one for each algorithm of a repository; episodes of other lengths are left out."""
+  """Returns the public curves by task, one for each algorithm of a repository, without episodes of other lengths."""
   settings = {row["repository"]: row for row in _read("settings")}
   manipulation = {*tasks_of("manipulation")}
   curves: dict[str, list[Curve]] = {}
@@ -161,12 +161,12 @@ def public_curves() -> dict[str, list[Curve]]:
 
 
 def _task_of(name: str) -> str | None:
-  """The task that a curve's name begins with."""
+  """Returns the task that a curve's name begins with; None without one."""
   return max((task for task in task_names() if name == task or name.startswith(f"{task}_")), key=len, default=None)
 
 
 def _panel(ours: Sequence[Curve], theirs: Sequence[Curve]) -> dict[str, figures.Curve]:
-  """A task's curves by short names, ours first."""
+  """Returns a task's curves by short names, ours first."""
   named = {f"our {_agent_of(curve.label)}{', mode' * (curve.actions == 'mode')}": curve.points for curve in ours}
   for curve in sorted(theirs, key=lambda curve: curve.points[-1][1]):
     named[re.split(r"[ ,(]", curve.label)[0]] = curve.points  # the highest is the last

@@ -1,4 +1,4 @@
-"""The page's sections, each from the rows of its benchmark; a missing one names its command."""
+"""Builds the sections of the page from the rows of each benchmark; a section without rows names its command."""
 
 import functools
 import re
@@ -14,22 +14,22 @@ TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipul
 SPEED = "training_steps_per_s"
 PARTS = ("physics", "task", "episodes", "pixels", "inference", "storing", "update")
 _BUDGET = re.compile(r" ?agent\.num_timesteps=\S+")  # in the setting of a whole run on a topology
-_TOPOLOGY = ("hardware.devices=", "hardware.scale_envs=")  # what a topology's setting varies
-_KEY = re.compile(r"^[\w.]+\.(?=\w+=)")  # what an override's key has before its last word
+_TOPOLOGY = ("hardware.devices=", "hardware.scale_envs=")  # keys that a topology's setting varies
+_KEY = re.compile(r"^[\w.]+\.(?=\w+=)")  # the part of an override's key before its last word
 _CURVE = re.compile(
   r"(.+?)_((?:ours|peer|ppo|reppo|sac|fast_td3|fast_sac|seed)(?:_.*)?)"
 )  # a curve's name: task and run
 
 
 class Notes:
-  """Conditions, listed once each below the tables."""
+  """Numbers the conditions of figures, and lists each once below the tables."""
 
   def __init__(self) -> None:
     self._texts: dict[str, int] = {}
 
   def number(self, figure: Figure) -> str:
-    """Returns the number of the note on a figure's conditions."""
-    untimed = re.sub(r"[\d.]+ s timed", "timed", figure["conditions"])  # else every seed would have a note of its own
+    """Returns the number of the note on a figure's conditions, such as `[2]`."""
+    untimed = re.sub(r"[\d.]+ s timed", "timed", figure["conditions"])  # else every seed would have its own note
     commit = figure["commit"] and f"commit {figure['commit']}"
     parts = (figure["precision"], figure["versions"], figure["note"], untimed, commit)
     text = "; ".join(part for part in parts if part)
@@ -41,7 +41,7 @@ class Notes:
 
 
 def throughput(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """The paper's tables with our column beside theirs."""
+  """Yields the paper's tables with our column beside theirs."""
   yield Heading(2, "Training throughput")
   yield Text(
     "Control steps trained on a second, at the paper's hyperparameters. The paper's column: one A100, five seeds, "
@@ -81,7 +81,7 @@ def _paper_table(evidence: Evidence, notes: Notes, lines: Sequence[dict[str, str
 
 
 def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Ours and the peer's, from the same call on the same machine."""
+  """Yields our figures beside the peer's, from the same call on the same machine."""
   yield Heading(2, "Beside the public package")
   yield Text(
     "Ours and `playground` 0.2.0, in turn on one machine in one call, each in fresh processes; of several turns the "
@@ -108,12 +108,12 @@ def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def _same_overrides(ours: Figure, peer: Figure) -> bool:
-  """Whether both are of one command: the peer's setting adds its backend to the overrides of our run."""
+  """Returns whether both are of one command: the peer's setting adds its backend to the overrides of our run."""
   return re.sub(r" ?env\.impl=\S+$", "", peer["setting"]) == ours["setting"]
 
 
 def startup(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """From the command to the first update."""
+  """Yields the times from the command to the first update."""
   yield Heading(2, "From the command to the first update")
   rows = []
   for figure in evidence.find(benchmark="startup", quantity="start_to_first_update_s"):
@@ -123,14 +123,14 @@ def startup(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Steps a second and memory against the number of environments."""
+  """Yields steps a second and memory over the number of environments."""
   yield Heading(2, "Against the number of environments")
   series: dict[str, dict[float, float]] = {}
   rows = []
   for quantity, label in (("env_steps_per_s", "environment"), ("training_steps_per_s", "training")):
     for figure in evidence.find(benchmark="scaling", who="ours", quantity=quantity):
       if counts := re.findall(r"agent\.num_envs=(\d+)", figure["setting"]):
-        count = counts[-1]  # the one that holds
+        count = counts[-1]  # the last override applies
         task = _named(figure, "agent.num_envs=", "agent.batch_size=")
         line = series.setdefault(f"{task}, {label}, {figure['device']}", {})
         line.setdefault(float(count), figure.mean)  # the newest
@@ -149,7 +149,7 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def together(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Several agents in one program beside one run."""
+  """Yields the steps a second of several agents in one program beside those of one run."""
   yield Heading(2, "Agents in one program")
   agents = lambda figure: int(figure["setting"].rpartition("num_agents=")[2])
   found = evidence.find(benchmark="together", who="ours", quantity=SPEED)
@@ -165,11 +165,11 @@ def together(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """One device and several: rates and what they make of a budget, then whole runs."""
+  """Yields rates on one and several devices with the time of a budget derived from them, then whole runs."""
   yield Heading(2, "Devices")
   yield Text(
     "The paper prints for LeapCubeReorient about 2080 s on one RTX 4090 and 670 s on eight H100 (IV-D). Times one "
-    "device: the rate over that of one device; efficiency: this over the number of devices. What a budget takes is "
+    "device: the rate over that of one device; efficiency: this over the number of devices. The time of a budget is "
     "derived: the task's own number of steps over the rate, so training alone, without compiling and evaluation."
   )
   found = evidence.find(benchmark="topology", who="ours", quantity=SPEED)
@@ -192,11 +192,11 @@ def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def _whole_runs(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Measured wall-clock and return of runs on each topology, beside what the rate makes of as many steps."""
+  """Yields measured wall-clock time and return of runs on each topology, beside the time derived from the rate."""
   yield Text(
-    "Whole runs, as measured: the wall-clock of so many control steps with evaluations and saving, without compiling, "
-    "and the return of the last evaluation. Times one device: how much faster than on one. Derived: the seconds of as "
-    "many steps at the rate above."
+    "Whole runs, as measured: the wall-clock time of the control steps with evaluations and saving, without compiling, "
+    "and the return of the last evaluation. Times one device: how much faster than on one. Derived: the seconds of the "
+    "same steps at the rate above."
   )
   rows = []
   for figure, one in _beside_one(evidence.find(benchmark="topology", who="ours", quantity="wall_clock_s")):
@@ -217,7 +217,7 @@ def _whole_runs(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def _beside_one(found: Iterable[Figure]) -> list[tuple[Figure, float | None]]:
-  """Figures in the order of their devices, each with one device's number: of several commits' its own or the newest."""
+  """Returns figures by number of devices, each with the value of one device, of the same commit or else the newest."""
   order = lambda figure: (figure["task"], int(figure["devices"]), _hyperparameters(figure))
   single: dict[tuple[str, ...], float] = {}
   pairs = []
@@ -236,19 +236,19 @@ def _hyperparameters(figure: Figure) -> str:
 
 
 def _of_topology(figure: Figure) -> tuple[str, ...]:
-  """What figures agree in that differ in their devices alone."""
+  """Returns the columns that are equal for figures that differ only in their devices."""
   setting = (text for text in figure["setting"].split() if not text.startswith(_TOPOLOGY))
   return figure["task"], figure["agent"], figure["device"], " ".join(setting)
 
 
 @functools.cache
 def _budget(task: str, agent: str) -> int:
-  """A task's own number of control steps."""
+  """Returns the default number of control steps of a task's training."""
   return compose([f"env={task}", f"agent={agent}"]).agent.num_timesteps
 
 
 def breakdown(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Where a control step's time goes."""
+  """Yields the time of each part of a control step."""
   yield Heading(2, "Where the time goes")
   yield Text("The loop timed with its parts added one by one; a part is the difference (the paper's method, D.3).")
   bars: dict[str, dict[str, float]] = {}
@@ -274,7 +274,7 @@ def breakdown(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def chains(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Curricula, stage by stage."""
+  """Yields return and time of curricula, stage by stage."""
   yield Heading(2, "Fine-tuning chains")
   rows = []
   for figure in evidence.find(benchmark="chain", quantity="wall_clock_s"):
@@ -287,7 +287,7 @@ def chains(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
-  """Learning curves and final returns of the runs that were kept."""
+  """Yields learning curves and final returns of all runs."""
   yield Heading(2, "Returns")
   groups: dict[str, dict[str, list[tuple[float, float]]]] = {}
   for name, points in evidence.curves.items():
@@ -310,9 +310,9 @@ def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 
 
 def runs_by_step(evidence: Evidence, quantity: str = "return") -> dict[str, dict[str, list[tuple[float, float]]]]:
-  """Curves from the rows of evaluations, whose setting ends in `step=`; a task's runs are named by what they differ in.
+  """Returns learning curves by task and run, from the rows of evaluations, whose setting ends in `step=`.
 
-  `quantity` is `return` or `mode_return`.
+  A run's name holds the words in which it differs from the task's other runs. `quantity` is `return` or `mode_return`.
   """
   tasks: dict[str, dict[tuple[str, ...], dict[float, float]]] = {}
   for figure in evidence.find(quantity=quantity):
@@ -335,7 +335,7 @@ def _curves(groups: Mapping[str, Mapping[str, figures.Points]]) -> str:
 
 
 def _named(figure: Figure, *varied: str) -> str:
-  """A figure's task, its agent unless PPO, and its setting except for what begins with what a section varies."""
+  """Returns a figure's task, its agent unless PPO, and its setting without the overrides that a section varies."""
   agent = [figure["agent"]] * (figure["agent"] not in ("ppo", ""))
   return " ".join([figure["task"], *agent, *(t for t in figure["setting"].split() if not t.startswith(varied))])
 
@@ -346,5 +346,5 @@ def _with_ci(figure: Figure) -> str:
 
 
 def nothing(command: str) -> Block:
-  """Names the command that measures a missing section."""
+  """Returns a text that names the command of a missing section."""
   return Text(f"{NOT_MEASURED.capitalize()}: `playground-bench {command}` does.")

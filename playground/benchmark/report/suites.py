@@ -1,7 +1,7 @@
-"""The tables of the result pages and the grids of the gallery, from results/reference/ and the catalogue.
+"""Writes the tables of the result pages and the grids of the gallery from results/reference/ and the catalogue.
 
 A page is written by hand except for the text between two comments, which `playground-bench report pages=docs` replaces.
-Each suite has a page with a row for each task and one with every run, where open tasks come first.
+Each suite has a page with a row for each task, and a page with every run, open tasks first.
 """
 
 import re
@@ -14,7 +14,7 @@ from playground.errors import ConfigError
 from playground.files import read_csv, write_text
 from playground.reporting.page import Block, Heading, Table, to_markdown
 
-TABLES = {  # the pages results-<name>.md and runs-<name>.md -> the tables that they show
+TABLES = {  # name of the pages results-<name>.md and runs-<name>.md -> their tables
   "dm-control": ("dm_control",),
   "locomotion": ("locomotion",),
   "manipulation": ("manipulation", "vision"),
@@ -24,7 +24,7 @@ TASKS_BEGIN, TASKS_END = GENERATED.format("tasks"), "<!-- end of tasks -->"
 RUNS_BEGIN, RUNS_END = GENERATED.format("runs"), "<!-- end of runs -->"
 GALLERY = "gallery.md"
 GRID_BEGIN, GRID_END = GENERATED.format("grid {}"), "<!-- end of grid -->"
-_GRID_WIDTH = 4  # loops in a row
+_GRID_WIDTH = 4  # animations in a row
 _TITLES = {"open": "Open", "learning": "Learning", "solved": "Solved"}
 # Settings that have columns of their own.
 _BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env=\w+| \(learning\)")
@@ -42,10 +42,10 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
     reference: the folder of the tables.
 
   Returns:
-    The pages.
+    The paths of the pages.
 
   Raises:
-    ConfigError: a page or a table is missing, or a page has no place for its table.
+    ConfigError: a page or a table is missing, or a page lacks the comments around its table.
   """
   try:
     rows = {
@@ -64,13 +64,13 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
 
 
 def _entries(name: str, rows: Mapping[str, Sequence[Row]]) -> list[Entry]:
-  """The tasks of a page: those of its tables, and those of its suite that no table has."""
+  """Returns the tasks of a page: those of its tables, and those of its suite that no table has."""
   pages = {row["task"]: page for page, found in rows.items() for row in found}
   return [entry for entry in entries().values() if pages.get(entry.task, entry.suite.replace("_", "-")) == name]
 
 
 def _rewrite(path: Path, begin: str, end: str, content: Sequence[Block] | str) -> Path:
-  """Writes a page with other content between two comments; returns its path."""
+  """Replaces the content of a page between two comments; returns the page's path."""
   before, found, rest = path.read_text(encoding="utf-8").partition(begin)
   _, closed, after = rest.partition(end)
   if not found or not closed:
@@ -81,7 +81,7 @@ def _rewrite(path: Path, begin: str, end: str, content: Sequence[Block] | str) -
 
 
 def _grid(suite: str) -> str:
-  """A table of loops, with each task's name, status, best return and robot; docs/gallery.js filters by these lines."""
+  """Returns a table of animations with each task's name, status, best return and robot, by which gallery.js filters."""
   cells = []
   for task, entry in entries().items():
     if entry.suite == suite:
@@ -94,7 +94,7 @@ def _grid(suite: str) -> str:
 
 
 def _blocks(rows: Sequence[Row]) -> Iterator[Block]:
-  """A table for each status; runs that differ only in seed or repetition share a row."""
+  """Yields a table for each status; runs that differ only in seed or repetition share a row."""
   known = entries()
   for status, title in _TITLES.items():
     groups: dict[tuple[str, ...], list[Row]] = {}
@@ -109,7 +109,7 @@ def _blocks(rows: Sequence[Row]) -> Iterator[Block]:
 
 
 def _run(row: Row) -> tuple[str, str, str]:
-  """Who and what trained, the backend, and millions of steps."""
+  """Returns a run's agent and setting (or the other package), the backend, and millions of steps."""
   if (who := row["who"]) != "ours":
     return who, row["backend"], _millions(row)
   setting = " ".join(_BUDGET.sub("", f"{row['agent']} {row.get('setting', '')}").split())
@@ -131,7 +131,7 @@ def _cells(key: tuple[str, ...], runs: Sequence[Row]) -> list[str]:
 
 
 def _figure(row: Row) -> str:
-  """The share of successes, the turns of a cube or the falls an episode; "" where the run logged none."""
+  """Returns the fraction of successes, the turns of a cube or the falls an episode; "" if the run logged none."""
   if row.get("success"):
     return f"success {float(row['success']):.2f}"
   if row.get("turns"):

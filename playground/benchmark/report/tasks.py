@@ -1,4 +1,4 @@
-"""A row for each task: its best run, beside the best public ones at equal steps."""
+"""Builds a table of a suite's tasks: each task's best run, beside the best public ones at equal steps."""
 
 import re
 from collections.abc import Sequence
@@ -14,9 +14,9 @@ Row = dict[str, str]
 
 
 def best_runs(rows: Sequence[Row], task: str) -> list[Row]:
-  """Our runs of a task with the agent, setting, backend and steps that have the highest mean return at their end.
+  """Returns our runs of a task with the agent, setting, backend and steps of the highest mean final return.
 
-  A chain counts only where there is nothing else, then by its last stage.
+  A chain counts only if the task has no other run, then by its last stage.
   """
   ours = [row for row in rows if row["task"] == task and row["who"] == "ours"]
   single = [row for row in ours if "chain" not in row.get("experiment", "")] or ours[-1:]
@@ -27,16 +27,16 @@ def best_runs(rows: Sequence[Row], task: str) -> list[Row]:
 
 
 def by_mode(row: Row) -> bool:
-  """Whether a run's `final_return` is of the policy's mode, not of sampled actions."""
+  """Returns whether a run's `final_return` is of the policy's mode, not of sampled actions."""
   return row["agent"] in _BY_MODE or "deterministic_eval=true" in row.get("setting", "")
 
 
 def table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
-  """The tasks of a suite in the order of the catalogue.
+  """Builds the table of a suite's tasks, in the order of the catalogue.
 
   Args:
-    entries: of the tasks.
-    rows: of their runs, from results/reference.
+    entries: catalogue entries of the tasks.
+    rows: rows of the tasks' runs, from results/reference.
   """
   cells = []
   for entry in entries:
@@ -61,7 +61,7 @@ def _returns(runs: Sequence[Row], column: str) -> list[float]:
 
 
 def _with_ci(runs: Sequence[Row], column: str) -> str:
-  """The mean over runs and, of several, half the width of its 95 % confidence interval; "" if it was not measured."""
+  """Formats the mean over runs, for several with half its 95 % confidence interval; "" if it was not measured."""
   values = _returns(runs, column)
   if not values:
     return ""
@@ -70,7 +70,7 @@ def _with_ci(runs: Sequence[Row], column: str) -> str:
 
 
 def _name(row: Row) -> str:
-  """The agent, and what else a reader must know to read the return."""
+  """Returns the agent, with the stage of a chain and a note on pushes and randomisation switched off."""
   pushed = "events.push.enabled=false" in row.get("setting", "")
   stage = re.search(r"stage[ =](\w+)", row.get("setting", "")) if "chain" in row.get("experiment", "") else None
   chain = f", {row['experiment']}'s {stage.group(1)}" if stage else ""
@@ -78,9 +78,9 @@ def _name(row: Row) -> str:
 
 
 def _public(task: str, steps: float, ppo_only: bool) -> str:
-  """The best public return after as many steps, and whose: of curves that ended before their end.
+  """Returns the best public return at equal steps, and its algorithm; a curve that ended earlier counts by its end.
 
-  Where all begin later it is the best of their first points, with its steps.
+  If all curves begin later, the result is the best of the earliest first points, with its steps.
   """
   curves = [curve for curve in public_curves().get(task, ()) if is_ppo(curve) or not ppo_only]
   named = lambda curve: f"{re.split(r'[ ,(]', curve.label)[0]}, {curve.actions}"
