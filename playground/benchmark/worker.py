@@ -24,6 +24,7 @@ class Rows(dict[str, object]):
   lock: str | None = None
 
   def emit(self, quantity: str, value: float, unit: str, **columns: object) -> None:
+    """Prints a row of the shared columns, a quantity of `schema.QUANTITIES` and further columns."""
     row = {"quantity": quantity, "value": float(f"{value:.6g}"), "unit": unit, **self, **columns}
     print("\n" + ROW + json.dumps(row), flush=True)  # a library may have left a line unfinished
 

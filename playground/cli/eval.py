@@ -27,7 +27,7 @@ def evaluate_run(
   video: str | None = None,
   camera: str | None = None,
 ) -> int:
-  """Evaluates a run's newest checkpoint, or the one given, prints the scores and writes them beside the run.
+  """Evaluates a run's newest checkpoint, or the one at `path`, prints the scores and writes them beside the run.
 
   Args:
     path: a run directory, or one of its checkpoints.

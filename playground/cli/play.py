@@ -199,7 +199,7 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
 
 
 def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
-  """Returns the checkpoints of the run at or above `given`; of a chain, those of all stages."""
+  """Returns the checkpoints of the run at or above `given`, or of all stages of a chain."""
   run = trained.run_dir.path
   return Menu(given if given == run.parent else run, trained, lambda said: console.print(said, soft_wrap=True))
 

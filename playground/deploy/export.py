@@ -24,7 +24,7 @@ class ParityError(PlaygroundError):
 
 
 def export_run(path: str, *, out: str | None = None, console: Console | None = None) -> int:
-  """Exports a run's newest checkpoint, or the one given.
+  """Exports a run's newest checkpoint, or the one at `path`.
 
   The exported policy must return the trained policy's actions on 1000 observations in C MuJoCo.
 

@@ -40,7 +40,7 @@ def _swish(graph: Chain) -> None:
 
 
 def _gelu(graph: Chain) -> None:
-  """GELU as in Flax, with tanh: x / 2 * (1 + tanh(sqrt(2 / pi) * (x + 0.044715 x^3)))."""
+  """Applies GELU as in Flax, with tanh: x / 2 * (1 + tanh(sqrt(2 / pi) * (x + 0.044715 x^3)))."""
   x = graph.value
   graph.apply("Pow", graph.constant(3.0))
   graph.apply("Mul", graph.constant(0.044715))

@@ -64,7 +64,7 @@ class Session:
     self.players = self.players[:number] + [first.copy(self._seed + i) for i in range(have, number)]
 
   def set_command(self, command: np.ndarray | None) -> None:
-    """Commands all environments, see `Player.command`."""
+    """Sets the command of all environments, see `Player.command`."""
     for player in self.players:
       player.command = command
 

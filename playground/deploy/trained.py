@@ -25,7 +25,7 @@ _EXACT = "highest"  # precision of matrix products, as in the exported policy
 
 
 def load_exact(path: str | Path) -> LoadedPolicy:
-  """Reads a run's newest checkpoint, or the one given, with its task on C MuJoCo, on the CPU.
+  """Reads a run's newest checkpoint, or the one at `path`, with its task on C MuJoCo, on the CPU.
 
   Raises:
     PlaygroundError: no such run or checkpoint, or one that does not fit.

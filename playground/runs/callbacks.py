@@ -211,7 +211,7 @@ class RunCallbacks:
     )
 
   def _advance_trace(self, metrics: Metrics) -> None:
-    """With `profile.enable`, traces training between the first two trained rows."""
+    """Traces training between the first two trained rows, with `profile.enable`."""
     if self._trace == "on":
       jax.profiler.stop_trace()
       self._trace = "off"

@@ -20,7 +20,7 @@ class Interrupted(BaseException):
 
 @contextlib.contextmanager
 def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-  """Context in which `handle` gets SIGINT, SIGTERM and (unless `nohup` ignores it) SIGHUP; main thread only."""
+  """Handles SIGINT, SIGTERM and (unless `nohup` ignores it) SIGHUP by `handle` in the block; main thread only."""
 
   def hang_up(signum: int, frame: FrameType | None) -> None:
     _leave_terminal()
@@ -39,14 +39,14 @@ def on_signals(handle: Callable[[int, FrameType | None], object]) -> Iterator[No
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[threading.Event]:
-  """Context with an event that the signals of `on_signals` set, for callbacks of C code, which swallow exceptions."""
+  """Yields an event that the signals of `on_signals` set, for callbacks of C code, which swallow exceptions."""
   received = threading.Event()
   with on_signals(lambda *_: received.set()):
     yield received
 
 
 class Interrupts:
-  """Context that turns the first signal into a flag while `saving` is on, and into `Interrupted` otherwise."""
+  """Turns the first signal into a flag while `saving` is on, and into `Interrupted` otherwise."""
 
   def __init__(self) -> None:
     self.signum: int | None = None

@@ -68,7 +68,7 @@ def load_policy(
   platform: Platform | None = None,
   precision: str | None = None,
 ) -> LoadedPolicy:
-  """Reads a run's newest checkpoint, or the checkpoint given.
+  """Reads a run's newest checkpoint, or the one at `path`.
 
   Args:
     path: a run directory, one of its checkpoints, or `pretrained:<task>`.

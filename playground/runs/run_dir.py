@@ -122,14 +122,17 @@ class RunDirectory:
 
   @property
   def manifest(self) -> dict[str, Plain]:
+    """The content of manifest.json, see `write_manifest`; empty without one."""
     return read_json(self.path / "manifest.json", earlier_starts=list, git=(dict, NoneType), timings=dict)
 
   @property
   def status(self) -> dict[str, Plain]:
+    """The content of status.json, see `set_status`; empty without one."""
     return read_json(self.path / "status.json", status=str, reason=str, started=str)
 
   @property
   def summary(self) -> dict[str, Plain]:
+    """The run's result from summary.json; empty without one."""
     numbers = dict.fromkeys(_NUMBERS_OF_SUMMARY, (int, float, NoneType))
     return read_json(self.path / "summary.json", status=str, **numbers)
 

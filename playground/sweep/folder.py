@@ -121,6 +121,7 @@ class JobFolder:
 
   @property
   def record(self) -> dict[str, Plain]:
+    """The content of job.json; empty without one."""
     optional = (str, NoneType)
     kinds = {"status": str, "reason": str, "attempt": int, "started": optional, "ended": optional, "where": str}
     return read_json(self.record_path, **kinds)
@@ -161,7 +162,7 @@ class JobFolder:
       yield lock
 
   def locked(self) -> bool:
-    """Whether a process runs the job, on this machine or on another that shares the folder."""
+    """Returns whether a process runs the job, on this machine or on another that shares the folder."""
     return is_locked(self.path / "job.lock")
 
   def progress(self) -> tuple[int | None, float | None]:
@@ -235,7 +236,7 @@ class SweepDirectory:
 
   @property
   def group(self) -> str:
-    """The group of its runs in W&B."""
+    """The group of the sweep's runs in W&B."""
     return f"{self.name}/{self.path.resolve().name}"
 
   @property
@@ -244,10 +245,11 @@ class SweepDirectory:
     return self.path / STOP_FILE
 
   def folder(self, job: Job) -> JobFolder:
+    """Returns the folder of a job, `<sweep>/jobs/<job>`."""
     return JobFolder(self.path / "jobs" / job.name)
 
   def states(self) -> dict[str, JobState]:
-    """The state of every job, by name."""
+    """Returns the state of every job, by name."""
     return {job.name: self.folder(job).state() for job in self.jobs}
 
   def add(self, job: Job) -> None:

@@ -59,7 +59,7 @@ class Launcher(Protocol):
     ...
 
   def busy(self, job: Job) -> bool:
-    """Whether the job is queued or running, as far as this launcher knows."""
+    """Returns whether the job is queued or running, as far as this launcher knows."""
     ...
 
   def kill(self) -> None:
@@ -149,7 +149,7 @@ class Runner:
     self._stopping = False
 
   def run(self) -> int:
-    """Returns the exit code; see `run_sweep`."""
+    """Runs the jobs and returns the exit code; see `run_sweep`."""
     sweep, launcher, view = self._sweep, self._launcher, self._view
     sweep.stop_file.unlink(missing_ok=True)
     self._states = sweep.states()

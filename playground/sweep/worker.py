@@ -176,7 +176,7 @@ class Worker:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-  """`python -m playground.sweep.worker <job folder>... [options] [-- command]`."""
+  """Runs `python -m playground.sweep.worker <job folder>... [options] [-- command]`."""
   parser = argparse.ArgumentParser(prog="playground.sweep.worker")
   parser.add_argument("folders", type=Path, nargs="+")
   parser.add_argument("--timeout", type=float)
