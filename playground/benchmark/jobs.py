@@ -156,7 +156,8 @@ def run_jobs(measurements: Sequence[Measurement], table: Table, machine: Mapping
   """Runs the measurements that the table lacks.
 
   Returns:
-    0 when the table is complete, 1 after a failure, 3 if the time was up, 130 or 143 when interrupted.
+    0 when the table is complete, 1 after a failure, 3 if the time was up, 128 plus the signal's number when
+    interrupted.
   """
   todo = [left for each in measurements if (left := each if plan.rerun else each.left(table, machine["device"]))]
   if len(todo) < len(measurements):

@@ -18,6 +18,9 @@ def main() -> None:
   signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # SystemExit ends the child processes
   try:
     code = _main(sys.argv[1:])
+  except BrokenPipeError:  # `playground-bench --help | head`
+    sys.stderr.close()
+    code = 0
   except (PlaygroundError, OSError) as error:
     print(one_sentence(error), file=sys.stderr)
     code = 2

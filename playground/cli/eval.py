@@ -56,7 +56,8 @@ def evaluate_run(
   drawn = drawn_model(env, run.video.visuals)
   need_camera(drawn, camera, "--camera")
   _, model = model_sampler(env, run, 1, count)(run.seed)
-  act = lambda policy, obs, key: trained.trainer.act(policy, obs, key, deterministic or None)
+  deterministic = deterministic or run.agent.deterministic_eval
+  act = lambda policy, obs, key: trained.trainer.act(policy, obs, key, deterministic)
   evaluate = make_evaluator(with_gait_metrics(env), act, count, hardware.mesh, 1 if film else 0)
   scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model, {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}

@@ -46,7 +46,7 @@ _COMPLETION = re.compile("(install|uninstall|query)=(bash|fish|zsh)")
 
 
 def main() -> None:
-  """Runs the command and exits: 0 done, 2 for errors that the user can act on, 130 or 143 when interrupted."""
+  """Runs the command and exits: 0 done, 2 an error that the user can act on, 128 plus a signal's number after it."""
   withhold_gl()
   os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # any other error is a bug: show the traceback
   try:

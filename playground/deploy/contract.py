@@ -114,8 +114,9 @@ def check_contract(contract: Contract) -> None:
   if told is not None:
     _check(contract, "command.max", ends, "three numbers")
     _check(contract, "command.min", lambda x: x is None or ends(x), "three numbers or null", optional=True)
-    if any(low > high for low, high in zip(told.get("min") or [], told["max"], strict=False)) or min(told["max"]) <= 0:
-      raise CheckpointError(f"command={format_value(told)} must have its minimum below its maximum.")
+    low = told.get("min") or [-high for high in told["max"]]
+    if any(least > most for least, most in zip(low, told["max"], strict=True)):
+      raise CheckpointError(f"command={format_value(told)} must not have its minimum above its maximum.")
 
 
 def _check(

@@ -80,9 +80,9 @@ class Vectorize(Wrapper):
 
 
 class FiniteGuard(Wrapper):
-  """Ends an episode whose numbers went NaN, infinite or absurd, before they reach anything that learns.
+  """Ends an episode whose numbers went NaN, infinite or too large, before they reach anything that learns.
 
-  Absurd is beyond `MAX_VALUE`, or `MAX_VELOCITY` in `qvel`: a simulation that comes apart holds finite values for some
+  Too large is beyond `MAX_VALUE`, or `MAX_VELOCITY` in `qvel`: a diverging simulation holds finite values for some
   steps, which ruin observation statistics and the critic as surely as a NaN would.
 
   Such a step gives done = 1, reward 0, the previous observation, metrics 0 and the previous info; `info["nonfinite"]`

@@ -43,7 +43,8 @@ def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explo
     explore: keys of the settings that the agents of a population copy and perturb.
 
   Returns:
-    The exit code: 0 when all are finished, 130 or 143 when interrupted (and saved), 2 where a run failed.
+    The exit code: 0 when all are finished, 2 where a run failed, 128 plus the signal's number when interrupted
+    (and saved).
 
   Raises:
     PlaygroundError: an error that concerns all runs.

@@ -50,7 +50,7 @@ def train(config: RunConfig) -> int:
   """Runs the training that `config` describes, a single run or a chain of them.
 
   Returns:
-    The exit code: 0 when finished, 130 or 143 when interrupted (and saved).
+    The exit code: 0 when finished, 128 plus the signal's number when interrupted (and saved).
 
   Raises:
     PlaygroundError: an error that the user can act on; the run directory, if made already, records it.

@@ -98,7 +98,7 @@ def run_sweep(
     console: for the output.
 
   Returns:
-    The number of failed jobs, 100 at most, or 130 or 143 when interrupted.
+    The number of failed jobs, 100 at most, or 128 plus the signal's number when interrupted.
 
   Raises:
     PlaygroundError: the settings are invalid here, or another process runs the sweep.

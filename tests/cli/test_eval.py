@@ -102,10 +102,18 @@ def test_the_mode_of_the_policy_is_another_score(command: Command, trained: Path
   for flags in ([], ["--deterministic"], ["--deterministic"]):
     assert command(str(trained), "--seed", "5", *flags) == 0
     written = report(trained, 4000, 5, "_deterministic" if flags else "")
-    assert written["deterministic"] == bool(flags)
+    assert written["deterministic"] == bool(flags), "the task's agent samples by default"
     scores.append(written["scores"]["episode_reward"])
   assert scores[0] != scores[1] == scores[2]
   assert report(trained, 4000, seed=5)["scores"]["episode_reward"] == scores[0], "the sampled one is kept"
+
+
+def test_a_run_may_be_evaluated_by_the_mode_by_default(command: Command, trained: Path, tmp_path: Path) -> None:
+  run = shutil.copytree(trained, tmp_path / "run", symlinks=True)
+  config = run / "config.yaml"
+  config.write_text(config.read_text().replace("deterministic_eval: false", "deterministic_eval: true"))
+  assert command(str(run), "--seed", "5") == 0
+  assert report(run, 4000, 5, "_deterministic")["deterministic"]
 
 
 @pytest.mark.parametrize("missing", ["gone", "empty", "run/checkpoints/000000000001"])

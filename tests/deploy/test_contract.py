@@ -10,6 +10,7 @@ import yaml
 from playground import registry
 from playground.deploy.contract import check_contract, describe_policy
 from playground.envs.base import State
+from playground.errors import CheckpointError
 from playground.files import plain
 from playground.mdp.terms import registered
 from playground.text import first_docstring_line
@@ -63,6 +64,17 @@ def test_a_joystick_policy() -> None:
   assert [row["joint"] for row in said["actuators"]] == said["joints"][1:]
   assert said["command"]["max"] == [1.5, 0.8, 1.2] and "gait" not in said
   check_contract(said | {"origin": {"steps": 1, "evaluation": {}}})
+
+
+def test_a_command_may_leave_an_axis_out() -> None:
+  config = registry.config("H1InplaceGaitTracking")
+  size = registry.build(config).observation_size
+  said = contract("H1InplaceGaitTracking", size["state"][0] if isinstance(size, dict) else size)
+  assert said["command"]["max"] == [0, 0, 0]
+  check_contract(said | {"origin": {"steps": 1, "evaluation": {}}})
+  said["command"] = {"max": [1, 0, 1], "min": [0, 0.1, -1]}
+  with pytest.raises(CheckpointError, match="must not have its minimum above its maximum"):
+    check_contract(said | {"origin": {"steps": 1, "evaluation": {}}})
 
 
 def test_frames_and_a_gait() -> None:

@@ -60,8 +60,10 @@ def used_memory(rows: Rows, seed: int | None = None) -> Iterator[None]:
   watcher = threading.Thread(target=watch, daemon=True)
   if before == before:
     watcher.start()
-  yield
-  ended.set()
+  try:
+    yield
+  finally:
+    ended.set()
   if before == before:
     watcher.join()
     rows.emit("used_memory_gib", (most - before) / 1024, "GiB", seed=seed)

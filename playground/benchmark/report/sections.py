@@ -341,7 +341,7 @@ def _named(figure: Figure, *varied: str) -> str:
 
 
 def _with_ci(figure: Figure) -> str:
-  digits = 0 if figure.mean >= 1000 else 1
+  digits = 0 if abs(figure.mean) >= 1000 else 1
   return f"{figure.mean:,.{digits}f}" + ("" if figure.ci95 is None else f" ± {figure.ci95:,.{digits}f}")
 
 
