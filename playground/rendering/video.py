@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 MAX_FPS = 50.0
 _TRIES = 100
+_REMEDY = "; `playground doctor` shows what rendering needs."
+# Agents of one program ask for videos at once; a renderer takes a core and 0.7 GB (measured with EGL on a CPU).
+_RENDERERS = threading.BoundedSemaphore(min(4, os.cpu_count() or 1))
 # Names of cameras with the best view of a task; the swimmer's is tracking1.
 _CAMERAS = ("track", "tracking", "tracking1", "fixed", "side", "front", "back", "cam0")
 
@@ -71,13 +74,24 @@ def render_video(
     `out_path`, or None if rendering failed.
   """
   out_path = Path(out_path).absolute()
-  backend = find_gl()
-  if backend is None:
-    notify(f"No video at {out_path.name}. {NO_GL_REMEDY}")
-    return None
-  timeout_s = timeout_s or 60.0 + 0.5 * len(qpos)
   view = {"camera": camera, "width": width, "height": height, "seen": seen}
-  trajectory = _pack(mj_model, qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat, dt=dt, **view)
+  with _RENDERERS:
+    try:
+      if (backend := find_gl()) is None:
+        failure = f". {NO_GL_REMEDY}"
+      else:
+        trajectory = _pack(mj_model, qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat, dt=dt, **view)
+        failure = _render_in_child(backend, trajectory, out_path, timeout_s or 60.0 + 0.5 * len(qpos))
+    except OSError as error:  # no memory or no process left for the renderer, or no folder for its files
+      failure = f": the renderer could not be started ({error.strerror or error}){_REMEDY}"
+  if failure is None:
+    return out_path
+  notify(f"No video at {out_path.name}{failure}")
+  return None
+
+
+def _render_in_child(backend: str, trajectory: bytes, out_path: Path, timeout_s: float) -> str | None:
+  """Renders a packed trajectory; returns the end of a sentence about a failure, else None."""
   environment = gl_environment(backend) | {
     # The child imports this package, from any working directory.
     "PYTHONPATH": os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH")))),
@@ -108,10 +122,7 @@ def render_video(
     os.close(theirs)
     os.close(ours)
     shutil.rmtree(scratch, ignore_errors=True)
-  if child.returncode == 0:
-    return out_path
-  notify(f"No video at {out_path.name}: {reason}; `playground doctor` shows what rendering needs.")
-  return None
+  return None if child.returncode == 0 else f": {reason}{_REMEDY}"
 
 
 def need_place(video: str | None, camera: str | None = None) -> Path | None:

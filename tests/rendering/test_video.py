@@ -1,9 +1,11 @@
 import contextlib
+import errno
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +180,36 @@ def test_a_crash_of_the_renderer_does_not_reach_the_run(monkeypatch: pytest.Monk
   said: list[str] = []
   assert render_video(model, path_of_ball(model, 3), tmp_path / "a.mp4", dt=0.02, notify=said.append) is None
   assert len(said) == 1 and "bogus" in said[0]
+
+
+def test_a_renderer_that_cannot_be_started_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: Any):
+  def refuse(*_: Any, **__: Any) -> None:
+    raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+  monkeypatch.setattr(video, "find_gl", lambda: "egl")
+  monkeypatch.setattr(video.subprocess, "Popen", refuse)
+  said: list[str] = []
+  assert render_video(model, path_of_ball(model, 3), tmp_path / "a.mp4", dt=0.02, notify=said.append) is None
+  sentence = "No video at a.mp4: the renderer could not be started (Resource temporarily unavailable)"
+  assert len(said) == 1 and said[0].startswith(sentence)
+
+
+def test_few_renderers_work_at_a_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: Any):
+  """Each takes 0.7 GB, and all agents of a program may ask for a video at once."""
+  working, most = [0], [0]
+
+  def render(*_: Any) -> None:
+    working[0] += 1
+    most[0] = max(most[0], working[0])
+    time.sleep(0.1)
+    working[0] -= 1
+
+  monkeypatch.setattr(video, "find_gl", lambda: "egl")
+  monkeypatch.setattr(video, "_render_in_child", render)
+  with ThreadPoolExecutor(8) as agents:
+    made = agents.map(lambda i: render_video(model, path_of_ball(model, 3), tmp_path / f"{i}.mp4", dt=0.02), range(8))
+  assert list(made) == [tmp_path / f"{i}.mp4" for i in range(8)]
+  assert most[0] <= 4
 
 
 def test_the_renderer_dies_with_a_run_that_is_killed(tmp_path: Path, needs_gl: str):
