@@ -64,8 +64,10 @@ class RunCallbacks:
     self._store = CheckpointStore(run_dir.checkpoints, config.checkpoint.keep, continued)
     self._videos = ThreadPoolExecutor(1, thread_name_prefix="video")
     self._video: Future[Path | None] | None = None
+    self._filmed: int | None = None  # step of the newest video
     self._earlier_s = plan.wall_clock_s
     self._began = time.perf_counter()
+    self._trained_s = 0.0  # the run's time when training ended
     self._process_began_s = plan.began_s
     self._evaluations = 0
     self._step = plan.step or 0
@@ -120,17 +122,20 @@ class RunCallbacks:
   def should_stop(self) -> bool:
     return self._interrupts.signum is not None
 
-  def finish(self, loop: Loop, state: TrainState, completed: bool) -> None:
-    """Waits for pending writes, and writes the run's result."""
+  def end_training(self) -> None:
+    """Waits for pending checkpoints, takes the run's time and starts the last video, for which `finish` waits."""
     self._progress.phase("saving")
     self._store.close()
+    self._trained_s = self.wall_clock_s
     wanted = self._config.video.enable and self._config.video.at_end and not self.should_stop()
-    if wanted and self._recording is not None:
-      self._progress.phase("rendering the video")
+    if wanted and self._recording is not None and self._filmed != self._step:
       self._start_video(self._step, self._recording)
+
+  def finish(self, loop: Loop, state: TrainState, completed: bool) -> None:
+    """Waits for the video, and writes the run's result; call `end_training` first."""
     policy = self._trainer.policy(state)
-    wall_clock_s = self.wall_clock_s
     if self._video:
+      self._progress.phase("rendering the video")
       self._video.result()
     plot_learning_curve(self._run_dir.metrics_csv, self._run_dir.plots)
     self.close("finished" if completed else "preempted")
@@ -153,7 +158,7 @@ class RunCallbacks:
         "status": "finished" if completed else "preempted",
         "env": self._config.choices["env"],
         **self._scores(),
-        "wall_clock_s": wall_clock_s,
+        "wall_clock_s": self._trained_s,
         "params_sha256": checksum([np.asarray(x) for x in jax.device_get(jax.tree.leaves(policy))]),
       }
     )
@@ -198,6 +203,7 @@ class RunCallbacks:
   def _start_video(self, step: int, recording: Recording) -> None:
     """Renders the first recorded episodes in a child process while training continues."""
     view = self._config.video
+    self._filmed = step
     self._video = self._videos.submit(
       render_video,
       self._drawn,

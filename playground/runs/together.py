@@ -110,6 +110,8 @@ def _train_group(
     loop = Loop(training.trainer, program, training.events, [config.seed for config in configs], members, population)
     state, completed = training.run(loop, plans, interrupts)
     state = jax.device_get(state)
+    for member in members:  # all first: no run's time has another's video in it, and videos are rendered side by side
+      member.end_training()
     for i, member in enumerate(members):
       member.finish(loop, training.trainer.agent(state, i), completed)
   for member in members:
@@ -179,6 +181,10 @@ class Member:
 
   def should_stop(self) -> bool:
     return self._interrupts.signum is not None or self.error is not None
+
+  def end_training(self) -> None:
+    """See `RunCallbacks.end_training`."""
+    self._do(lambda callbacks: callbacks.end_training())
 
   def finish(self, loop: Loop, state: TrainState, completed: bool) -> None:
     """See `RunCallbacks.finish`."""

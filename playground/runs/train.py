@@ -202,6 +202,7 @@ def _train_locked(
       progress.phase("training")
       loop = Loop(training.trainer, program, training.events, [config.seed], [callbacks])
       state, completed = training.run(loop, [plan], interrupts)
+      callbacks.end_training()
       callbacks.finish(loop, state, completed)
   say_where(run_dir)
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)

@@ -3,10 +3,13 @@
 import errno
 import itertools
 import shutil
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -97,6 +100,46 @@ def test_what_ends_one_lets_the_others_go_on(
   assert resume(runs["b"].path) == 0
   assert runs["b"].summary["steps"] == runs["a"].summary["steps"]
   assert train_together(resumed(tmp_path, *AGENTS)) == 0, "the finished ones have nothing left to do"
+
+
+@pytest.mark.slow
+def test_each_agent_has_its_own_videos(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  """Each step once, those of the end side by side; no agent's time has the videos of another in it."""
+  made: list[Path] = []
+  ends = threading.Barrier(len(AGENTS), timeout=60)
+
+  def render(*_: Any, out_path: Path, notify: Callable[[str], None], qpos: np.ndarray, **__: Any) -> None:
+    made.append(out_path)
+    if int(out_path.stem.removeprefix("step_")) >= STEPS:
+      ends.wait()  # passes only if the videos of all agents are asked for before one is waited for
+      time.sleep(1.0)
+    notify(f"No video at {out_path.name}: {len(qpos)} states.") if out_path.parents[1].name == "b" else None
+
+  monkeypatch.setattr("playground.runs.callbacks.render_video", render)
+  filmed = [compose([*BUDGET, *own, "video.enable=true", "video.every_evals=2", f"run_dir={tmp_path / name}"])
+            for name, own in AGENTS.items()]  # fmt: skip
+  assert train_together(filmed) == 0
+  runs = {name: RunDirectory(tmp_path / name) for name in AGENTS}
+  last = runs["a"].summary["steps"]
+  steps = [960, last]  # after the second of three evaluations, and at the end
+  assert sorted(made) == sorted(run.videos / f"step_{step:012d}.mp4" for run in runs.values() for step in steps)
+  out = capsys.readouterr().out
+  assert out.count("b: No video at") == 2 and "a: No video" not in out and "c: No video" not in out
+  assert [run.status["status"] for run in runs.values()] == ["finished"] * 3
+  for run in runs.values():
+    trained = pd.read_csv(run.metrics_csv)["time/wall_clock_s"].to_numpy()[-1]
+    assert run.summary["wall_clock_s"] < trained + 1.0
+
+
+@pytest.mark.slow
+def test_what_is_filmed_already_is_not_filmed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  made: list[Path] = []
+  monkeypatch.setattr("playground.runs.callbacks.render_video", lambda *_, out_path, **__: made.append(out_path))
+  videos = ["video.enable=true", "video.every_evals=1"]
+  assert train(compose([*BUDGET, *videos, f"run_dir={tmp_path / 'run'}"])) == 0
+  assert len(made) == len(set(made)) == 3
 
 
 @pytest.mark.slow
