@@ -92,7 +92,8 @@ class Worker:
       self._write_all("running")
       code, why = self._watch(self._child)
       for folder in self._records:
-        self._write(folder, *self._outcome(folder, code, why))
+        with contextlib.suppress(OSError):  # a full disk; the others still get their record
+          self._write(folder, *self._outcome(folder, code, why))
     return code
 
   def interrupt(self, reason: str) -> None:
@@ -172,7 +173,11 @@ class Worker:
       return "killed", f"killed by {name}{', perhaps for want of memory' if code == -signal.SIGKILL else ''}"
     if run.get("status") == "failed" and run.get("reason"):
       return "failed", run["reason"]
-    return "failed", f"exit code {code}: {_last_line(next(iter(self._records)).log)}"
+    lines = _lines(next(iter(self._records)).log)
+    own = f"{folder.path.name} failed: "
+    if said := [line.removeprefix(own) for line in lines if line.startswith(own)]:  # of one run among several
+      return "failed", said[-1]
+    return "failed", f"exit code {code}: {lines[-1] if lines else 'no output'}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -212,10 +217,15 @@ def _signal(child: "subprocess.Popen[bytes]", signum: int, group: bool) -> None:
       child.send_signal(signum)
 
 
-def _last_line(log: Path) -> str:
-  """Returns the last line of a job's log, which usually is the error."""
-  lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-  return (lines or ["no output"])[-1][:300]
+def _lines(log: Path) -> list[str]:
+  """Returns the lines of a job's log since its last start; the last is mostly an error. A removed log has none."""
+  try:
+    text = log.read_text(encoding="utf-8", errors="replace")
+  except OSError:
+    return []
+  lines = [line.strip()[:300] for line in text.splitlines() if line.strip()]
+  starts = [i for i, line in enumerate(lines) if line.startswith("--- start ")]
+  return lines[starts[-1] + 1 :] if starts else lines
 
 
 if __name__ == "__main__":

@@ -107,6 +107,33 @@ def test_one_process_does_the_jobs_of_a_group(tmp_path: Path) -> None:
   assert list(pd.read_csv(sweep.path / "sweep.csv")["final_return"]) == [2.0, 3.0]
 
 
+LOST = f"""
+import itertools, pathlib, shutil, subprocess, sys
+runs = [list(run) for apart, run in itertools.groupby(sys.argv[1:], "--".__eq__) if not apart]
+for run in runs:
+  folder = pathlib.Path(run[-1].partition("=")[2].strip("'"))
+  if folder.name == {{lost!r}}:
+    shutil.rmtree(folder)
+    print(f"{{{{folder.name}}}} failed: {{{{folder}}}} cannot be written.", flush=True)
+  else:
+    subprocess.run([*{STUB!r}, *run], check=True)
+print("video       none")
+sys.exit(2)
+"""
+
+
+@pytest.mark.parametrize("lost", ["000", "001"])
+def test_a_removed_folder_costs_the_others_nothing(tmp_path: Path, lost: str) -> None:
+  """That of the first job has the log of the group."""
+  sweep = make(tmp_path / "sweep", "seed=1", "seed=2", "seed=3")
+  assert run(sweep, "launcher=together", command=(sys.executable, "-c", LOST.format(lost=lost))) == 1
+  records = {job.name: sweep.folder(job).record for job in sweep.jobs}
+  expected = {"000": "finished", "001": "finished", "002": "finished", lost: "failed"}
+  assert {name: record["status"] for name, record in records.items()} == expected
+  said = "exit code 2: no output" if lost == "000" else f"{sweep.path / 'jobs' / lost} cannot be written."
+  assert records[lost]["reason"] == said
+
+
 @pytest.mark.slow
 def test_a_sweep_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   sweep = ["-m", *TASK, "agent.num_timesteps=200", "seed=1,2", "launcher=together", f"sweep_dir={tmp_path / 'sweep'}"]
