@@ -12,12 +12,15 @@ from playground.settings import settings
 if TYPE_CHECKING:
   from playground.config import RunConfig
 
+KEEP = 3  # a run may have saved a step while another still writes the one before, so that its newest is older still
+
 
 def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: Sequence[str]) -> Population | None:
   """Returns the population of the runs, None where `exploit_every` is 0.
 
   Raises:
-    ConfigError: there is only one run, or the runs differ in program or task, so that returns are not comparable.
+    ConfigError: there is only one run, the runs differ in program or task, so that returns are not comparable, or they
+      keep fewer than `KEEP` checkpoints.
     UnknownNameError: a key of `explore` is not one of the agent's numbers that are arguments of the program.
   """
   if not exploit_every:
@@ -32,6 +35,11 @@ def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: S
   if any(config.resolved["env"] != configs[0].resolved["env"] for config in configs):
     raise ConfigError(
       f"launcher.exploit_every={exploit_every} compares returns, so all jobs need the same env: vary seed and agent."
+    )
+  if (keep := min(config.checkpoint.keep for config in configs)) < KEEP:
+    raise ConfigError(
+      f"checkpoint.keep={keep} must be {KEEP} or more with launcher.exploit_every: after a kill the jobs go on from a "
+      "step that all have, and their newest checkpoints may be two apart."
     )
   agent, known = configs[0].agent, [f"agent.{name}" for name in configs[0].agent.traced]
   for key in explore:

@@ -55,33 +55,55 @@ def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explo
   with Interrupts() as interrupts:
     try:
       hardware, groups = setup(configs[0].hardware), _groups(configs, population)
-      codes = [_train_group(group, interrupts, hardware, population) for group in groups if interrupts.signum is None]
+      codes = [_train_group(*group, interrupts, hardware) for group in groups if interrupts.signum is None]
     except Interrupted as interrupt:
       print(f"Interrupted by {interrupt}.")
       return exit_code(interrupt.signum)
   return exit_code(interrupts.signum) if interrupts.signum is not None and any(codes) else max(codes, default=0)
 
 
-def _groups(configs: Sequence["RunConfig"], population: Population | None) -> "list[list[RunConfig]]":
-  """Groups the unfinished runs: a population is one group, other runs are grouped by step."""
-  groups: dict[str, list[RunConfig]] = {}
-  for config in configs:
-    plan = RestorePlan.find(config)
-    if not plan.finished:
-      step = plan.checkpoints[0].name if plan.checkpoints and not population else ""
-      groups.setdefault(step, []).append(config)
-  return list(groups.values())
+def _groups(
+  configs: Sequence["RunConfig"], population: Population | None
+) -> "list[tuple[list[RunConfig], Population | None]]":
+  """Groups the unfinished runs: a population is one group, others are grouped by step and by what they start from.
+
+  A run that failed, or lost its folder, leaves a population whose other runs are too far ahead to go on with it.
+  """
+  others = [(config, plan) for config in configs if not (plan := RestorePlan.find(config)).finished]
+  members: list[RunConfig] = []
+  if population and others:
+    plans = [plan for _, plan in others]
+    apart = not _shared_steps(plans) and any(plan.checkpoints for plan in plans)
+    stays = [
+      not apart or (plan.run_dir is not None and plan.run_dir.status.get("status") != "failed") for plan in plans
+    ]
+    if sum(stays) > 1:
+      members = [config for (config, _), stay in zip(others, stays, strict=True) if stay]
+      others = [other for other, stay in zip(others, stays, strict=True) if not stay]
+  groups: dict[tuple[str, bool], list[RunConfig]] = {}
+  for config, plan in others:
+    step = plan.checkpoints[0].name if plan.checkpoints else ""
+    groups.setdefault((step, plan.weights is None), []).append(config)
+  return [(members, population)] * bool(members) + [(group, None) for group in groups.values()]
+
+
+def _shared_steps(plans: Sequence[RestorePlan]) -> set[str]:
+  """Returns the names of the checkpoints that all runs have."""
+  first, *others = ({path.name for path in plan.checkpoints} for plan in plans)
+  return first.intersection(*others)
 
 
 def _train_group(
-  configs: Sequence["RunConfig"], interrupts: Interrupts, hardware: Hardware, population: Population | None
+  configs: Sequence["RunConfig"], population: Population | None, interrupts: Interrupts, hardware: Hardware
 ) -> int:
   """Trains runs at the same step, or a population."""
   with contextlib.ExitStack() as runs:
     plans = [runs.enter_context(RestorePlan.find(config).locked(config)) for config in configs]
     if population:
-      steps = set.intersection(*({path.name for path in plan.checkpoints} for plan in plans))
+      steps = _shared_steps(plans)
       for plan in plans:
+        if plan.checkpoints and not steps:
+          plan.notices.append("No step has a checkpoint of all runs: the population starts from the beginning.")
         plan.checkpoints = [path for path in plan.checkpoints if path.name in steps]
     training = prepare(configs, plans, hardware, together=True)
     if len({plan.update for plan in plans}) > 1:

@@ -14,10 +14,11 @@ import pandas as pd
 import pytest
 
 from playground.config import RunConfig, compose
+from playground.learning.population import Population
 from playground.runs.callbacks import RunCallbacks
 from playground.runs.programs import program_of
 from playground.runs.run_dir import RunDirectory
-from playground.runs.together import Member, train_together
+from playground.runs.together import Member, _groups, train_together  # pyright: ignore[reportPrivateUsage]
 from playground.runs.train import train
 from tests.runs.helpers import TASK, resume
 
@@ -171,6 +172,43 @@ def test_a_population_goes_on_from_the_step_that_all_have(tmp_path: Path, monkey
   for run, table in zip(cut.values(), tables, strict=True):
     theirs = pd.read_csv(run.metrics_csv).filter(regex="^(?!time/)")
     pd.testing.assert_frame_equal(theirs, table.filter(regex="^(?!time/)"), check_like=True)
+
+
+POPULATION = Population(1, {}, 0)
+
+
+def saved(folder: Path, steps: list[int], status: str) -> RunConfig:
+  """A run with checkpoints of these steps, by their names alone."""
+  run = RunDirectory.create(folder, compose([*BUDGET, f"run_dir={folder}"]).resolved)
+  run.set_status(status)  # pyright: ignore[reportArgumentType]
+  for step in steps:
+    (run.checkpoints / f"{step:012d}").mkdir(parents=True)
+  return compose([f"resume={folder}"])
+
+
+@pytest.mark.parametrize("lost", ["failed", "removed"])
+def test_a_run_that_is_behind_leaves_its_population(tmp_path: Path, lost: str) -> None:
+  """The others would lose all that they trained since."""
+  ahead = [saved(tmp_path / name, [400, 500, 600], "running") for name in "ac"]
+  behind = saved(tmp_path / "b", [100], "failed")
+  if lost == "removed":
+    shutil.rmtree(tmp_path / "b")
+    behind = compose([*BUDGET, f"run_dir={tmp_path / 'b'}"])
+  groups = _groups([ahead[0], behind, ahead[1]], POPULATION)
+  assert groups == [(ahead, POPULATION), ([behind], None)]
+  still_near = [*ahead, saved(tmp_path / "d", [400], "failed")]
+  assert _groups(still_near, POPULATION) == [(still_near, POPULATION)]
+  at_first_save = [ahead[0], saved(tmp_path / "e", [], "running")]
+  assert _groups(at_first_save, POPULATION) == [(at_first_save, POPULATION)]
+
+
+def test_a_run_from_weights_is_not_joined_with_one_without(tmp_path: Path, group: Path) -> None:
+  """Both were killed before their first checkpoint."""
+  plain = saved(tmp_path / "plain", [], "running")
+  with_weights = tmp_path / "weights"
+  RunDirectory.create(with_weights, compose([*BUDGET, f"init_from={group / 'a'}", f"run_dir={with_weights}"]).resolved)
+  weights = compose([f"resume={with_weights}"])
+  assert _groups([plain, weights], None) == [([plain], None), ([weights], None)]
 
 
 @pytest.mark.parametrize(
