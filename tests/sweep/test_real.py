@@ -15,12 +15,13 @@ pytestmark = pytest.mark.slow
 
 STEPS = 800_000  # seconds of training, so that a signal finds the runs at work
 LINE = ["env=CartpoleBalance", "seed=1,2", "tuned=null", "debug=fast", "hardware=cpu", "tracking=csv"]
-LINE += [f"agent.num_timesteps={STEPS}", "agent.num_evals=5", "launcher.cores_per_job=1"]
+LINE += ["agent.num_evals=5", "launcher.cores_per_job=1"]
 
 
-def start(folder: Path, *overrides: str) -> "subprocess.Popen[str]":
-  command = [sys.executable, "-m", "playground.cli.run", "-m", *LINE, *overrides]
-  env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+def start(folder: Path, *overrides: str, steps: int = STEPS) -> "subprocess.Popen[str]":
+  command = [sys.executable, "-m", "playground.cli.run", "-m", *LINE, f"agent.num_timesteps={steps}", *overrides]
+  devices = "2" if "hardware.devices=2" in overrides else "1"
+  env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "JAX_NUM_CPU_DEVICES": devices}
   return subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
@@ -55,10 +56,22 @@ def test_interrupted_and_started_again(tmp_path: Path) -> None:
   assert any("Resuming the whole training state" in log for log in logs)  # the other may not have come to save yet
 
 
-def test_a_group_that_is_killed_loses_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+  ("steps", "own"),
+  [
+    (STEPS, []),
+    (6400, ["env.impl=warp"]),  # Warp takes 500 steps/s on a CPU
+    (STEPS // 4, ["hardware.devices=2", "launcher.exploit_every=1"]),
+  ],
+  ids=["alone", "warp", "population on two devices"],
+)
+def test_a_group_that_is_killed_loses_nothing(steps: int, own: list[str], tmp_path: Path) -> None:
+  if "env.impl=warp" in own:
+    pytest.importorskip("warp")
+
   def group(folder: Path) -> "subprocess.Popen[str]":
-    own = [f"sweep_dir={folder}", f"hardware.cache_dir={tmp_path / 'cache'}", "launcher.cores_per_job=1000"]
-    return start(tmp_path, "launcher=together", *own)
+    place = [f"sweep_dir={folder}", f"hardware.cache_dir={tmp_path / 'cache'}", "launcher.cores_per_job=1000"]
+    return start(tmp_path, "launcher=together", *own, *place, steps=steps)
 
   def saved(job: Path) -> list[int]:
     return sorted(int(path.name) for path in (job / "checkpoints").glob("*") if path.name.isdigit())
@@ -80,7 +93,9 @@ def test_a_group_that_is_killed_loses_nothing(tmp_path: Path) -> None:
 
   assert group(killed).wait(900) == 0
   for job, step in zip(jobs(), newest, strict=True):
-    # After a kill between two saves the agents stand at different steps, train apart, and end the same to rounding.
-    to = STEPS if len(set(newest)) == 1 else step
+    # After a kill between two saves the agents stand at different steps, train apart, and end the same to rounding;
+    # a population goes on from a step that all have.
+    to = steps if len(set(newest)) == 1 or "launcher.exploit_every=1" in own else step
     pd.testing.assert_frame_equal(rows(job, to), rows(whole / "jobs" / job.name, to), check_like=True)
-    assert json.loads((job / "summary.json").read_text())["steps"] == STEPS
+    assert pd.read_csv(job / "metrics.csv")["step"].is_unique
+    assert json.loads((job / "summary.json").read_text())["steps"] == steps
