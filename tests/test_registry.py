@@ -322,7 +322,7 @@ def test_every_key_is_read_and_a_step_keeps_the_states_structure(overrides: list
   after = jax.eval_shape(lambda state, values: episodes(values).step(state, actions), state, settings)
   assert jax.tree.structure(after) == jax.tree.structure(state)
   assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
-  # The robot's description serves many tasks, none of which needs all of it; a task without a camera has no picture.
+  # The robot's description serves many tasks, none of which needs all of it; a task without a camera has no image.
   others = ("robot.",) if config["vision"]["enable"] else ("robot.", "vision.")
   unread = [key for key in _leaves(config) if key not in read and key != "task" and not key.startswith(others)]
   assert not unread

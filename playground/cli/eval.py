@@ -70,7 +70,7 @@ def evaluate_run(
     console.print(f"hardware, {row['metric']}: {row['what']}; {median}{row['trials']} trials (paper, {row['where']})")
     console.print(f"simulation, {row['metric']}: by default {row['simulation']}")
   report = {"checkpoint": str(checkpoint.path), "episodes": count, "seed": seed, "deterministic": deterministic}
-  report |= {"scores": scores} | hardware.facts
+  report |= {"scores": scores} | hardware.machine
   report |= {"hardware_in_paper": real} if real else {}
   name = f"step_{checkpoint.step:012d}_seed_{seed}{'_deterministic' * deterministic}.json"
   out = folder / name

@@ -72,14 +72,14 @@ def _rows(prefix: str, node: Plain, config: RunConfig, names: Section) -> Iterat
 
   def walk(key: str, value: Plain) -> Iterator[tuple[str, str, str, str]]:
     setting = definition(key, names)
-    said = meaning(setting, comments.get(key, ""))
+    help = meaning(setting, comments.get(key, ""))
     if _is_term(key, value):
-      what, said = _term(key, value)
-      yield key, what, "", said
+      what, help = _term(key, value)
+      yield key, what, "", help
       if key != prefix:
         return
     if not isinstance(value, Mapping) or not value:
-      yield key, format_value(value), _allowed(setting), said
+      yield key, format_value(value), _allowed(setting), help
     for name, inner in value.items() if isinstance(value, Mapping) else ():
       yield from walk(join(key, name), inner)
 

@@ -173,7 +173,7 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
     PlaygroundError: an invalid value, or a task that the policy does not fit.
   """
   contract = exported.contract
-  task, config, facts = contract["task"], contract["env"], contract["policy"]
+  task, config, policy = contract["task"], contract["env"], contract["policy"]
   if task in registry.names():  # another task has no defaults without its robot
     default = registry.config(task).to_dict()
     default.pop("robot", None)  # another robot's section may hold other types
@@ -182,12 +182,12 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
     env = load_on_c_physics(task, config)
     obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
     entries = obs if isinstance(obs, Mapping) else {"state": obs}
-    theirs = {row["entry"]: (tuple(row["shape"][1:]), row["type"]) for row in facts["inputs"]}
+    theirs = {row["entry"]: (tuple(row["shape"][1:]), row["type"]) for row in policy["inputs"]}
     ours = {name: (entry.shape, entry.dtype.name) for name, entry in entries.items() if name in theirs}
-    if theirs != ours or facts["action_size"] != env.action_size:
+    if theirs != ours or policy["action_size"] != env.action_size:
       raise CheckpointError(
         f"{path} does not fit the task that its contract describes: the policy reads {theirs} and gives "
-        f"{facts['action_size']} actions, the task has {ours} and takes {env.action_size}."
+        f"{policy['action_size']} actions, the task has {ours} and takes {env.action_size}."
       )
     jax.eval_shape(make_evaluator(env, exported.act, 1, make_mesh(1)), {}, jax.random.PRNGKey(0), {}, {})
   except PlaygroundError:
@@ -201,7 +201,7 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
 def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
   """Returns the checkpoints of the run at or above `given`, or of all stages of a chain."""
   run = trained.run_dir.path
-  return Menu(given if given == run.parent else run, trained, lambda said: console.print(said, soft_wrap=True))
+  return Menu(given if given == run.parent else run, trained, lambda message: console.print(message, soft_wrap=True))
 
 
 def _table(contract: Contract, episodes: int, scores: Mapping[str, float]) -> Table:

@@ -65,7 +65,7 @@ def add_policy(path: str, note: str = "") -> int:
   git: dict[str, Plain] = manifest.get("git") or {}
   as_set, other = ("mode", "sampled") if config["agent"]["deterministic_eval"] else ("sampled", "mode")
   returns = {as_set: row[RETURN], other: row.get(OTHER_RETURNS[other], math.nan)}
-  facts = {
+  card = {
     "task": config["choices"]["env"],
     "agent": config["choices"]["agent"],
     "status": _status(scores),
@@ -90,7 +90,7 @@ def add_policy(path: str, note: str = "") -> int:
       "falls": round(scores.get("episode_fall", 0.0) * _EPISODES),
     },
   }
-  folder = add(run.path, facts["task"], facts)
+  folder = add(run.path, card["task"], card)
   size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
   print(f"{folder}: {size / 1e6:.1f} MB")
   return 0

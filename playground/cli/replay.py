@@ -28,7 +28,7 @@ def replay(file: str) -> int:
   console.print(f"recorded: {_listed(nonfinite_fields(dump.after))}")
   again = jax.device_get(dump.replay(env))
   bad = nonfinite_fields({"data": again.data, "obs": again.obs, "reward": again.reward})
-  console.print(f"replayed on {hardware.facts['device']} with impl={env.impl}: {_listed(bad)}")
+  console.print(f"replayed on {hardware.machine['device']} with impl={env.impl}: {_listed(bad)}")
   return 0 if bad else 1
 
 

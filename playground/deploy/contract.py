@@ -52,14 +52,14 @@ def describe_policy(
   """
   names = input_names(inputs)
   vectors = [entry for entry in inputs if not entry.startswith(PIXELS)]
-  pictures = [entry for entry in inputs if entry.startswith(PIXELS)]
+  images = [entry for entry in inputs if entry.startswith(PIXELS)]
   reads = lambda entry: {
     "name": names[entry],
     "entry": entry,
     "shape": [1, *inputs[entry]],
-    "type": "uint8" if entry in pictures else "float32",
+    "type": "uint8" if entry in images else "float32",
   }
-  decision = env.dt * env.action_repeat
+  policy_dt = env.dt * env.action_repeat
   contract = {
     "format": FORMAT,
     "task": task,
@@ -71,9 +71,9 @@ def describe_policy(
       "normalization": "part of the graph: feed the observation as it is",
       "actions": "the mode of the trained distribution, in [-1, 1]",
     },
-    "rate_hz": 1 / decision,
+    "rate_hz": 1 / policy_dt,
     "observation": [term for entry in vectors for term in _observation(env, entry)],
-    "cameras": [_camera(env, entry) for entry in pictures if entry == f"{PIXELS}{env.config.vision.camera}"],
+    "cameras": [_camera(env, entry) for entry in images if entry == f"{PIXELS}{env.config.vision.camera}"],
     "frames": env_config.get("observation_frames", 1),
     "delays": dict(_delays(env_config)),
     "action": _action(env, env_config, state),
@@ -110,13 +110,13 @@ def check_contract(contract: Contract) -> None:
     at("type", lambda x: x in ("float32", "uint8"), "float32 or uint8")
     at("shape", lambda x: isinstance(x, list) and len(x) > 1 and all(map(_counts, x)) and x[0] == 1, "a shape [1, ...]")
   ends = lambda x: isinstance(x, list) and len(x) == 3 and all(map(_is_number, x))
-  told = contract.get("command")
-  if told is not None:
+  command = contract.get("command")
+  if command is not None:
     _check(contract, "command.max", ends, "three numbers")
     _check(contract, "command.min", lambda x: x is None or ends(x), "three numbers or null", optional=True)
-    low = told.get("min") or [-high for high in told["max"]]
-    if any(least > most for least, most in zip(low, told["max"], strict=True)):
-      raise CheckpointError(f"command={format_value(told)} must not have its minimum above its maximum.")
+    low = command.get("min") or [-high for high in command["max"]]
+    if any(least > most for least, most in zip(low, command["max"], strict=True)):
+      raise CheckpointError(f"command={format_value(command)} must not have its minimum above its maximum.")
 
 
 def _check(

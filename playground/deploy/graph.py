@@ -54,16 +54,16 @@ def policy_graph(
   Raises:
     ConfigError: the actor has unknown layers.
   """
-  pictures = [entry for entry in inputs if entry.startswith(PIXELS)]
+  images = [entry for entry in inputs if entry.startswith(PIXELS)]
   hidden = sum(name.startswith("hidden_") for name in params)
   norms = sum(name.startswith("LayerNorm_") for name in params)
-  layers = [*(f"hidden_{i}" for i in range(hidden)), *(["output"] if pictures else [])]
-  if set(params) != {*layers, *(f"LayerNorm_{i}" for i in range(norms)), *map(cnn_name, pictures)}:
+  layers = [*(f"hidden_{i}" for i in range(hidden)), *(["output"] if images else [])]
+  if set(params) != {*layers, *(f"LayerNorm_{i}" for i in range(norms)), *map(cnn_name, images)}:
     raise ConfigError("The actor is not an MLP, with or without CNNs before it, and only such can be exported.")
   graph, names, features = Chain(), input_names(inputs), []
   for entry, shape in inputs.items():
     graph.value = names[entry]
-    if entry in pictures:
+    if entry in images:
       assert cnn is not None
       see(graph, params[cnn_name(entry)], cnn, [*shape[:2]])
     else:
@@ -93,7 +93,7 @@ def policy_graph(
         graph.apply("LayerNormalization", *scale_and_bias, epsilon=_LAYER_NORM_EPSILON)
   graph.apply("Tanh")
   graph.nodes[-1].output[0] = OUTPUT
-  kinds = {entry: TensorProto.UINT8 if entry in pictures else TensorProto.FLOAT for entry in inputs}
+  kinds = {entry: TensorProto.UINT8 if entry in images else TensorProto.FLOAT for entry in inputs}
   sources = [helper.make_tensor_value_info(names[entry], kinds[entry], [1, *inputs[entry]]) for entry in inputs]
   sink = helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, [1, size])
   proto = helper.make_graph(graph.nodes, "policy", sources, [sink], graph.weights)

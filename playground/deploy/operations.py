@@ -98,19 +98,19 @@ def _normalize_channels(graph: Chain) -> None:
   whole image lose digits: both errors are too large for a policy with steep actions.
   """
   x = graph.value
-  _mean_of_picture(graph)
+  _mean_of_image(graph)
   mean, graph.value = graph.value, x
   graph.apply("Sub", mean)
   x = graph.value
   graph.apply("Mul", x)
-  _mean_of_picture(graph)
+  _mean_of_image(graph)
   graph.apply("Add", graph.constant(NORM_EPSILON))
   graph.apply("Sqrt")
-  deviation, graph.value = graph.value, x
-  graph.apply("Div", deviation)
+  std, graph.value = graph.value, x
+  graph.apply("Div", std)
 
 
-def _mean_of_picture(graph: Chain) -> None:
+def _mean_of_image(graph: Chain) -> None:
   """Reduces an image [1, C, H, W] to the mean of each channel, [1, C, 1, 1]."""
   graph.apply("ReduceMean", axes=[3])
   graph.apply("ReduceMean", axes=[2])

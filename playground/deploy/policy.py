@@ -51,13 +51,13 @@ class ExportedPolicy:
       self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common base
       raise CheckpointError(f"The policy is no model that ONNX Runtime can read: {error}") from None
-    facts = contract["policy"]
-    told = {row["name"]: row["shape"] for row in facts["inputs"]} | {facts["output"]: [1, facts["action_size"]]}
+    policy = contract["policy"]
+    known = {row["name"]: row["shape"] for row in policy["inputs"]} | {policy["output"]: [1, policy["action_size"]]}
     found = {end.name: end.shape for end in (*self._session.get_inputs(), *self._session.get_outputs())}
-    if found != told:
-      raise CheckpointError(f"The policy has other inputs or outputs than its contract: {found} instead of {told}.")
+    if found != known:
+      raise CheckpointError(f"The policy has other inputs or outputs than its contract: {found} instead of {known}.")
     own = hashlib.sha256(model).hexdigest()
-    if facts.get("sha256", own) != own:  # older exports have none
+    if policy.get("sha256", own) != own:  # older exports have none
       raise CheckpointError("The policy and its contract are not of one export (sha256): export the run again.")
     self.model = model
     self.contract = contract

@@ -33,13 +33,13 @@ def load_exact(path: str | Path) -> LoadedPolicy:
   return load_policy(path, load_task=load_on_c_physics, platform="cpu", precision=_EXACT)
 
 
-def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:
+def record(trained: LoadedPolicy, num_envs: int, steps: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:
   """Rolls out the policy's mode with the task's noise, and records inputs and actions.
 
   Args:
     trained: the policy and its task.
     num_envs: number of environments.
-    decisions: policy steps in each environment.
+    steps: policy steps in each environment.
 
   Returns:
     The actor's inputs by group, [N, ...], and its actions, [N, action_size], of all N policy steps, and the last state
@@ -47,13 +47,13 @@ def record(trained: LoadedPolicy, num_envs: int, decisions: int) -> tuple[dict[s
   """
   batch, networks = wrap_for_training(trained.env), trained.trainer.networks
 
-  def decide(state: State, _: None) -> tuple[State, tuple[dict[str, jax.Array], jax.Array]]:
+  def act_and_step(state: State, _: None) -> tuple[State, tuple[dict[str, jax.Array], jax.Array]]:
     action, seen = trained.act(state.obs, jax.random.PRNGKey(0), deterministic=True), networks.select(state.obs)
     return batch.step(state, action), ({entry: seen[entry] for entry in networks.policy_inputs}, action)
 
   @jax.jit
   def roll(key: jax.Array) -> tuple[State, tuple[dict[str, jax.Array], jax.Array]]:
-    return jax.lax.scan(decide, batch.reset(jax.random.split(key, num_envs)), None, decisions)
+    return jax.lax.scan(act_and_step, batch.reset(jax.random.split(key, num_envs)), None, steps)
 
   state, (obs, actions) = roll(jax.random.PRNGKey(0))
   obs, actions = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), (obs, actions))

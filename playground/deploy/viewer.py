@@ -70,10 +70,10 @@ def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
 
   console.print(_HELP, soft_wrap=True)
   others = set(threading.enumerate())
-  with noted_signals() as told, mujoco.viewer.launch_passive(env.mj_model, data, key_callback=on_key) as window:
+  with noted_signals() as ended, mujoco.viewer.launch_passive(env.mj_model, data, key_callback=on_key) as window:
     with window.lock():
       follow(window.cam, env.mj_model)
-    while window.is_running() and not told.is_set():
+    while window.is_running() and not ended.is_set():
       began = time.perf_counter()
       state = player.policy_step()
       with window.lock():

@@ -24,7 +24,7 @@ class Hardware:
 
   mesh: Mesh
   network_precision: str | None
-  facts: dict[str, object]  # for the manifest
+  machine: dict[str, object]  # its device, number of devices, precision and cache, for the manifest
 
 
 def setup(config: HardwareConfig) -> Hardware:
@@ -54,7 +54,7 @@ def setup(config: HardwareConfig) -> Hardware:
       f"hardware.kind={config.kind}, but this machine has {devices[0].device_kind}: hardware=gpu takes any GPU."
     )
   mesh = make_mesh(count)
-  facts = {
+  machine = {
     "platform": devices[0].platform,
     "device": devices[0].device_kind,
     "num_devices": mesh.size,
@@ -63,7 +63,7 @@ def setup(config: HardwareConfig) -> Hardware:
     "network_precision": config.network_precision,
     "compilation_cache": cache,
   }
-  return Hardware(mesh, config.network_precision, facts)
+  return Hardware(mesh, config.network_precision, machine)
 
 
 def this_machine(hardware: HardwareConfig, platform: Platform | None = None) -> HardwareConfig:

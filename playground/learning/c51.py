@@ -8,7 +8,7 @@ from brax.training import networks as brax_networks
 
 from playground.envs.base import Env
 from playground.learning.hyperparameters import C51Config
-from playground.learning.networks import Actor, refuse_pictures
+from playground.learning.networks import Actor, refuse_images
 from playground.learning.off_policy import Transition
 from playground.pytree import PyTree
 
@@ -49,7 +49,7 @@ class C51Networks(Actor):
       ConfigError: a task with images, an unknown activation, or an observation group that the task does not have.
     """
     sizes, network = env.observation_size, config.network
-    refuse_pictures(sizes, agent)
+    refuse_images(sizes, agent)
     hidden, norm = network.policy_hidden_layer_sizes, network.layer_norm
     super().__init__(sizes, env.action_size, hidden, network, precision, norm)
     self.atoms = Atoms(config.min_value, config.max_value, config.num_atoms)

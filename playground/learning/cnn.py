@@ -81,10 +81,10 @@ class PixelNetwork(linen.Module):
   estimate_size: int = 0
 
   @linen.compact
-  def __call__(self, pictures: Mapping[str, jax.Array], vector: jax.Array | None) -> jax.Array:
+  def __call__(self, images: Mapping[str, jax.Array], vector: jax.Array | None) -> jax.Array:
     """Returns the output, [..., output_size], for images [..., H, W, C] by camera and a vector [..., D]."""
     make = lambda key: CNN(self.cnn, self.cnn_activation, self.dtype, name=cnn_name(key))
-    features = [make(key)(pictures[key]) for key in sorted(pictures)]
+    features = [make(key)(images[key]) for key in sorted(images)]
     hidden = jnp.concatenate([*features, *([] if vector is None else [vector.astype(self.dtype)])], axis=-1)
     init = jax.nn.initializers.lecun_uniform()
     for i, size in enumerate(self.hidden_layer_sizes):
@@ -115,9 +115,9 @@ def random_shift(obs: dict[str, jax.Array], shifts: jax.Array, pad: int) -> dict
     pad: the largest shift.
   """
 
-  def shift(picture: jax.Array, start: jax.Array) -> jax.Array:
-    padded = jnp.pad(picture, ((pad, pad), (pad, pad), (0, 0)), mode="edge")
-    return jax.lax.dynamic_slice(padded, (*start, 0), picture.shape)
+  def shift(image: jax.Array, start: jax.Array) -> jax.Array:
+    padded = jnp.pad(image, ((pad, pad), (pad, pad), (0, 0)), mode="edge")
+    return jax.lax.dynamic_slice(padded, (*start, 0), image.shape)
 
   def each(x: jax.Array) -> jax.Array:
     starts = jnp.broadcast_to(shifts, (*x.shape[:-3], 2)).reshape(-1, 2)

@@ -76,8 +76,8 @@ def make_evaluator(
 
     def view(state: State, active: jax.Array) -> dict[str, jax.Array]:
       shown = {name: getattr(state.data, name) for name in ("qpos", "mocap_pos", "mocap_quat")}
-      picture = newest_image(env, state.obs)
-      shown |= {} if picture is None else {"seen": picture}
+      image = newest_image(env, state.obs)
+      shown |= {} if image is None else {"seen": image}
       return jax.tree.map(lambda x: x[:num_recorded], shown | {"active": active})
 
     active = jnp.ones_like(state.done)

@@ -190,8 +190,8 @@ class Actor:
 
   def _example(self) -> dict[str, jax.Array]:
     """Returns an observation of zeros, a batch of one."""
-    pictures = {key: jnp.zeros((1, *size), jnp.uint8) for key, size in self.pixel_sizes.items()}
-    return pictures | {key: jnp.zeros((1, *size)) for key, size in self.obs_sizes.items()}
+    images = {key: jnp.zeros((1, *size), jnp.uint8) for key, size in self.pixel_sizes.items()}
+    return images | {key: jnp.zeros((1, *size)) for key, size in self.obs_sizes.items()}
 
   def at_precision(self) -> AbstractContextManager[None]:
     """Returns a context in which matrix products have the networks' precision."""
@@ -283,7 +283,7 @@ class SoftActorCritic(Actor):
     self, obs_size: ObservationSize, action_size: int, config: SoftNetworkConfig, precision: str | None = None
   ):
     """Builds the networks; see `Actor` for the arguments and errors."""
-    refuse_pictures(obs_size, "sac")
+    refuse_images(obs_size, "sac")
     self.batched = jax.default_backend() == "gpu"
     sizes, norm = tuple(config.hidden_layer_sizes), config.policy_network_layer_norm
     super().__init__(obs_size, action_size, sizes, config, precision, norm)
@@ -314,7 +314,7 @@ class SoftActorCritic(Actor):
     return self.distribution.postprocess(raw_action), self.distribution.log_prob(logits, raw_action)
 
 
-def refuse_pictures(obs_size: ObservationSize, agent: str) -> None:
+def refuse_images(obs_size: ObservationSize, agent: str) -> None:
   """Raises ConfigError for a task with images, which this agent does not read."""
   if isinstance(obs_size, Mapping) and any(key.startswith(PIXELS) for key in obs_size):
     raise ConfigError(f"agent={agent} reads no images: choose agent=ppo, or env.vision.enable=false.")

@@ -22,7 +22,7 @@ from playground.envs.base import Env
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy, gradient_step
 from playground.learning.hyperparameters import REPPOConfig
-from playground.learning.networks import Actor, Normalizer, normalize, refuse_pictures
+from playground.learning.networks import Actor, Normalizer, normalize, refuse_images
 from playground.learning.rollout import Environments
 from playground.pytree import PyTree
 
@@ -99,14 +99,14 @@ class HLGauss:
   def __init__(self, low: float, high: float, bins: int):
     """`bins` bins with centres from `low` to `high`; the Gaussian's standard deviation is 0.75 of a bin."""
     width = (high - low) / (bins - 1)
-    self.low, self.high, self.deviation = low, high, 0.75 * width
+    self.low, self.high, self.std = low, high, 0.75 * width
     self.centres = jnp.linspace(low, high, bins)
     self.edges = jnp.linspace(low - width / 2, high + width / 2, bins + 1)
 
   def encode(self, value: jax.Array) -> jax.Array:
     """Returns probabilities of the bins, [..., K], for values [...]; those outside are moved to the nearest edge."""
     value = jnp.clip(value, self.low, self.high)[..., None]
-    below = jax.scipy.special.erf((self.edges - value) / (jnp.sqrt(2.0) * self.deviation))
+    below = jax.scipy.special.erf((self.edges - value) / (jnp.sqrt(2.0) * self.std))
     return jnp.diff(below) / (below[..., -1:] - below[..., :1])
 
   def decode(self, logits: jax.Array) -> jax.Array:
@@ -124,7 +124,7 @@ class REPPONetworks(Actor):
       ConfigError: a task with images, an unknown activation, or an observation group that the task does not have.
     """
     sizes = env.observation_size
-    refuse_pictures(sizes, "reppo")
+    refuse_images(sizes, "reppo")
     network = config.network
     super().__init__(sizes, env.action_size, network.hidden_layer_sizes, network, precision, layer_norm=True)
     self.distribution = NormalTanhDistribution(env.action_size, min_std=network.min_std)

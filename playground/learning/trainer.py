@@ -216,8 +216,8 @@ class Trainer:
       f" It was written on {there} device{'s' * (there > 1)}: on {here}, all of it goes on, but random numbers and "
       "rounding differ from here on."
     )
-    said = f"Resuming {what} of {checkpoint.path} ({checkpoint.step:,} steps).{elsewhere * (there != here)}"
-    return state, said
+    message = f"Resuming {what} of {checkpoint.path} ({checkpoint.step:,} steps).{elsewhere * (there != here)}"
+    return state, message
 
   def place(self, state: TrainState) -> TrainState:
     """Puts a state's host arrays on the devices, each its share, with the trainer's settings."""

@@ -134,11 +134,11 @@ def _forget_machine(folder: Path) -> None:
   kept = [line for line in overrides.read_text().splitlines(keepends=True) if not line.startswith("- run_dir=")]
   overrides.write_text("".join(kept))
   manifest = json.loads((folder / "manifest.json").read_text())
-  told = {key: value for key, value in manifest.items() if key not in ("host", "compilation_cache")}
-  (folder / "manifest.json").write_text(json.dumps(told, indent=2) + "\n")
+  kept = {key: value for key, value in manifest.items() if key not in ("host", "compilation_cache")}
+  (folder / "manifest.json").write_text(json.dumps(kept, indent=2) + "\n")
 
 
-def add(run: Path, task: str, facts: Section) -> Path:
+def add(run: Path, task: str, entries: Section) -> Path:
   """Copies a run's policy into the package and writes its card.
 
   The critic is rounded to bfloat16's precision, which halves its files; actions stay the same.
@@ -146,7 +146,7 @@ def add(run: Path, task: str, facts: Section) -> Path:
   Args:
     run: a run directory with `export/policy.onnx`.
     task: its task.
-    facts: entries of the card beside the files' hashes.
+    entries: entries of the card beside the files' hashes.
 
   Returns:
     The folder.
@@ -164,5 +164,5 @@ def add(run: Path, task: str, facts: Section) -> Path:
     shutil.copyfile(run / "export" / name, folder / "export" / name)
   files = sorted(path for path in folder.rglob("*") if path.is_file())
   hashes = {str(path.relative_to(folder)): _sha256(path) for path in files}
-  (folder / CARD).write_text(yaml.safe_dump({**facts, "sha256": hashes}, sort_keys=False, width=120))
+  (folder / CARD).write_text(yaml.safe_dump({**entries, "sha256": hashes}, sort_keys=False, width=120))
   return folder

@@ -18,9 +18,9 @@ from playground.physics.backend import Physics, PhysicsData, mjx
 from playground.pytree import PyTree
 from playground.rendering.video import camera_names
 
-Pictures = dict[str, jax.Array]
+Images = dict[str, jax.Array]
 Context = Any  # of MuJoCo-Warp, which has no public type for it
-Rendered = tuple[dict[str, Pictures], jax.Array]  # images by camera, and a zero that depends on them
+Rendered = tuple[dict[str, Images], jax.Array]  # images by camera, and a zero that depends on them
 _KINDS = ("rgb", "depth", "segmentation")
 
 
@@ -77,7 +77,7 @@ class BatchRenderer:
     self._physics = physics
     self._contexts: dict[tuple[object, ...], list[Context]] = {}
 
-  def render(self, model: mjx.Model, data: PhysicsData) -> tuple[dict[str, Pictures], PhysicsData]:
+  def render(self, model: mjx.Model, data: PhysicsData) -> tuple[dict[str, Images], PhysicsData]:
     """Renders the current state of one environment.
 
     Args:
@@ -95,8 +95,8 @@ class BatchRenderer:
     lenses = model.cam_fovy is not task.cam_fovy or model.cam_intrinsic is not task.cam_intrinsic
     shared = jax.tree.map(lambda _: False, model)
     batch = jax.tree.map(lambda x: x[None], data)
-    pictures, token = jax.tree.map(lambda x: x[0], self._draw(lenses, shared, model, batch))
-    return pictures, data.replace(time=data.time + token)
+    images, token = jax.tree.map(lambda x: x[0], self._draw(lenses, shared, model, batch))
+    return images, data.replace(time=data.time + token)
 
   def _draw(self, lenses: bool, own: mjx.Model, model: mjx.Model, data: PhysicsData) -> Rendered:
     """Returns the result of `_render` for a batch [N] of states; `own` marks the model fields with a batch axis."""
@@ -143,13 +143,13 @@ class BatchRenderer:
       "segmentation": lambda place: seg[place, 0],
     }
     width, height = self.view.width, self.view.height
-    pictures = {}
+    images = {}
     for i, camera in enumerate(self.view.cameras):
       place = slice(i * width * height, (i + 1) * width * height)
       flat = {kind: unpack[kind](place) for kind in self.view.kinds}
-      pictures[camera] = {kind: x.reshape(height, width, *x.shape[1:]) for kind, x in flat.items()}
+      images[camera] = {kind: x.reshape(height, width, *x.shape[1:]) for kind, x in flat.items()}
     token: Any = full._impl._jax_token  # pyright: ignore[reportOptionalMemberAccess]
-    return pictures, token.sum().astype(data.time.dtype)
+    return images, token.sum().astype(data.time.dtype)
 
   def _contexts_of(self, size: int, lenses: bool) -> list[Context]:
     """Returns the renderer's buffers for a batch, on every device of the function being traced.

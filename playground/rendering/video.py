@@ -240,12 +240,12 @@ def _render(trajectory: io.BytesIO, out_path: Path) -> None:
   writer.close()
 
 
-def enlarged(picture: np.ndarray, height: int) -> np.ndarray:
+def enlarged(image: np.ndarray, height: int) -> np.ndarray:
   """Enlarges an image [H, W, 1 or 3] to `height` rows and an even width, [height, width, 3], without smoothing."""
-  rows, columns = picture.shape[:2]
+  rows, columns = image.shape[:2]
   width = 2 * max(1, round(height * columns / rows / 2))
-  picture = picture[np.arange(height)[:, None] * rows // height, np.arange(width) * columns // width]
-  return np.broadcast_to(picture, (height, width, 3))
+  image = image[np.arange(height)[:, None] * rows // height, np.arange(width) * columns // width]
+  return np.broadcast_to(image, (height, width, 3))
 
 
 def choose_camera(model: "mujoco.MjModel", name: str | None = None) -> "str | mujoco.MjvCamera":

@@ -50,12 +50,12 @@ def save_views(env: Env, events: Mapping[str, object], path: str | Path, count: 
   return path
 
 
-def sheet(pictures: np.ndarray) -> np.ndarray:
+def sheet(images: np.ndarray) -> np.ndarray:
   """Arranges images [N, H, W, 1 or 3] uint8 in rows of one image [..., 3]."""
-  count, height, width, _ = pictures.shape
+  count, height, width, _ = images.shape
   columns = math.ceil(math.sqrt(count))
   rows = math.ceil(count / columns)
   page = np.full((rows, height + _GAP, columns, width + _GAP, 3), 255, np.uint8)
-  for i, picture in enumerate(pictures):
-    page[i // columns, :height, i % columns, :width] = picture
+  for i, image in enumerate(images):
+    page[i // columns, :height, i % columns, :width] = image
   return page.reshape(rows * (height + _GAP), columns * (width + _GAP), 3)

@@ -54,8 +54,8 @@ class Vision(Wrapper):
     self._warp_model = env.mjx_model  # the model to render, also where the task is simulated elsewhere (`c_physics.py`)
     size = {"width": config.width, "height": config.height}
     kind = "rgb" if self._image in ("rgb", "gray") else self._image
-    looks = {"shadows": config.shadows, "textures": config.textures}
-    self._renderer = BatchRenderer(env.physics, View((config.camera,), kinds=(kind,), **size, **looks))
+    visuals = {"shadows": config.shadows, "textures": config.textures}
+    self._renderer = BatchRenderer(env.physics, View((config.camera,), kinds=(kind,), **size, **visuals))
 
   @property
   def episode_info(self) -> tuple[str, ...]:

@@ -42,7 +42,7 @@ class Table:
 
 
 @dataclasses.dataclass(frozen=True)
-class Picture:
+class Image:
   """A drawing.
 
   Attributes:
@@ -57,7 +57,7 @@ class Picture:
 
 
 NOT_MEASURED = "not measured"
-Block = Heading | Text | Table | Picture
+Block = Heading | Text | Table | Image
 
 _CODE = re.compile("`([^`]+)`")
 _STYLE = """
@@ -69,9 +69,9 @@ svg,img{max-width:100%;height:auto} figcaption{font-size:.9rem;color:#555}
 """
 
 
-def to_markdown(blocks: Iterable[Block], pictures: str) -> str:
-  """Returns Markdown; figures are files `<pictures>/<name>.svg`."""
-  return "\n\n".join(_markdown(block, pictures) for block in blocks) + "\n"
+def to_markdown(blocks: Iterable[Block], images: str) -> str:
+  """Returns Markdown; figures are files `<images>/<name>.svg`."""
+  return "\n\n".join(_markdown(block, images) for block in blocks) + "\n"
 
 
 def to_html(blocks: Sequence[Block], title: str) -> str:
@@ -81,14 +81,14 @@ def to_html(blocks: Sequence[Block], title: str) -> str:
   return f"<!doctype html>\n<html lang=en><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
 
 
-def _markdown(block: Block, pictures: str) -> str:
+def _markdown(block: Block, images: str) -> str:
   match block:
     case Heading(level, text):
       return f"{'#' * level} {text}"
     case Text(text):
       return text
-    case Picture(name, _, caption):
-      return f"![{caption}]({pictures}/{name}.svg)"
+    case Image(name, _, caption):
+      return f"![{caption}]({images}/{name}.svg)"
     case Table(header, rows):
       rules = ["---:" if right else "---" for right in _numeric(block)]
       lines = [header, rules, *([cell.replace("|", "\\|") for cell in row] for row in rows)]
@@ -102,7 +102,7 @@ def _html(block: Block) -> str:
     case Text(text):
       marked = _CODE.sub(r"<code>\1</code>", html.escape(text))
       return f"<p>{marked}</p>"
-    case Picture(_, image, caption):
+    case Image(_, image, caption):
       if isinstance(image, bytes):
         drawing = f'<img alt="" src="data:image/png;base64,{base64.b64encode(image).decode()}">'
       else:

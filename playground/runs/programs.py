@@ -56,7 +56,7 @@ def stored_program(
     None where functions are not stored: without JAX's compilation cache, on several machines, on Warp (its functions
     hold addresses of this process), and for a task from a notebook.
   """
-  env, cache = trainer.env.unwrapped, hardware.facts["compilation_cache"]
+  env, cache = trainer.env.unwrapped, hardware.machine["compilation_cache"]
   if not cache or "://" in str(cache) or is_multiprocess() or env.impl == "warp":
     return None
   placeholders = {name: np.ones_like(value) for name, value in trainer.settings.items()}

@@ -112,12 +112,12 @@ def _train_group(
     for member in members:
       runs.enter_context(member)
     progress = runs.enter_context(Progress(training.steps))
-    facts = {"impl": training.env.impl, "agents_in_program": len(configs), **hardware.facts}
+    machine = {"impl": training.env.impl, "agents_in_program": len(configs), **hardware.machine}
     for config, plan, member in zip(configs, plans, members, strict=True):
-      member.run_dir.write_manifest(seed=config.seed, task=config.choices["env"], **facts)
+      member.run_dir.write_manifest(seed=config.seed, task=config.choices["env"], **machine)
       for notice in plan.notices:
         progress.print(f"{member.name}: {notice}")
-    progress.phase(f"compiling {len(configs)} agents for {hardware.mesh.size} x {hardware.facts['device']}")
+    progress.phase(f"compiling {len(configs)} agents for {hardware.mesh.size} x {hardware.machine['device']}")
     program = training.compile(plans)
     for notice in (program.notice, memory_needed(program, hardware)):
       if notice:
@@ -221,5 +221,5 @@ class Member:
       self.error = str(error)
       try:
         self._record.__exit__(type(error), error, error.__traceback__)  # records that the run failed, and why
-      except PlaygroundError as said:
-        self.error = str(said)
+      except PlaygroundError as error:
+        self.error = str(error)

@@ -186,10 +186,10 @@ def _train_locked(
   run_dir = open_run(config, plan)
   share(str(run_dir.path.absolute()))
   with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(training.steps) as progress:
-    run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=training.env.impl, **hardware.facts)
+    run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=training.env.impl, **hardware.machine)
     for notice in plan.notices:
       progress.print(notice)
-    progress.phase(f"compiling for {hardware.mesh.size} x {hardware.facts['device']}")
+    progress.phase(f"compiling for {hardware.mesh.size} x {hardware.machine['device']}")
     program = training.compile([plan])
     if program.notice:
       progress.print(program.notice)

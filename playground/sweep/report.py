@@ -12,8 +12,8 @@ from playground.files import replacing, write_text
 from playground.reporting.page import (
   Block,
   Heading,
+  Image,
   Link,
-  Picture,
   Table,
   Text,
   mean_and_ci95,
@@ -174,7 +174,7 @@ def _page(
       "return` it acts by its mode."
     )
     blocks += [Heading(2, "Groups"), Text(mean), Table(*_group_rows(groups))]
-  blocks += [Picture(path.stem, path.read_bytes(), "") for path in curves]
+  blocks += [Image(path.stem, path.read_bytes(), "") for path in curves]
   columns = [name for name in jobs.columns if name != "overrides"]
   rows = [[_text(value) for value in row] for row in jobs[columns].to_numpy(object).tolist()]
   rows = [[_job_link(job), *rest] for job, *rest in rows]

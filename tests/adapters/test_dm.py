@@ -37,7 +37,7 @@ class TestDmEnv(test_utils.EnvironmentTestMixin, absltest.TestCase):
     assert env.step(np.zeros(1, np.float32)).first()
 
 
-def test_pictures_are_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_are_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
   class Seeing(Point):
     @property
     def observation_size(self) -> dict[str, tuple[int, ...]]:

@@ -139,7 +139,7 @@ def test_each_environment_has_a_model_of_its_own() -> None:
   assert (obs["policy"][0] != obs["policy"][1]).any()
 
 
-def test_pictures_are_refused() -> None:
+def test_images_are_refused() -> None:
   class Camera(Point):
     @property
     def observation_size(self) -> dict[str, tuple[int, ...]]:

@@ -9,7 +9,7 @@ from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.public import Curve, at, beside_public, our_best, public_curves
 from playground.benchmark.report.sections import Notes
 from playground.config.files import task_names
-from playground.reporting.page import Picture, Table
+from playground.reporting.page import Image, Table
 
 
 @pytest.mark.parametrize(("steps", "expected"), [(9, None), (10, 1.0), (15, 2.0), (20, 3.0), (25, 5.0), (99, 7.0)])
@@ -54,7 +54,7 @@ def test_tasks_where_we_are_below_come_first(tmp_path: Path, monkeypatch: pytest
   } | {"HopperHop": [Curve("PPO (some)", "mode", [(200, 5.0)])]}
   monkeypatch.setattr(public, "public_curves", lambda: theirs)
   blocks = list(beside_public(runs(tmp_path), Notes()))
-  assert any(isinstance(block, Picture) for block in blocks)
+  assert any(isinstance(block, Image) for block in blocks)
   table, settings = (block for block in blocks if isinstance(block, Table))
   assert [(row[0], row[2], row[5], row[6], row[7]) for row in table.rows] == [
     ("CheetahRun", "as set", "100.0 (PPO (some))", "0.50", "below"),

@@ -14,7 +14,7 @@ from playground.benchmark.schema import Table as Rows
 from playground.errors import ConfigError
 from playground.paper import SUITES, paper_table
 from playground.reporting import figures
-from playground.reporting.page import Block, Picture, Table
+from playground.reporting.page import Block, Image, Table
 
 REFERENCE = Path(__file__).parents[2] / "results/reference"
 ROW = {
@@ -97,7 +97,7 @@ def test_every_benchmark_has_its_section(tmp_path: Path):
     ),
   )
   blocks = page(found)
-  assert {block.name for block in blocks if isinstance(block, Picture)} == {
+  assert {block.name for block in blocks if isinstance(block, Image)} == {
     *("scaling", "topology", "breakdown", "runs", "public")
   }
   cells = {cell for block in blocks if isinstance(block, Table) for row in block.rows for cell in row}
@@ -263,7 +263,7 @@ def test_the_committed_results_make_a_page(tmp_path: Path, monkeypatch: pytest.M
   assert len(tasks) == 48
   assert all(f"| {task} | " in markdown and f"<td>{task}</td>" in html for task in tasks)
   assert "src=" not in html and 'href="http' not in html, "it needs nothing beside it"
-  assert (tmp_path / "report_pictures" / "curves.svg").is_file()
+  assert (tmp_path / "report_images" / "curves.svg").is_file()
 
 
 def test_rows_that_are_being_written_and_damaged_ones(tmp_path: Path):

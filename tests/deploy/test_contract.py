@@ -21,12 +21,12 @@ def contract(
   size: int,
   overrides: Mapping[str, Any] | None = None,
   info: Mapping[str, Any] | None = None,
-  pictures: Mapping[str, tuple[int, ...]] | None = None,
+  images: Mapping[str, tuple[int, ...]] | None = None,
 ) -> dict[str, Any]:
   env = registry.load(task, overrides=overrides)
   zero = jnp.zeros(())
   state = State(env.physics.make(), {"state": jnp.zeros(size)}, zero, zero, {}, dict(info or {}))
-  inputs = {**(pictures or {}), **({"state": (size,)} if size else {})}
+  inputs = {**(images or {}), **({"state": (size,)} if size else {})}
   written = describe_policy(env, plain(env.config), task, {"run": "a"}, inputs, state)
   assert yaml.safe_load(yaml.safe_dump(written)) == written
   return written

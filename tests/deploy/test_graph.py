@@ -102,7 +102,7 @@ def test_what_a_controller_finds() -> None:
 
 
 @pytest.mark.parametrize("cnn", CNNS, ids=lambda cnn: cnn.global_pool)
-def test_same_actions_from_pictures_and_a_vector(cnn: CNNConfig) -> None:
+def test_same_actions_from_images_and_a_vector(cnn: CNNConfig) -> None:
   nets = ActorCritic(SEEN, ACTIONS, NetworkConfig((16, 8), (4,), "elu", cnn=cnn))
   policy, normalizer = trained(nets)
   policy = jax.tree.map(lambda x: x / 2, policy)  # or tanh hides much
@@ -126,7 +126,7 @@ def test_every_pool_is_tried() -> None:
   assert {cnn.global_pool for cnn in CNNS} == set(_POOLS)
 
 
-def test_pictures_alone_are_obs() -> None:
+def test_images_alone_are_obs() -> None:
   sizes = {"state": (OBS,), "pixels/eye": (9, 8, 3)}
   keys: Any = {
     "policy_obs_key": "",

@@ -56,6 +56,6 @@ class Seen(PointTask):
 
 
 @pytest.mark.parametrize("agent", ["reppo", "fast_td3", "fast_sac"])
-def test_pictures_are_refused(agent: str) -> None:
+def test_images_are_refused(agent: str) -> None:
   with pytest.raises(ConfigError, match=f"agent={agent} reads no images: choose agent=ppo"):
     build_algorithm(Seen(), config_class(agent)(), None)

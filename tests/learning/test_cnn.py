@@ -1,4 +1,4 @@
-"""Networks on pictures: sizes, what is shared, what is normalised, shifts, and a training step on bytes."""
+"""Networks on images: sizes, what is shared, what is normalised, shifts, and a training step on bytes."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -70,7 +70,7 @@ def test_normalised_channels_know_no_brightness_nor_contrast() -> None:
   normalising = dataclasses.replace(TINY, normalize_channels=True)
   np.testing.assert_allclose(features(normalising, pixels), features(normalising, brighter), atol=1e-3)
   assert jnp.abs(features(TINY, pixels) - features(TINY, brighter)).max() > 0.1
-  beside_a_bright_one = jnp.concatenate([pixels[:1], pixels[1:] + 150])  # each picture is normalised by itself
+  beside_a_bright_one = jnp.concatenate([pixels[:1], pixels[1:] + 150])  # each image is normalised by itself
   np.testing.assert_allclose(features(normalising, beside_a_bright_one), features(normalising, pixels), atol=1e-3)
 
 
@@ -100,21 +100,21 @@ def test_actor_and_critic_have_cnns_of_their_own_and_vectors_of_their_choice() -
   assert (logits(params.policy, obs) != logits(params.policy, dark)).all()
 
 
-def test_pictures_are_not_normalised() -> None:
+def test_images_are_not_normalised() -> None:
   networks = ActorCritic(SIZES, 2, NetworkConfig((8,), (8,), cnn=TINY))
   assert isinstance(mean := networks.init_normalizer().mean, Mapping) and set(mean) == {"state"}
 
 
 def test_shifts_move_a_trajectory_as_one_and_repeat_edges() -> None:
-  picture = jnp.arange(12, dtype=jnp.uint8).reshape(3, 4, 1)
-  obs = {"pixels/eye": jnp.broadcast_to(picture, (2, 3, 3, 4, 1)), "state": jnp.ones((2, 3, 5))}
+  image = jnp.arange(12, dtype=jnp.uint8).reshape(3, 4, 1)
+  obs = {"pixels/eye": jnp.broadcast_to(image, (2, 3, 3, 4, 1)), "state": jnp.ones((2, 3, 5))}
   shifted = random_shift(obs, jnp.array([[1, 1], [2, 1], [1, 0]]), pad=1)
   np.testing.assert_array_equal(shifted["state"], obs["state"])
   still, up, right = np.asarray(shifted["pixels/eye"][0, ..., 0])
   np.testing.assert_array_equal(shifted["pixels/eye"][0], shifted["pixels/eye"][1])
-  np.testing.assert_array_equal(still, picture[..., 0])
-  np.testing.assert_array_equal(up, picture[jnp.array([1, 2, 2]), :, 0])
-  np.testing.assert_array_equal(right, picture[:, jnp.array([0, 0, 1, 2]), 0])
+  np.testing.assert_array_equal(still, image[..., 0])
+  np.testing.assert_array_equal(up, image[jnp.array([1, 2, 2]), :, 0])
+  np.testing.assert_array_equal(right, image[:, jnp.array([0, 0, 1, 2]), 0])
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_what_cannot_be(settings: dict[str, Any], message: str) -> None:
     ActorCritic(SIZES, 2, NetworkConfig(**settings))
 
 
-def test_no_pictures_no_empty_key_and_none_for_sac() -> None:
+def test_no_images_no_empty_key_and_none_for_sac() -> None:
   with pytest.raises(ConfigError, match="policy_obs_key='' must be an entry"):
     ActorCritic(5, 2, NetworkConfig(policy_obs_key=""))
   with pytest.raises(ConfigError, match="estimated_obs_key='state' is estimated from images"):
@@ -143,7 +143,7 @@ def test_no_pictures_no_empty_key_and_none_for_sac() -> None:
 
 
 class Seen(PointTask):
-  """The point, and a picture whose two channels are as bright as it is far to the right and up."""
+  """The point, and a image whose two channels are as bright as it is far to the right and up."""
 
   def _obs(self, data: Any) -> dict[str, jax.Array]:
     bright = jnp.clip(60 * (data.qpos + 2), 0, 255)
@@ -153,7 +153,7 @@ class Seen(PointTask):
     return super().reset(rng)
 
 
-def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_step_keeps_images_as_bytes_and_shifts_them(monkeypatch: pytest.MonkeyPatch) -> None:
   shifted: list[Any] = []
   note = lambda obs, shifts, pad: (
     shifted.append((obs["pixels/eye"].shape, shifts, pad)) or random_shift(obs, shifts, pad)
@@ -175,7 +175,7 @@ def test_a_training_step_keeps_pictures_as_bytes_and_shifts_them(monkeypatch: py
   assert all((a != b).any() for a, b in zip(before, numbers(state.algorithm.params), strict=True) if a.any())
 
 
-def test_only_pictures_can_be_shifted() -> None:
+def test_only_images_can_be_shifted() -> None:
   with pytest.raises(
     ConfigError, match=r"^agent\.augment_pixels=4 shifts images, and the task has none: set it to 0\.$"
   ):

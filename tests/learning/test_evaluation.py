@@ -87,13 +87,13 @@ class Seeing(Counting):
     return {"pixels/eye": {"gray[-1]": 1, "gray[0]": 1}}
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
-    return self._with_picture(super().reset(rng, model), 0)
+    return self._with_image(super().reset(rng, model), 0)
 
   def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     state = super().post_step(data, info, action)
-    return self._with_picture(state, state.info["age"])
+    return self._with_image(state, state.info["age"])
 
-  def _with_picture(self, state: State, age: Any) -> State:
+  def _with_image(self, state: State, age: Any) -> State:
     frame = jnp.full((3, 2, 1), age).astype(jnp.uint8)
     own: Any = state.obs
     return state.replace(obs=own | {"pixels/eye": jnp.concatenate([frame + 100, frame], axis=-1)})

@@ -1,4 +1,4 @@
-"""Pictures of a batch by MuJoCo-Warp, on the CPU: of a cart and its pole at several poses."""
+"""Images of a batch by MuJoCo-Warp, on the CPU: of a cart and its pole at several poses."""
 
 import os
 import subprocess
@@ -55,18 +55,18 @@ def batched() -> Any:
 
 
 @cache
-def pictures() -> Any:
+def images() -> Any:
   return jax.device_get(batched()(POSES, {})[0])
 
 
 def columns_of(geom: str, which: int) -> np.ndarray:
   """The columns in which a geom is seen by the camera that does not move."""
-  seen = pictures()["fixed"]["segmentation"][which] == task().mj_model.geom(geom).id
+  seen = images()["fixed"]["segmentation"][which] == task().mj_model.geom(geom).id
   return np.nonzero(seen.any(axis=0))[0]
 
 
 def test_shapes_and_types() -> None:
-  of = jax.tree.map(lambda x: (x.shape, x.dtype.name), pictures())
+  of = jax.tree.map(lambda x: (x.shape, x.dtype.name), images())
   size = (3, HEIGHT, WIDTH)
   assert set(of) == {"fixed", "lookatcart"}
   assert of["fixed"] == {"rgb": ((*size, 3), "uint8"), "depth": (size, "float32"), "segmentation": (size, "int32")}
@@ -77,12 +77,12 @@ def test_a_cart_is_seen_where_it_is() -> None:
   assert left < middle - 3 and right > middle + 3
   np.testing.assert_allclose(middle, (WIDTH - 1) / 2, atol=1)
   assert columns_of("pole_1", 1).mean() > right and columns_of("pole_1", 2).mean() < left  # it leans outwards
-  seen = pictures()["fixed"]["rgb"]
+  seen = images()["fixed"]["rgb"]
   assert (seen[0] != seen[1]).any() and (seen[1] != seen[2]).any()
 
 
 def test_depth_is_the_distance_along_the_optical_axis() -> None:
-  fixed = jax.tree.map(lambda x: x[0], pictures()["fixed"])
+  fixed = jax.tree.map(lambda x: x[0], images()["fixed"])
   cart = task().mj_model.geom("cart")
   front = 4 - cart.size[1]  # the camera stands 4 m before the rails
   np.testing.assert_allclose(fixed["depth"][fixed["segmentation"] == cart.id], front, atol=0.02)
@@ -93,7 +93,7 @@ def test_a_batch_is_what_its_environments_are_one_by_one_and_under_scan() -> Non
   def each(_: None, pose: jax.Array) -> tuple[None, Any]:
     return None, render(pose, {})[0]
 
-  batch = pictures()
+  batch = images()
   one_by_one = jax.jit(lambda poses: jax.lax.scan(each, None, poses)[1])(POSES)
   jax.tree.map(np.testing.assert_array_equal, batch, jax.device_get(one_by_one))
 
@@ -102,7 +102,7 @@ def test_a_map_over_a_batch_is_a_larger_batch_with_what_each_map_is_over() -> No
   wide = task().mjx_model.cam_fovy * jnp.array([1.0, 1.5])[:, None]
   over_lenses = jax.vmap(lambda pose, fovy: render(pose, {"cam_fovy": fovy})[0]["fixed"], (None, 0))
   seen = jax.device_get(jax.jit(jax.vmap(over_lenses, (0, None)))(POSES, wide))
-  jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[:, 0], y), seen, pictures()["fixed"])
+  jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[:, 0], y), seen, images()["fixed"])
   alone = jax.jit(lambda: render(POSES[1], {"cam_fovy": wide[1]})[0]["fixed"])()
   jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[1, 1], y), seen, jax.device_get(alone))
   assert (seen["rgb"][1, 0] != seen["rgb"][1, 1]).any()
@@ -118,7 +118,7 @@ def test_each_environment_has_its_own_lens_light_and_colour() -> None:
   areas = (seen["segmentation"] == cart).sum(axis=(1, 2))
   assert areas[1] < 0.7 * areas[0] and areas[2] == areas[0]
   assert seen["rgb"][2].mean() < seen["rgb"][0].mean()
-  np.testing.assert_array_equal(seen["segmentation"][0], pictures()["fixed"]["segmentation"][0])
+  np.testing.assert_array_equal(seen["segmentation"][0], images()["fixed"]["segmentation"][0])
 
 
 SHARES = """

@@ -1,4 +1,4 @@
-"""What is randomised is seen: each term alone changes the picture of the scene that it is made for."""
+"""What is randomised is seen: each term alone changes the image of the scene that it is made for."""
 
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ def test_every_term_is_seen(task: str, camera: str, terms: list[dict[str, Any]])
   env: Any = registry.load(task, overrides={"impl": "warp", "vision.enable": False})
   model = env.mj_model
   qpos = model.keyframe("low_home").qpos.copy() if model.nkey else model.qpos0.copy()
-  qpos[1] += 0.2  # the arm lower, so that all of its materials are in the picture; the pole leans
+  qpos[1] += 0.2  # the arm lower, so that all of its materials are in the image; the pole leans
   randomizers = [Randomizer(model, events(term)) for term in terms]
   fields = {field for randomizer in randomizers for field in randomizer.fields}
   nominal = {field: jnp.asarray(getattr(model, field)) for field in fields}

@@ -14,7 +14,7 @@ from tests.test_randomization import events
 LIGHT = {"field": "light_diffuse", "target": "all", "operation": "scale", "range": [0.0, 1.0]}
 
 
-def test_pictures_lie_in_rows_with_gaps() -> None:
+def test_images_lie_in_rows_with_gaps() -> None:
   page = sheet(np.arange(5, dtype=np.uint8)[:, None, None, None] * np.ones((1, 3, 4, 1), np.uint8))
   assert page.shape == (2 * 5, 3 * 6, 3) and page.dtype == np.uint8
   assert [page[1, 1, 0], page[1, 7, 1], page[6, 8, 2]] == [0, 1, 4]

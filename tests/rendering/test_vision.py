@@ -1,4 +1,4 @@
-"""What a camera's pictures become on their way into the observation, with a renderer that shows the position."""
+"""What a camera's images become on their way into the observation, with a renderer that shows the position."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -78,7 +78,7 @@ def values(state: Any) -> list[int]:
   return np.asarray(state.obs[PIXELS])[0, 0, 0].tolist()
 
 
-def test_pictures_stand_beside_the_tasks_own_observation(seeing: Any) -> None:
+def test_images_stand_beside_the_tasks_own_observation(seeing: Any) -> None:
   env = seeing(image="rgb", frames=2)
   assert env.observation_size == {"state": (2,), "privileged_state": (4,), PIXELS: (3, 2, 6)}
   assert env.observation_parts == {PIXELS: {"rgb[-1]": 3, "rgb[0]": 3}}
@@ -90,7 +90,7 @@ def test_pictures_stand_beside_the_tasks_own_observation(seeing: Any) -> None:
 def test_frames_are_of_this_episode_newest_last(seeing: Any) -> None:
   seen = [values(state) for state in roll(seeing(image="gray", frames=3), LENGTH + 2)]
   first = [[0, 0, 0], [0, 0, 10], [0, 10, 20], [10, 20, 30]]
-  assert seen == [*first, *first[:3]]  # the step that ends an episode shows the next one's first picture
+  assert seen == [*first, *first[:3]]  # the step that ends an episode shows the next one's first image
 
 
 def test_brightness_is_drawn_for_every_episode_and_kept_in_it(seeing: Any) -> None:

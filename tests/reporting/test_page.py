@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from playground.reporting import figures
-from playground.reporting.page import Heading, Link, Picture, Table, Text, mean_and_ci95, to_html, to_markdown
+from playground.reporting.page import Heading, Image, Link, Table, Text, mean_and_ci95, to_html, to_markdown
 
 
 @pytest.mark.filterwarnings("error")
@@ -26,7 +26,7 @@ def test_blocks_as_markdown_and_html():
     Heading(2, "A & B"),
     Text("run `it`"),
     Table(["a", "b"], [["x|y", "1"]]),
-    Picture("p", "<?xml?><svg/>", "C"),
+    Image("p", "<?xml?><svg/>", "C"),
   ]
   assert to_markdown(blocks, "d") == (
     "## A & B\n\nrun `it`\n\n| a | b |\n| --- | ---: |\n| x\\|y | 1 |\n\n![C](d/p.svg)\n"
@@ -40,7 +40,7 @@ def test_blocks_as_markdown_and_html():
 def test_a_png_and_a_link_are_html():
   curve = figures.Curve([1.0, 2.0], [3.0, 4.0], [0.1, 0.2])
   png = figures.curves({"task": {"ppo": curve}}, "steps", "return", "png")
-  html = to_html([Picture("p", png, ""), Table(["job"], [[Link("0<1", "jobs/0/")]])], "T")
+  html = to_html([Image("p", png, ""), Table(["job"], [[Link("0<1", "jobs/0/")]])], "T")
   assert png.startswith(b"\x89PNG") and 'src="data:image/png;base64,' in html
   assert '<td><a href="jobs/0/">0&lt;1</a></td>' in html
 

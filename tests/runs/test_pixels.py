@@ -1,4 +1,4 @@
-"""A whole run from pixels on the CPU: Warp's pictures, a CNN, evaluation, checkpoints."""
+"""A whole run from pixels on the CPU: Warp's images, a CNN, evaluation, checkpoints."""
 
 import json
 from pathlib import Path

@@ -91,7 +91,7 @@ def setting_of(overrides: Sequence[str]) -> list[str]:
 
 
 def _precision(hardware: Hardware, trainer: Trainer) -> str:
-  manifest, value_dtype = hardware.facts, getattr(trainer.networks, "value_dtype", None)
+  manifest, value_dtype = hardware.machine, getattr(trainer.networks, "value_dtype", None)
   critic = f", critic activations {value_dtype}" if value_dtype else ""
   return f"physics {manifest['matmul_precision']}, networks {manifest['network_precision']}{critic}"
 

@@ -12,10 +12,10 @@ from playground.benchmark.report.public import beside_public
 from playground.benchmark.report.suites import write_pages
 from playground.errors import ConfigError
 from playground.files import need_folder, write_text
-from playground.reporting.page import Block, Heading, Picture, Text, to_html, to_markdown
+from playground.reporting.page import Block, Heading, Image, Text, to_html, to_markdown
 
 ROWS = ("results/reference", "results/benchmarks")
-PICTURES = "report_pictures"
+IMAGES = "report_images"
 TITLE = "Measured"
 SECTIONS = (
   *(sections.throughput, sections.compared, sections.together, sections.startup, sections.scaling),
@@ -53,11 +53,11 @@ def run(options: Options) -> int:
     raise ConfigError(f"rows={','.join(options.rows)}: there is no measured row in these folders.")
   blocks = page(evidence)
   try:
-    (out / PICTURES).mkdir(parents=True, exist_ok=True)
+    (out / IMAGES).mkdir(parents=True, exist_ok=True)
     for block in blocks:
-      if isinstance(block, Picture) and isinstance(block.image, str):
-        write_text(out / PICTURES / f"{block.name}.svg", block.image)
-    write_text(out / "report.md", to_markdown(blocks, PICTURES))
+      if isinstance(block, Image) and isinstance(block.image, str):
+        write_text(out / IMAGES / f"{block.name}.svg", block.image)
+    write_text(out / "report.md", to_markdown(blocks, IMAGES))
     write_text(out / "report.html", to_html(blocks, TITLE))
   except OSError as error:
     raise ConfigError(f"out={out} cannot be written: {error.strerror}.") from None

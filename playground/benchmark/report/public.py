@@ -13,7 +13,7 @@ from playground.config.files import shipped, task_names
 from playground.files import read_csv
 from playground.paper import tasks_of
 from playground.reporting import figures
-from playground.reporting.page import Block, Heading, Picture, Table, Text
+from playground.reporting.page import Block, Heading, Image, Table, Text
 
 Points = list[tuple[float, float]]  # (environment steps, return), steps ascending
 SHARE = 0.95  # of the best public PPO at equal steps: below it a task counts as below
@@ -53,7 +53,7 @@ def beside_public(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   )
   panels = {task: _panel(ours[task], theirs[task]) for task in shared}
   drawn = figures.curves(panels, "million control steps", "return").decode()
-  yield Picture("public", drawn, "Our curves over public ones, of each public algorithm the one that ends highest.")
+  yield Image("public", drawn, "Our curves over public ones, of each public algorithm the one that ends highest.")
   compared = [_compared(task, curve, theirs[task]) for task in shared for curve in ours[task]]
   rows = [row.cells() for row in sorted(compared, key=lambda row: (-row.below, row.ratio))]
   header = ["task", "our run", "our actions", "ours", "million steps", "best public PPO at equal steps", "of it", ""]

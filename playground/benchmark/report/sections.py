@@ -8,7 +8,7 @@ from playground.benchmark.report.evidence import Evidence, Figure
 from playground.config import compose
 from playground.paper import SUITES, paper_table
 from playground.reporting import figures
-from playground.reporting.page import NOT_MEASURED, Block, Heading, Picture, Table, Text, short
+from playground.reporting.page import NOT_MEASURED, Block, Heading, Image, Table, Text, short
 
 TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipulation": "Manipulation"}
 SPEED = "training_steps_per_s"
@@ -143,7 +143,7 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     yield nothing("scaling")
     return
   points = {name: list(line.items()) for name, line in series.items()}
-  yield Picture("scaling", figures.lines("steps/s", points, "environments", "steps/s", log=True), "Steps a second.")
+  yield Image("scaling", figures.lines("steps/s", points, "environments", "steps/s", log=True), "Steps a second.")
   order = lambda row: (row[0], row[1], int(row[2]))
   yield Table(["task", "", "environments", "steps/s", "memory (GiB)", "device", "note"], sorted(rows, key=order))
 
@@ -183,7 +183,7 @@ def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     seconds = f"{_budget(figure['task'], figure['agent']) / figure.mean:,.0f}"
     rows.append([task, count, kind, _with_ci(figure), *times, seconds, device, note])
   if rows:
-    yield Picture("topology", figures.bars("training steps/s", groups, "steps/s"), "Devices.")
+    yield Image("topology", figures.bars("training steps/s", groups, "steps/s"), "Devices.")
     derived = ["times one device", "efficiency", "its budget takes (s)"]
     yield Table(["task", "devices", "hyperparameters", "steps/s", *derived, "device", "note"], rows)
   else:
@@ -267,7 +267,7 @@ def breakdown(evidence: Evidence, notes: Notes) -> Iterable[Block]:
       cells = [f"{shares[part]:.3g}" if part in shares else "" for part in PARTS]
       rows.append([task, *cells, f"{1 / times[-1]:,.0f}", device, notes.number(of_it[have[-1]])])
   if bars:
-    yield Picture("breakdown", figures.stacked("share of training time", bars, "share"), "Where the time goes.")
+    yield Image("breakdown", figures.stacked("share of training time", bars, "share"), "Where the time goes.")
     yield Table(["task", *(f"{part} (µs)" for part in PARTS), "steps/s", "device", "note"], rows)
   else:
     yield nothing("breakdown")
@@ -295,9 +295,9 @@ def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     task, run = parts.groups() if parts else (name, name)
     groups.setdefault(task, {})[run] = points
   if groups:
-    yield Picture("curves", _curves(groups), "Return of evaluations over control steps.")
+    yield Image("curves", _curves(groups), "Return of evaluations over control steps.")
   if runs := runs_by_step(evidence):
-    yield Picture("runs", _curves(runs), "Return of runs that were measured whole, means over seeds.")
+    yield Image("runs", _curves(runs), "Return of runs that were measured whole, means over seeds.")
   rows = []
   for figure in evidence.find(quantity="final_return"):
     if figure["benchmark"] != "chain":

@@ -50,11 +50,11 @@ class Pad:
   def read(cls, note: str) -> "Pad":
     """Parses the script's state; an invalid state gives a gamepad at rest."""
     try:
-      said = msgspec.json.decode(note, type=_Note)
+      message = msgspec.json.decode(note, type=_Note)
     except msgspec.MsgspecError:
       return cls()
-    left_x, left_y, right_x = [-x if abs(x) > _DEADBAND else 0.0 for x in said.axes[:3]]
-    return cls((left_y, left_x, right_x), frozenset(i for i, down in enumerate(said.pressed) if down))
+    left_x, left_y, right_x = [-x if abs(x) > _DEADBAND else 0.0 for x in message.axes[:3]]
+    return cls((left_y, left_x, right_x), frozenset(i for i, down in enumerate(message.pressed) if down))
 
 
 class Gamepads:

@@ -148,8 +148,8 @@ class Gate:
     cookies = [
       pair.strip().partition("=") for header in request.headers.get_all("Cookie") for pair in header.split(";")
     ]
-    told = [value for name, _, value in cookies if name == self._cookie]
-    return told + parse_qs(urlsplit(request.path).query).get("token", [])
+    tokens = [value for name, _, value in cookies if name == self._cookie]
+    return tokens + parse_qs(urlsplit(request.path).query).get("token", [])
 
   def _start(self, host: str, port: int) -> viser.ViserServer:
     """Starts viser's server, which calls `serve` of `websockets` in its constructor and passes no options to it."""

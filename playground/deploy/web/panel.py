@@ -113,9 +113,9 @@ class Panel:
 
   def _add_command(self) -> list[viser.GuiSliderHandle[float]]:
     player = self._session.player
-    told = player.exported.contract.get("command") or {}
-    high = np.array(told.get("max") or [_DEFAULT_RANGE] * len(AXES))
-    low = -high if told.get("min") is None else np.array(told["min"])
+    command = player.exported.contract.get("command") or {}
+    high = np.array(command.get("max") or [_DEFAULT_RANGE] * len(AXES))
+    low = -high if command.get("min") is None else np.array(command["min"])
     sliders: list[viser.GuiSliderHandle[float]] = []
 
     def take(_: object) -> None:

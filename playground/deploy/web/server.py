@@ -57,11 +57,11 @@ class Watch:
 
 def watch(session: Session, host: str, port: int, console: Console) -> None:
   """Serves a session until it is interrupted."""
-  with noted_signals() as told:
+  with noted_signals() as ended:
     watching = Watch(session, host, port)
     try:
       console.print(f"Watch it at {watching.url} (ctrl+c here ends it).", soft_wrap=True)
-      while not told.is_set():
+      while not ended.is_set():
         watching.frame()
     finally:
       watching.close()

@@ -1,4 +1,4 @@
-"""The hand that picks up by what it sees: what counts as success, and what is hidden. Without physics or pictures."""
+"""The hand that picks up by what it sees: what counts as success, and what is hidden. Without physics or images."""
 
 from typing import Any
 
