@@ -250,7 +250,7 @@ def test_a_checkpoint_that_is_not_damaged_is_never_passed_over(
   newest, *_ = find_checkpoints(copy)
   if what == "open files":
     monkeypatch.setattr(checkpoints, "_RETRY_AFTER_S", ())
-    monkeypatch.setattr(Checkpoint, "_arrays", lambda *_: (_ for _ in ()).throw(OSError(errno.EMFILE, "Too many")))
+    monkeypatch.setattr(Checkpoint, "_read_arrays", lambda *_: (_ for _ in ()).throw(OSError(errno.EMFILE, "Too many")))
     expected = f"{newest} cannot be read now"
   elif what == "shape":
     config = (copy / "config.yaml").read_text()
