@@ -127,7 +127,9 @@ def _is_critic(name: str) -> bool:
 
 
 def _forget_machine(folder: Path) -> None:
-  """Removes the paths and the name of the machine from a policy's configuration and manifest."""
+  """Removes the paths and the name of the machine from a policy's configuration, manifest and checkpoint."""
+  for note in folder.rglob("commit_success.txt"):  # Orbax writes its path; only that the file exists counts
+    note.write_text("Checkpoint commit was successful\n")
   config = folder / "config.yaml"
   config.write_text(re.sub(r"^run_dir: .*$", "run_dir: null", config.read_text(), flags=re.MULTILINE))
   overrides = folder / "overrides.yaml"
