@@ -1,6 +1,6 @@
 """A task without physics, so that trainers compile in seconds: move a point to the origin."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -168,3 +168,25 @@ class Recorder:
 
 def numbers(tree: Any) -> list[np.ndarray]:
   return [np.asarray(x) for x in jax.tree.leaves(tree)]
+
+
+def check_resume(trainer: Any, run: Callable[..., Any], recorders: Sequence[Sequence[Recorder]], expected: Any) -> None:
+  """Stops agents after their second save and goes on: their state is `expected`, their rows those of an uncut run.
+
+  Args:
+    trainer: of the agents.
+    run: trains with recorders, from a state and update if given; returns the last state.
+    recorders: of the uncut run, of the first part and of the second part.
+    expected: the last state of the uncut run.
+  """
+  whole, first, second = recorders
+  for recorder in first:
+    recorder.stop_after = 2
+  run(first)
+  update, _ = first[0].saved[-1]
+  trainer.settings = trainer.join([recorder.saved[-1][1].settings for recorder in first])
+  state = trainer.place(trainer.join([recorder.saved[-1][1] for recorder in first]))
+  for ours, theirs in zip(numbers(run(second, state, update)), numbers(expected), strict=True):
+    np.testing.assert_array_equal(ours, theirs)
+  for recorder, one, two in zip(whole, first, second, strict=True):
+    assert recorder.rows == one.rows + two.rows

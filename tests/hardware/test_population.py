@@ -19,7 +19,7 @@ from playground.learning.loop import Loop, compile_program, schedule
 from playground.learning.population import PARENT, Population
 from playground.learning.trainer import Trainer, trainer_settings
 from playground.limits import positive
-from tests.dummy import SMALL, PointTask, Recorder, numbers
+from tests.dummy import SMALL, PointTask, Recorder, check_resume, numbers
 
 EVERY = 8  # training steps between evaluations; SAC only fills its buffer in the first four
 RATE = "agent.learning_rate"
@@ -37,7 +37,7 @@ def run(recorders, state=None, update=None):
   return loop.run(loop.init() if state is None else state, update)[0]
 
 whole, first, second = ([Recorder() for _ in seeds] for _ in range(3))
-expected = numbers(run(whole))
+expected = run(whole)
 exchanges = []
 for at in (1, 2):  # of rows; nothing is exchanged before training and after it
   saved = [dict(recorder.saved)[EVERY * at] for recorder in whole]
@@ -53,16 +53,7 @@ for at in (1, 2):  # of rows; nothing is exchanged before training and after it
   assert len({policy.tobytes() for policy in policies}) == len(kept), "only what was copied is the same"
   assert all(recorder.rows[at][1][f"population/{RATE}"] == s.settings[RATE] for recorder, s in zip(whole, saved))
 
-for recorder in first:
-  recorder.stop_after = 2
-run(first)
-update, _ = first[0].saved[-1]
-trainer.settings = trainer.join([recorder.saved[-1][1].settings for recorder in first])
-state = trainer.place(trainer.join([recorder.saved[-1][1] for recorder in first]))
-for ours, theirs in zip(numbers(run(second, state, update)), expected, strict=True):
-  np.testing.assert_array_equal(ours, theirs)
-for recorder, one, two in zip(whole, first, second):
-  assert recorder.rows == one.rows + two.rows
+check_resume(trainer, run, (whole, first, second), expected)
 print(json.dumps([list(trainer.mesh.devices.shape), exchanges]))
 """
 

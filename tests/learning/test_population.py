@@ -12,7 +12,7 @@ from playground.learning.loop import Loop, compile_program, schedule
 from playground.learning.population import PARENT, Population
 from playground.learning.trainer import Trainer, trainer_settings
 from playground.limits import positive
-from tests.dummy import SMALL_PPO, PointTask, Recorder, numbers
+from tests.dummy import SMALL_PPO, PointTask, Recorder, check_resume, numbers
 
 RATE, COST = "agent.learning_rate", "agent.entropy_cost"
 POPULATION = Population(exploit_every=1, explore={RATE: positive(1e-2)}, seed=5)
@@ -68,13 +68,4 @@ def test_a_population_goes_on_where_it_was_cut_short() -> None:
       assert recorder.rows[at][1][f"population/{RATE}"] == state.settings[RATE]
     assert not np.array_equal(saved[0].env_state.data.qpos, saved[1].env_state.data.qpos)
 
-  for recorder in first:
-    recorder.stop_after = 2
-  run(first)
-  update, _ = first[0].saved[-1]
-  trainer.settings = trainer.join([recorder.saved[-1][1].settings for recorder in first])
-  state = trainer.place(trainer.join([recorder.saved[-1][1] for recorder in first]))
-  for a, b in zip(numbers(run(second, state, update)), numbers(expected), strict=True):
-    np.testing.assert_array_equal(a, b)
-  for recorder, others in zip(whole, zip(first, second, strict=True), strict=True):
-    assert recorder.rows == others[0].rows + others[1].rows
+  check_resume(trainer, run, (whole, first, second), expected)
