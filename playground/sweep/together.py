@@ -51,8 +51,9 @@ class TogetherLauncher(LocalLauncher):
       if folder.state().status != "finished" and not folder.locked():
         config = compose([f"resume={quoted(folder.path)}"] if folder.begun else job.overrides)
         programs.setdefault(program_of(config) or job.name, []).append(job)
+    share = math.ceil(sum(map(len, programs.values())) / len(self.slots))  # with it no slot stays empty
     for same in programs.values():
-      size = min(self._max_agents, math.ceil(len(same) / len(self.slots)))  # no slot stays empty
+      size = min(self._max_agents, share)
       size = len(same) if self._population else size
       groups = [same[i : i + size] for i in range(0, len(same), size)]
       self._groups |= {job.name: group for group in groups for job in group}

@@ -13,7 +13,7 @@ from playground.cli.run import main
 from playground.config.sweep_options import TogetherConfig
 from playground.errors import ConfigError
 from playground.sweep.folder import Job, SweepDirectory
-from playground.sweep.local import LocalLauncher
+from playground.sweep.local import LocalLauncher, Slot
 from playground.sweep.together import TogetherLauncher
 from tests.processes import WITHOUT_WARP
 from tests.runs.helpers import TASK
@@ -50,6 +50,15 @@ def test_jobs_of_one_program_are_one_process(
   launcher = TogetherLauncher(sweep, TogetherConfig(max_agents=max_agents, cores_per_job=1000))
   assert all(launcher.start(job) for job in sweep.jobs)
   assert started == groups
+
+
+def test_jobs_of_one_program_stay_together_where_other_jobs_fill_the_slots(
+  tmp_path: Path, started: list[list[str]]
+) -> None:
+  sweep = make(tmp_path, "seed=1", "seed=2", "env=PendulumSwingup seed=1", "env=PendulumSwingup seed=2")
+  launcher = TogetherLauncher(sweep, TogetherConfig(), slots=[Slot(i, None, ()) for i in range(2)])
+  assert all(launcher.start(job) for job in sweep.jobs)
+  assert started == [["000", "001"], ["002", "003"]]
 
 
 def test_finished_jobs_are_left_out_and_a_search_adds_jobs(tmp_path: Path, started: list[list[str]]) -> None:
