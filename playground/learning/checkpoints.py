@@ -59,7 +59,6 @@ logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax warns about its ow
 Arrays = list[np.ndarray]
 Leaf = list[Plain]  # name, shape and dtype
 T = TypeVar("T")
-Fetch = Callable[[], np.ndarray | None]
 
 
 class NoCheckpointError(CheckpointError):
@@ -137,7 +136,7 @@ class CheckpointStore:
     policy: PyTree,
     state: PyTree,
     meta: Section,
-    replay: Fetch | None = None,
+    replay: np.ndarray | None = None,
     episode_return: float | None = None,
   ) -> None:
     """Starts saving. The arrays must not be donated or deleted meanwhile. Raises an earlier failure.
@@ -147,7 +146,7 @@ class CheckpointStore:
       policy: the item of that name.
       state: the item of that name.
       meta: further entries of the item of that name.
-      replay: fetches that item on the saving thread, None without one. Older checkpoints lose theirs.
+      replay: that item, None without one. Older checkpoints lose theirs.
       episode_return: of the policy, if it has been evaluated; a non-finite one counts as none.
     """
     self.wait()
@@ -167,11 +166,9 @@ class CheckpointStore:
     self._alias.remove()
     os.close(self._handle)
 
-  def _write(self, step: int, policy: PyTree, state: PyTree, meta: dict[str, Plain], replay: Fetch | None) -> None:
-    trees = {"policy": policy, "state": state}
-    if replay and (experience := replay()) is not None:
-      trees["replay"] = experience
-    arrays = {name: [np.asarray(x) for x in jax.device_get(jax.tree.leaves(tree))] for name, tree in trees.items()}
+  def _write(self, step: int, policy: PyTree, state: PyTree, meta: dict[str, Plain], replay: np.ndarray | None) -> None:
+    trees = {"policy": policy, "state": state} | ({} if replay is None else {"replay": replay})
+    arrays = {name: [np.asarray(x) for x in jax.tree.leaves(tree)] for name, tree in trees.items()}
     meta |= {
       "format": FORMAT,
       "step": step,

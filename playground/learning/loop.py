@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol
+from typing import Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ class Callbacks(Protocol):
     ...
 
   def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
-    """Saves a state, whose buffers stay valid; `final` marks the end of training."""
+    """Saves a state, which is on the host; `final` marks the end of training."""
     ...
 
   def should_stop(self) -> bool:
@@ -99,7 +99,7 @@ class CompiledFunctions:
   """The compiled functions of a run, and its models.
 
   Attributes:
-    train, init, reset, copy: see `Trainer`.
+    train, init, reset, gather: see `Trainer`.
     evaluate: see `evaluation.make_evaluator`.
     model: randomised model fields of the training environments, each [num_envs, ...].
     eval_model: of the evaluation environments.
@@ -112,7 +112,7 @@ class CompiledFunctions:
   init: Callable[..., TrainState]
   reset: Callable[..., TrainState]
   evaluate: Evaluate
-  copy: Callable[[TrainState], TrainState]
+  gather: Callable[[TrainState], TrainState]
   model: ModelFields
   eval_model: ModelFields
   trace_s: float
@@ -168,7 +168,8 @@ def compile_program(
       stored.save(lowered)
     except OSError as error:
       notices.append(f"The program was not stored, so the next start traces again: {first_line(error)}.")
-  compiled = {"reset": trainer.reset} | {name: function for name, (function, _) in results.items()}
+  compiled = {name: getattr(trainer, name) for name in ("reset", "gather")}
+  compiled |= {name: function for name, (function, _) in results.items()}
   notice = " ".join(filter(None, notices)) or None
   return CompiledFunctions(
     **compiled, model=model, eval_model=eval_model, trace_s=trace_s, compile_s=compile_s, notice=notice
@@ -186,7 +187,8 @@ def _compile_stored(
   futures = {name: pool.submit(function.compile, trainer.mesh) for name, function in functions.items()}
   model, eval_model = shard(draw(), trainer.mesh)
   try:
-    compiled = {"reset": trainer.reset} | {name: future.result() for name, future in futures.items()}
+    compiled = {name: getattr(trainer, name) for name in ("reset", "gather")}
+    compiled |= {name: future.result() for name, future in futures.items()}
   except Exception as error:  # any error: JAX and XLA read a file
     raise stored.discard(error) from error
   compile_s = time.perf_counter() - start
@@ -224,20 +226,21 @@ def _trace(
     "train": submit(trainer.train, state, model, count),  # first, because it takes XLA longest
     "init": submit(trainer.init, key, model, policy, trainer.settings),
     "evaluate": submit(evaluate, trainer.policy(state), key, eval_model, state.settings),
-    "copy": submit(trainer.copy, state),
   }
+  if is_multiprocess():
+    futures["gather"] = submit(cast(Wrapped, trainer.gather), state)
   return futures | {"reset": submit(trainer.reset, state, key, model)} if resets else futures
 
 
 @dataclasses.dataclass
 class SegmentResult:
-  """The results of training up to one event, on the device."""
+  """The results of training up to one event, on the host."""
 
   event: ScheduleEvent
   steps: int
-  trained: dict[str, jax.Array] | None = None
+  trained: dict[str, np.ndarray] | None = None
   train_s: float = 0.0
-  evaluated: tuple[dict[str, jax.Array], Recording] | None = None
+  evaluated: tuple[dict[str, np.ndarray], Recording] | None = None
   lineage: tuple[np.ndarray, dict[str, np.ndarray]] | None = None  # see `Population.exchange`
   eval_s: float = 0.0
   captured: Sequence[Step | None] | None = None
@@ -247,6 +250,9 @@ class SegmentResult:
 @dataclasses.dataclass
 class Loop:
   """Runs the schedule of one agent or several, from a state at one of its events to the end.
+
+  Results are fetched between two programs on the device, never while one runs. Warp captures CUDA graphs of its kernels
+  on the stream of the running program, and a transfer that another thread starts meanwhile breaks the capture.
 
   Attributes:
     trainer: of the run.
@@ -308,7 +314,7 @@ class Loop:
           reported.result()  # one row is in flight; its error is raised here
         stop = any_process(all(each.should_stop() for each in self.callbacks)) and event is not events[-1]
         if stop:
-          done.snapshot = self.functions.copy(state) if is_multiprocess() else state
+          done.snapshot = jax.device_get(self.functions.gather(state))
         reported = reports.submit(lambda results=results: [self._report(each) for each in results])
         if stop:
           break
@@ -317,19 +323,19 @@ class Loop:
     return state, at == self.events[-1].update
 
   def _work(self, state: TrainState, event: ScheduleEvent, num_updates: int) -> tuple[TrainState, SegmentResult]:
-    """Trains up to an event and performs its actions; waits for metrics, not for resets and copies."""
+    """Trains up to an event and performs its actions, each of which has ended before the next begins."""
     done = SegmentResult(event, num_updates * self.trainer.steps_per_update)
     if num_updates:
       start = time.perf_counter()
-      state, done.trained = self.functions.train(state, self.functions.model, np.int32(num_updates))
-      jax.block_until_ready(done.trained)
+      state, trained = self.functions.train(state, self.functions.model, np.int32(num_updates))
+      trained = done.trained = jax.device_get(trained)
       done.train_s = time.perf_counter() - start
       self.train_s += done.train_s
       if self.first_update_s is None:
         self.first_update_s = done.train_s / num_updates
         self.first_update_at = start + self.first_update_s
-      if np.any(done.trained["nonfinite"] > 0):
-        capture = jax.device_get(self.functions.copy(state).capture if is_multiprocess() else state.capture)
+      if np.any(trained["nonfinite"] > 0):
+        capture = jax.device_get(self.functions.gather(state).capture if is_multiprocess() else state.capture)
         shapes = self.trainer.shapes((state.env_state, self.functions.model))
         action_size = self.trainer.env.action_size
         first = lambda i: self.trainer.agent(capture, i).first(shapes[0], action_size, shapes[1])
@@ -340,11 +346,11 @@ class Loop:
         state, done.lineage = self._exchange(state, event, scores["episode_reward"], self.population)
     if event.reset:
       state = self.functions.reset(state, self._key(self._reset_key, event), self.functions.model)
+      jax.block_until_ready(state)
     late = any_process(time.perf_counter() - self._last_save > SAVE_EVERY_S)
     due = late or event.evaluate or event is self.events[-1]
     if due:
-      # A copy, because the next training call donates the state's buffers while this one is written to disk.
-      done.snapshot = self.functions.copy(state)
+      done.snapshot = jax.device_get(self.functions.gather(state))
       self._last_save = time.perf_counter()
     return state, done
 
@@ -356,33 +362,31 @@ class Loop:
       done.lineage = np.arange(len(self.callbacks)), jax.device_get(settings)
     return done
 
-  def _evaluate(self, done: SegmentResult, policy: Policy, settings: PyTree) -> dict[str, jax.Array]:
+  def _evaluate(self, done: SegmentResult, policy: Policy, settings: PyTree) -> dict[str, np.ndarray]:
     """Evaluates a policy with the random numbers of an event; returns the scores."""
     start = time.perf_counter()
     key = self._key(self._eval_key, done.event)
-    done.evaluated = self.functions.evaluate(policy, key, self.functions.eval_model, settings)
-    jax.block_until_ready(done.evaluated)
+    scores, _ = done.evaluated = jax.device_get(
+      self.functions.evaluate(policy, key, self.functions.eval_model, settings)
+    )
     done.eval_s = time.perf_counter() - start
-    return done.evaluated[0]
+    return scores
 
   def _exchange(
-    self, state: TrainState, event: ScheduleEvent, returns: jax.Array, population: Population
+    self, state: TrainState, event: ScheduleEvent, returns: np.ndarray, population: Population
   ) -> tuple[TrainState, tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Exchanges between the agents of a population if it is due, never at the end of the run."""
     settings = jax.device_get(state.settings)
     count = sum(each.evaluate and 0 < each.update <= event.update for each in self.events)
     if event is self.events[-1] or count % population.exploit_every:
       return state, (np.arange(len(self.callbacks)), settings)
-    lineage = population.exchange(np.asarray(returns), settings, event.update)
+    lineage = population.exchange(returns, settings, event.update)
     return self.trainer.inherit(state, *lineage), lineage
 
   def _report(self, done: SegmentResult) -> None:
     """Passes results to the callbacks of each agent."""
     step = done.event.update * self.trainer.steps_per_update
     trained, (scores, recording), snapshot = done.trained, done.evaluated or (None, None), done.snapshot
-    trained, scores = jax.device_get((trained, scores))
-    if self.trainer.num_agents:
-      recording, snapshot = jax.device_get((recording, snapshot))  # one transfer; the part of an agent is a view
     for i, callbacks in enumerate(self.callbacks):
       row: Metrics = {}
       if trained is not None:

@@ -118,11 +118,8 @@ class Trainer:
     self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS), P(), P()), spec)
     self.reset = jit_on_mesh(self._reset, mesh, (spec, P(), P(AXIS)), spec, donate_argnums=0)
     self.train = jit_on_mesh(self._train, mesh, (spec, P(AXIS), None), (spec, P()), donate_argnums=0)
-    copy = lambda state: jax.tree.map(jnp.copy, self._saved(state))
-    # Whole on every device where no process sees all of them.
-    self.copy = (
-      gather_on_mesh(copy, mesh, spec) if is_multiprocess() else jit_on_mesh(copy, mesh, (spec,), self._saved(spec))
-    )
+    # The saved part of a state; whole on every device where no process sees all of them.
+    self.gather = gather_on_mesh(self._saved, mesh, spec) if is_multiprocess() else self._saved
 
   def join(self, parts: Sequence[PyTree]) -> PyTree:
     """Stacks the trees of all agents into one; that of a single agent stays unchanged."""
@@ -167,12 +164,8 @@ class Trainer:
       return []
     each, limit = buffer.nbytes * max(self.num_agents, 1) / self.mesh.size, device_memory(self.mesh)
     size = f"{buffer.size:,} transitions of {buffer.width} numbers, {each / 1e9:.2f} GB on each device"
-    size += ", and as much again while a checkpoint is saved" * buffer.saved
-    if limit is not None and each * (1 + buffer.saved) > limit:
-      raise ConfigError(
-        f"agent.max_replay_size={buffer.max_size} is {size}, but a device has {limit / 1e9:.2f} GB: "
-        "lower it, or set agent.checkpoint_replay=false."
-      )
+    if limit is not None and each > limit:
+      raise ConfigError(f"agent.max_replay_size={buffer.max_size} is {size}, which has {limit / 1e9:.2f} GB: lower it.")
     return [f"Replay buffer: {size}."]
 
   # Checkpoints
@@ -183,11 +176,11 @@ class Trainer:
     return self.policy(state), self._without_data(rest)
 
   def experience(self, state: TrainState) -> np.ndarray | None:
-    """Returns the replay buffer's data on the host; it is large, so only the newest checkpoint has it."""
+    """Returns the data of a fetched state's replay buffer; it is large, so only the newest checkpoint has it."""
     if self._buffer is None or not self._buffer.saved:
       return None
     assert state.replay is not None
-    return np.asarray(state.replay.data)[: int(self._buffer.held(state.replay))]
+    return np.asarray(state.replay.data)[: min(int(state.replay.inserted), self._buffer.slots)]
 
   def restore(self, checkpoint: Checkpoint, template: TrainState) -> tuple[TrainState, str]:
     """Reads a training state.

@@ -2,7 +2,6 @@
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -116,7 +115,7 @@ class RunCallbacks:
       "columns": self._trackers.columns,
       "settings": {key: np.asarray(value).tolist() for key, value in state.settings.items()},
     }
-    experience = None if final else partial(self._trainer.experience, state)
+    experience = None if final else self._trainer.experience(state)
     self._store.save(step, policy, rest, meta, experience, None if self._copied else self._return)
 
   def should_stop(self) -> bool:

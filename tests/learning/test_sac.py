@@ -182,7 +182,7 @@ def save(folder: Path, trainer: Trainer, *states: Any) -> list[Path]:
   for i, state in enumerate(states):
     policy, rest = trainer.split(state)
     meta = {"update": i, "wall_clock_s": 0.0, "env": "Point", "config": {}}
-    store.save(10 * (i + 1), policy, rest, meta, lambda state=state: trainer.experience(state))
+    store.save(10 * (i + 1), policy, rest, meta, trainer.experience(state))
   store.close()
   return find_checkpoints(folder)
 
@@ -223,14 +223,14 @@ def test_without_the_buffer_it_is_filled_again(tmp_path: Path) -> None:
   assert np.isfinite(metrics["critic_loss"])
 
 
-def test_a_buffer_that_is_not_to_be_saved_is_not_even_copied(tmp_path: Path) -> None:
+def test_a_buffer_that_is_not_to_be_saved_is_not_even_fetched(tmp_path: Path) -> None:
   trainer = other()
   state = trained(6, trainer)
-  copy = trainer.copy(state)
-  assert copy.replay.data is None
-  for kept in (copy, state):
+  saved = trainer.gather(state)
+  assert saved.replay.data is None
+  for kept in (saved, state):
     assert trainer.experience(kept) is None
-  (path,) = save(tmp_path, trainer, copy)
+  (path,) = save(tmp_path, trainer, saved)
   restored: Any = trainer.restore(Checkpoint(path), jax.eval_shape(lambda: state))[0]
   assert not restored.replay.inserted
   for a, b in zip(numbers(state.algorithm.opt_state), numbers(restored.algorithm.opt_state), strict=True):
@@ -259,17 +259,14 @@ def test_another_buffer_is_refused(tmp_path: Path) -> None:
 
 
 def test_memory_is_stated_and_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+  large = dataclasses.replace(SMALL_SAC, max_replay_size=10**8)
   monkeypatch.setattr(trainer_module, "device_memory", lambda mesh: None)
-  (said,) = point_trainer(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
-  assert said.startswith("Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device, and as much ")
-  monkeypatch.setattr(trainer_module, "device_memory", lambda mesh: 10 * 10**9)
-  with pytest.raises(ConfigError, match=r"agent.max_replay_size=100000000 is .* but a device has 10.00 GB: lower it"):
-    point_trainer(dataclasses.replace(SMALL_SAC, max_replay_size=10**8)).notices()
-  config = dataclasses.replace(SMALL_SAC, max_replay_size=10**8, checkpoint_replay=False)
-  assert point_trainer(config).notices() == [
-    "Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device."
-  ]
-  (said,) = point_trainer(dataclasses.replace(config, replay_dtype="bfloat16")).notices()
+  (said,) = point_trainer(large).notices()
+  assert said == "Replay buffer: 100,000,000 transitions of 17 numbers, 6.80 GB on each device."
+  monkeypatch.setattr(trainer_module, "device_memory", lambda mesh: 5 * 10**9)
+  with pytest.raises(ConfigError, match=r"agent.max_replay_size=100000000 is .* which has 5.00 GB: lower it"):
+    point_trainer(large).notices()
+  (said,) = point_trainer(dataclasses.replace(large, replay_dtype="bfloat16")).notices()
   assert "17 numbers, 4.00 GB" in said, "14 numbers of 2 bytes; reward, discount and nonfinite of 4"
 
 
