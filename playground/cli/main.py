@@ -140,7 +140,6 @@ def _parser() -> argparse.ArgumentParser:
     "--agent", choices=("zero", "random"), default="zero", help="zero or random actions (default: %(default)s)"
   )
   view.add_argument("--randomize", action="store_true", help="draw the model by the task's startup events")
-  view.add_argument("--no-events", action="store_true", help="switch pushes and other interval events off")
   view.add_argument("--seed", type=int, default=0, help="seed of episodes and model (default: %(default)s)")
   _add_places(view, "render an episode to this .mp4 instead")
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
@@ -172,11 +171,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_places(parser: argparse.ArgumentParser, video: str) -> argparse._MutuallyExclusiveGroup:
-  """Adds the options that choose where to show a policy or a task; returns the group of the exclusive ones."""
+  """Adds the options that choose how and where to show a policy or a task; returns the group of the exclusive ones."""
   shown = parser.add_mutually_exclusive_group()
   shown.add_argument("--video", metavar="FILE", help=video)
   shown.add_argument("--viewer", action="store_true", help="show it in MuJoCo's viewer instead")
   parser.add_argument("--camera", metavar="NAME", help=_CAMERA)
+  parser.add_argument(
+    "--no-events", dest="interval_events", action="store_false", help="switch pushes and other interval events off"
+  )
   parser.add_argument("--host", default="127.0.0.1", help="address that the page listens on (default: %(default)s)")
   parser.add_argument("--port", type=int, default=8080, help="port of the page (default: %(default)s)")
   return shown
@@ -227,8 +229,8 @@ def _play(args: argparse.Namespace) -> int:
 def _view(args: argparse.Namespace) -> int:
   from playground.cli.play import play
 
-  own = {"interval_events": not args.no_events, "episodes": 1, "web": not (args.video or args.viewer)}
-  return play(args.task, **own, **_named(args, "task", "no_events"))
+  own = {"episodes": 1, "web": not (args.video or args.viewer)}
+  return play(args.task, **own, **_named(args, "task"))
 
 
 def _pretrained(args: argparse.Namespace) -> int:

@@ -57,7 +57,7 @@ def play(
     agent: zero or random actions in place of a policy; None is the policy of `path`.
     overrides: with `agent`: as for playground-run.
     randomize: with `agent`: whether the task's startup events draw the model.
-    interval_events: with `agent`: whether pushes and other interval events act.
+    interval_events: whether pushes and other interval events act.
     episodes: number of episodes to measure.
     seed: of the episodes.
     video: the .mp4 to render the first episode to.
@@ -96,6 +96,8 @@ def play(
     env = build_task(path, overrides, seed, randomize=randomize, interval_events=interval_events)
     opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
   exported, env = opened.exported, opened.env
+  if agent is None and not interval_events:
+    env = load_on_c_physics(exported.contract["task"], env.config, interval_events=False)
   need_camera(env.mj_model, camera, "--camera")
   if viewer:
     from playground.deploy.viewer import view
@@ -118,8 +120,9 @@ def play(
   origin = exported.contract["origin"]
   console.print(_table(exported.contract, episodes, scores))
   if opened.folder is not None:
-    out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}.json"
-    write_json(out, {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "scores": scores, "origin": origin})
+    out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}{'' if interval_events else '_no_events'}.json"
+    played = {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "interval_events": interval_events}
+    write_json(out, played | {"scores": scores, "origin": origin})
     console.print(f"written to {out}", soft_wrap=True)
   if film:
     render_video(

@@ -10,6 +10,7 @@ from playground import registry
 from playground.config import compose, config_dict
 from playground.deploy.contract import Contract
 from playground.deploy.policy import Seen
+from playground.deploy.trained import switch_off_interval_events
 from playground.envs.base import Env, Observation
 from playground.envs.c_physics import on_c_physics
 from playground.envs.options import uses_vision
@@ -78,9 +79,8 @@ def build_task(
   setup(this_machine(compose(["hardware=cpu"]).hardware))
   config: Any = config_dict(compose([f"env={task}", *overrides]).env)
   config.impl = "warp" if uses_vision(config) else "jax"  # the smallest model to build; it is not simulated
-  for event in config.events.values():
-    if event is not None and event.get("mode") == "interval" and not interval_events:
-      event.enabled = False
+  if not interval_events:
+    switch_off_interval_events(config)
   env = registry.load(task, config=config)
   if randomize:
     for name, value in Randomizer(env.mj_model, config.events).sample(jax.random.PRNGKey(seed)).items():

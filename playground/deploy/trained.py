@@ -8,7 +8,7 @@ import numpy as np
 from ml_collections import ConfigDict
 
 from playground import registry
-from playground.config import config_dict
+from playground.config import TaskConfig, config_dict
 from playground.deploy.contract import describe_policy
 from playground.deploy.graph import policy_graph
 from playground.deploy.policy import ExportedPolicy
@@ -97,12 +97,26 @@ def _newest_evaluation(trained: LoadedPolicy) -> dict[str, float]:
   return {"steps": int(last.step)} | scores
 
 
-def load_on_c_physics(task: str, config: Section | ConfigDict) -> Env:
+def switch_off_interval_events(config: TaskConfig) -> None:
+  """Switches off pushes and other interval events in a section `env`."""
+  for event in config["events"].values():
+    if event is not None and event.get("mode") == "interval":
+      event.enabled = False
+
+
+def load_on_c_physics(task: str, config: Section | ConfigDict, interval_events: bool = True) -> Env:
   """Builds a task on C MuJoCo.
+
+  Args:
+    task: its name.
+    config: its section `env`.
+    interval_events: whether pushes and other interval events act.
 
   Raises:
     ConfigError: the task has images, and MuJoCo-Warp, which renders them, is not installed.
   """
   own = config_dict(config)
+  if not interval_events:
+    switch_off_interval_events(own)
   own.impl = "warp" if uses_vision(own) else "jax"  # the smallest model to build; it is not simulated
   return on_c_physics(registry.load(task, config=own))

@@ -63,6 +63,9 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
     assert "MJX-Warp in training" in shown
     assert re.search(rf"reward\W+{scores[-1]['episode_reward']:.4g}\W+12.5\b", shown)
   assert scores[0] == scores[1]
+  assert command("play", str(run), "--episodes", "3", "--seed", "4", "--no-events") == 0
+  report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_no_events.json").read_text())
+  assert not report["interval_events"] and report["scores"] == scores[0], "Cartpole has no interval events"
   assert 0 < scores[0]["episode_reward"] < 40 == scores[0]["episode_length"]
 
 

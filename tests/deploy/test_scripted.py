@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from playground import registry
 from playground.cli.main import main
 from playground.deploy.scripted import ScriptedPolicy, build_task
 from playground.deploy.session import Session
+from playground.deploy.trained import load_on_c_physics
 from tests.command import Command, caller
 
 
@@ -42,5 +44,7 @@ def test_view_shows_it_in_the_browser(command: Command, monkeypatch: pytest.Monk
   assert session.terrain == "rough" and session.acting == "0" and session.choices() == {}
   assert session.player.exported.contract["command"]["max"] == [1.5, 0.8, 1.2]
   assert not session.player.env.config.events.push.enabled
+  calm = load_on_c_physics("Go1JoystickFlatTerrain", registry.config("Go1JoystickFlatTerrain"), interval_events=False)
+  assert not calm.config.events.push.enabled, "of a policy's task"
   drawn = build_task("Go1JoystickFlatTerrain", ["terrain=rough"], 1, randomize=True)
   assert (session.player.env.mj_model.body_mass != drawn.mj_model.body_mass).any()
