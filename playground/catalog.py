@@ -13,6 +13,7 @@ from typing import Literal, get_args
 from playground.files import read_csv
 
 Status = Literal["solved", "learning", "open", "not measured"]
+_ORDER: tuple[Status, ...] = ("open", "learning", "solved")
 STATUSES = get_args(Status)
 FILE = Path(__file__).parent / "catalog.json"
 _REFERENCE = FILE.parents[1] / "results/reference"
@@ -113,13 +114,14 @@ def status(row: dict[str, str]) -> Status:
 
 
 def _reference(task: str) -> dict[str, str] | None:
-  """The best of our runs of a task; where there are only chains, the last stage."""
+  """The run of ours (of a chain the last stage) that got furthest; of several the one of the highest return."""
   rows: list[dict[str, str]] = []
   for name in _TABLES:
     found = read_csv(_REFERENCE / f"{name}.csv")
     rows += [row for row in found if row["task"] == task and row["who"] == "ours"]
-  single = [row for row in rows if "chain" not in row.get("experiment", "")]
-  return max(single, key=lambda row: float(row["final_return"])) if single else rows[-1] if rows else None
+  chained = [row for row in rows if "chain" in row.get("experiment", "")]
+  candidates = [row for row in rows if row not in chained] + chained[-1:]
+  return max(candidates, key=lambda row: (_ORDER.index(status(row)), float(row["final_return"])), default=None)
 
 
 def _write() -> None:

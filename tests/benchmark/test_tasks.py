@@ -28,10 +28,11 @@ def test_runs_that_differ_in_seed_alone_count_together():
   assert best_runs(rows, "HopperHop") == []
 
 
-def test_a_chain_counts_by_its_last_stage_and_only_alone():
+def test_a_chain_counts_by_its_last_stage():
   rows = [run(20, experiment="chain", setting="stage=a"), run(9, experiment="chain", setting="stage=b")]
   assert best_runs(rows, TASK) == rows[1:]
-  assert best_runs([*rows, run(5)], TASK) == [run(5)]
+  assert best_runs([*rows, run(5)], TASK) == rows[1:]
+  assert best_runs([*rows, run(10)], TASK) == [run(10)]
 
 
 @pytest.mark.parametrize(

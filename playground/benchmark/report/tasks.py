@@ -16,12 +16,12 @@ Row = dict[str, str]
 def best_runs(rows: Sequence[Row], task: str) -> list[Row]:
   """Returns our runs of a task with the agent, setting, backend and steps of the highest mean final return.
 
-  A chain counts only if the task has no other run, then by its last stage.
+  A chain counts by its last stage.
   """
   ours = [row for row in rows if row["task"] == task and row["who"] == "ours"]
-  single = [row for row in ours if "chain" not in row.get("experiment", "")] or ours[-1:]
+  chained = [row for row in ours if "chain" in row.get("experiment", "")]
   groups: dict[tuple[str, ...], list[Row]] = {}
-  for row in single:
+  for row in [*(row for row in ours if row not in chained), *chained[-1:]]:
     groups.setdefault((row["agent"], row.get("setting", ""), row["backend"], row["steps"]), []).append(row)
   return max(groups.values(), key=lambda runs: mean_and_ci95(_returns(runs, "final_return"))[0], default=[])
 
