@@ -6,13 +6,13 @@ set -euo pipefail
 out=${1:-results/walk}
 four_at_a_time="launcher.slots_per_gpu=4 launcher.mps=true"
 
-# Each alone on the GPU, for these have goals in minutes. Keep the policies: those of seed 1 are lost.
+# Each alone on the GPU, for these have goals in minutes. Keep the policies.
 playground-run -m sweep=humanoids sweep_dir="$out/humanoids"
 
-# What is below public PPO, and the Go1's policy.
+# What is below public PPO.
 playground-run -m sweep=below_public launcher.slots_per_gpu=3 launcher.mps=true sweep_dir="$out/below_public"
 
-# Goal: HumanoidRun 600.
+# HumanoidRun again (663 after 60 M steps), and where public PPO is slow or stalls.
 playground-run -m sweep=reppo_fast_td3 $four_at_a_time sweep_dir="$out/reppo_fast_td3"
 playground-run -m sweep=ppo_robust $four_at_a_time sweep_dir="$out/ppo_robust"
 
