@@ -21,7 +21,7 @@ from jax.stages import Compiled, Traced, Wrapped
 from playground.envs.wrappers import ModelFields
 from playground.gc_pause import gc_paused
 from playground.hardware.distributed import any_process, is_multiprocess
-from playground.hardware.mesh import put, shard
+from playground.hardware.mesh import local_shard, put, shard
 from playground.learning.algorithm import Policy
 from playground.learning.evaluation import Evaluate, Recording
 from playground.learning.population import PARENT, Population
@@ -366,10 +366,10 @@ class Loop:
     """Evaluates a policy with the random numbers of an event; returns the scores."""
     start = time.perf_counter()
     key = self._key(self._eval_key, done.event)
-    scores, _ = done.evaluated = jax.device_get(
-      self.functions.evaluate(policy, key, self.functions.eval_model, settings)
-    )
+    scores, recording = self.functions.evaluate(policy, key, self.functions.eval_model, settings)
+    scores = jax.device_get(scores)
     done.eval_s = time.perf_counter() - start
+    done.evaluated = scores, {name: local_shard(value, axis=1) for name, value in recording.items()}
     return scores
 
   def _exchange(

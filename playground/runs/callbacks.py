@@ -11,7 +11,6 @@ import numpy as np
 from playground.config import RunConfig
 from playground.envs.base import Env
 from playground.errors import PlaygroundError
-from playground.hardware.mesh import local_shard
 from playground.learning.checkpoints import CheckpointStore, checksum
 from playground.learning.evaluation import Recording
 from playground.learning.loop import Loop, Metrics
@@ -299,7 +298,7 @@ def check_updates(metrics: Metrics, allowed: float, step: int) -> int:
 
 def episodes_of(recording: Recording, count: int) -> dict[str, PyTree]:
   """Returns the first `count` recorded episodes, concatenated: `qpos` [T, nq] and mocap poses."""
-  arrays = {name: local_shard(value, axis=1) for name, value in recording.items()}
+  arrays = {name: np.asarray(value) for name, value in recording.items()}
   active = arrays.pop("active")[:, :count] > 0
   columns, rows = np.nonzero(active.T)
   return {name: value[rows, columns] for name, value in arrays.items() if value.size}
