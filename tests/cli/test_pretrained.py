@@ -33,7 +33,8 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
   assert not checkpoint.has("state")
   exact, shipped = Checkpoint(run / "checkpoints" / checkpoint.path.name).arrays("policy"), checkpoint.arrays("policy")
   for (name, *_), before, after in zip(checkpoint.meta["leaves"]["policy"], exact, shipped, strict=True):
-    np.testing.assert_allclose(after, before, rtol=2**-8 if name.startswith(".params.value") else 0, err_msg=name)
+    rtol = 2.0**-pretrained.CRITIC_BITS if name.startswith(".params.value") else 0
+    np.testing.assert_allclose(after, before, rtol=rtol, err_msg=name)
   texts = [path.read_text() for end in ("yaml", "json", "txt") for path in folder.rglob(f"*.{end}")]
   assert len(texts) >= 5 and str(tmp_path) not in "".join(texts), "paths of this machine"
   console = Console(record=True, width=120)
