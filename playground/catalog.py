@@ -6,6 +6,7 @@ reference runs in results/reference/. A task of another package is not in it.
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Literal, get_args
@@ -13,7 +14,6 @@ from typing import Literal, get_args
 from playground.files import read_csv
 
 Status = Literal["solved", "learning", "open", "not measured"]
-_ORDER: tuple[Status, ...] = ("open", "learning", "solved")
 STATUSES = get_args(Status)
 FILE = Path(__file__).parent / "catalog.json"
 _REFERENCE = FILE.parents[1] / "results/reference"
@@ -113,15 +113,20 @@ def status(row: dict[str, str]) -> Status:
   return "solved" if score >= 750 else "learning" if score >= 50 else "open"
 
 
+def our_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]:
+  """Returns the rows of our runs of a task; a chain counts by its last stage."""
+  ours = [row for row in rows if row["task"] == task and row["who"] == "ours"]
+  chained = [row for row in ours if "chain" in row.get("experiment", "")]
+  return [row for row in ours if row not in chained] + chained[-1:]
+
+
 def _reference(task: str) -> dict[str, str] | None:
-  """The run of ours (of a chain the last stage) that got furthest; of several the one of the highest return."""
+  """The run of ours that got furthest; of several the one of the highest return."""
   rows: list[dict[str, str]] = []
   for name in _TABLES:
     found = read_csv(_REFERENCE / f"{name}.csv")
-    rows += [row for row in found if row["task"] == task and row["who"] == "ours"]
-  chained = [row for row in rows if "chain" in row.get("experiment", "")]
-  candidates = [row for row in rows if row not in chained] + chained[-1:]
-  return max(candidates, key=lambda row: (_ORDER.index(status(row)), float(row["final_return"])), default=None)
+    rows += our_runs(found, task)
+  return max(rows, key=lambda row: (-STATUSES.index(status(row)), float(row["final_return"])), default=None)
 
 
 def _write() -> None:

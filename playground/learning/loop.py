@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 import jax
 import jax.numpy as jnp
@@ -168,8 +168,7 @@ def compile_program(
       stored.save(lowered)
     except OSError as error:
       notices.append(f"The program was not stored, so the next start traces again: {first_line(error)}.")
-  compiled = {name: getattr(trainer, name) for name in ("reset", "gather")}
-  compiled |= {name: function for name, (function, _) in results.items()}
+  compiled = _uncompiled(trainer) | {name: function for name, (function, _) in results.items()}
   notice = " ".join(filter(None, notices)) or None
   return CompiledFunctions(
     **compiled, model=model, eval_model=eval_model, trace_s=trace_s, compile_s=compile_s, notice=notice
@@ -187,14 +186,18 @@ def _compile_stored(
   futures = {name: pool.submit(function.compile, trainer.mesh) for name, function in functions.items()}
   model, eval_model = shard(draw(), trainer.mesh)
   try:
-    compiled = {name: getattr(trainer, name) for name in ("reset", "gather")}
-    compiled |= {name: future.result() for name, future in futures.items()}
+    compiled = _uncompiled(trainer) | {name: future.result() for name, future in futures.items()}
   except Exception as error:  # any error: JAX and XLA read a file
     raise stored.discard(error) from error
   compile_s = time.perf_counter() - start
   return CompiledFunctions(
     **compiled, model=model, eval_model=eval_model, trace_s=0.0, compile_s=compile_s, notice=None
   )
+
+
+def _uncompiled(trainer: Trainer) -> dict[str, Callable[..., Any]]:
+  """Returns the functions that not every run compiles: without resets in its schedule, or in a single process."""
+  return {"reset": trainer.reset, "gather": trainer.gather}
 
 
 def _trace(
@@ -313,7 +316,7 @@ class Loop:
         if reported:
           reported.result()  # one row is in flight; its error is raised here
         stop = any_process(all(each.should_stop() for each in self.callbacks)) and event is not events[-1]
-        if stop:
+        if stop and done.snapshot is None:
           done.snapshot = jax.device_get(self.functions.gather(state))
         reported = reports.submit(lambda results=results: [self._report(each) for each in results])
         if stop:
@@ -335,7 +338,7 @@ class Loop:
         self.first_update_s = done.train_s / num_updates
         self.first_update_at = start + self.first_update_s
       if np.any(trained["nonfinite"] > 0):
-        capture = jax.device_get(self.functions.gather(state).capture if is_multiprocess() else state.capture)
+        capture = jax.device_get(self.functions.gather(state).capture)
         shapes = self.trainer.shapes((state.env_state, self.functions.model))
         action_size = self.trainer.env.action_size
         first = lambda i: self.trainer.agent(capture, i).first(shapes[0], action_size, shapes[1])

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from playground.benchmark.report.public import at, is_ppo, public_curves
-from playground.catalog import Entry
+from playground.catalog import Entry, our_runs
 from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
 
 _HEADER = ("task", "status", "best run", "M steps", "default budget", "runs (seeds)", "sampled", "mode")
@@ -18,10 +18,8 @@ def best_runs(rows: Sequence[Row], task: str) -> list[Row]:
 
   A chain counts by its last stage.
   """
-  ours = [row for row in rows if row["task"] == task and row["who"] == "ours"]
-  chained = [row for row in ours if "chain" in row.get("experiment", "")]
   groups: dict[tuple[str, ...], list[Row]] = {}
-  for row in [*(row for row in ours if row not in chained), *chained[-1:]]:
+  for row in our_runs(rows, task):
     groups.setdefault((row["agent"], row.get("setting", ""), row["backend"], row["steps"]), []).append(row)
   return max(groups.values(), key=lambda runs: mean_and_ci95(_returns(runs, "final_return"))[0], default=[])
 
