@@ -147,7 +147,7 @@ def point_trainer(config: Config, num_devices: int = 1, **events: Any) -> Traine
 
 
 class Recorder:
-  """Callbacks that remember, and stop after a number of rows."""
+  """Callbacks that remember, and stop after a number of rows. All they are given has left the device."""
 
   def __init__(self, stop_after: int | None = None):
     self.rows: list[tuple[int, Metrics]] = []
@@ -156,14 +156,22 @@ class Recorder:
     self.stop_after = stop_after
 
   def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Any) -> None:
+    self._check_fetched((captured, recording))
     self.rows.append((step, {k: v for k, v in metrics.items() if not k.startswith("time/")}))
     self.captured.append(captured)
 
   def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
-    self.saved.append((update, jax.device_get(state)))
+    self._check_fetched(state)
+    self.saved.append((update, state))
 
   def should_stop(self) -> bool:
     return self.stop_after is not None and len(self.rows) >= self.stop_after
+
+  @staticmethod
+  def _check_fetched(tree: Any) -> None:
+    """Callbacks run beside the training program, whose CUDA graphs another use of the device breaks."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+      assert isinstance(leaf, np.ndarray | np.generic), jax.tree_util.keystr(path)
 
 
 def numbers(tree: Any) -> list[np.ndarray]:

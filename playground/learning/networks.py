@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import get_args
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,13 @@ import numpy as np
 from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics, specs
 from brax.training.distribution import NormalTanhDistribution
+from brax.training.types import UInt64
 from flax import linen, struct
 from jax.typing import DTypeLike
 
 from playground.envs.base import PIXELS, Observation
 from playground.errors import ConfigError, nearest
+from playground.hardware.mesh import AXIS
 from playground.learning.cnn import ESTIMATOR, Activation, PixelNetwork, check_cnn
 from playground.learning.hyperparameters import (
   ActivationName,
@@ -31,6 +33,26 @@ ACTIVATIONS: dict[ActivationName, Activation] = {name: getattr(linen, name) for 
 
 Normalizer = running_statistics.RunningStatisticsState
 ObservationSize = int | Mapping[str, tuple[int, ...]]
+
+
+@struct.dataclass
+class Count:
+  """A number below 2**64, of two uint32 halves.
+
+  Brax's `UInt64` does the arithmetic, but moves its halves to the device whenever JAX rebuilds a tree that has one, a
+  fetched one too: threads that write results would then use the device while it trains.
+  """
+
+  hi: Any
+  lo: Any
+
+
+def update_normalizer(normalizer: Normalizer, obs: Mapping[str, jax.Array]) -> Normalizer:
+  """Adds observations, [..., D] each, of all devices to the statistics, by Brax's Welford algorithm."""
+  count: Any = normalizer.count
+  counted = normalizer.replace(count=UInt64(count.hi, count.lo))  # pyright: ignore[reportCallIssue]
+  total: Any = (updated := running_statistics.update(counted, obs, pmap_axis_name=AXIS)).count
+  return updated.replace(count=Count(total.hi, total.lo))
 
 
 class Actor:
@@ -118,8 +140,8 @@ class Actor:
     shapes = {key: specs.Array(size, jnp.dtype("float32")) for key, size in self.obs_sizes.items()}
     state = running_statistics.init_state(shapes)  # pyright: ignore[reportArgumentType]
     # Python numbers are weakly typed: a loop over them would be traced, and compiled, a second time.
-    count = jax.tree.map(lambda x: jnp.asarray(x, jnp.uint32), state.count)
-    return state.replace(count=count, std_eps=jnp.asarray(state.std_eps, jnp.float32))
+    zero = jnp.zeros((), jnp.uint32)
+    return state.replace(count=Count(zero, zero), std_eps=jnp.asarray(state.std_eps, jnp.float32))
 
   def select(self, obs: Observation) -> dict[str, jax.Array]:
     """Returns the groups of an observation that actor or critic reads."""

@@ -10,7 +10,6 @@ from typing import ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
-from brax.training.acme import running_statistics
 from flax import struct
 
 from playground.envs.base import Env, Observation
@@ -18,7 +17,7 @@ from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy
 from playground.learning.hyperparameters import OffPolicyConfig
-from playground.learning.networks import Actor, normalize
+from playground.learning.networks import Actor, normalize, update_normalizer
 from playground.learning.replay import ReplayBuffer
 from playground.learning.rollout import Environments
 from playground.pytree import PyTree
@@ -122,7 +121,7 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
     envs, transition = self.collect(state, envs, act_key)
     normalizer = state.normalizer
     if config.normalize_observations:
-      normalizer = running_statistics.update(normalizer, transition.obs, pmap_axis_name=AXIS)
+      normalizer = update_normalizer(normalizer, transition.obs)
     stored = lambda obs: {key: x for key, x in obs.items() if key not in self._inside}
     kept = transition.replace(obs=stored(transition.obs), next_obs=stored(transition.next_obs))
     replay = self.buffer.insert(state.replay, kept)

@@ -10,7 +10,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training.acme import running_statistics
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
@@ -21,7 +20,7 @@ from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy, gradient_step
 from playground.learning.cnn import random_shift
 from playground.learning.hyperparameters import PPOConfig
-from playground.learning.networks import ActorCritic, ActorCriticParams, Normalizer, normalize
+from playground.learning.networks import ActorCritic, ActorCriticParams, Normalizer, normalize, update_normalizer
 from playground.learning.rollout import Environments, side_by_side, unroll
 from playground.pytree import PyTree
 
@@ -120,7 +119,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
 
     # Normalise once for all epochs, with statistics that include this data.
     if config.normalize_observations and networks.obs_keys:
-      normalizer = running_statistics.update(state.normalizer, networks.vectors(data.obs), pmap_axis_name=AXIS)
+      normalizer = update_normalizer(state.normalizer, networks.vectors(data.obs))
     obs, last_obs = normalize(data.obs, normalizer), normalize(networks.select(last_obs), normalizer)
 
     batch = Batch(obs, last_obs, data.raw_action, data.log_prob, data.reward, data.termination, data.truncation)

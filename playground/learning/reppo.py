@@ -13,7 +13,6 @@ Gaussians before squashing; the critic's prior is a constant.
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training.acme import running_statistics
 from brax.training.distribution import NormalTanhDistribution
 from flax import linen, struct
 from jax.flatten_util import ravel_pytree
@@ -22,7 +21,7 @@ from playground.envs.base import Env
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy, gradient_step
 from playground.learning.hyperparameters import REPPOConfig
-from playground.learning.networks import Actor, Normalizer, normalize, refuse_images
+from playground.learning.networks import Actor, Normalizer, normalize, refuse_images, update_normalizer
 from playground.learning.rollout import Environments
 from playground.pytree import PyTree
 
@@ -187,7 +186,7 @@ class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
     envs, data = envs.scan(step, jax.random.split(rollout_key, config.unroll_length))
     statistics = state.normalizer
     if config.normalize_observations:
-      statistics = running_statistics.update(statistics, data.obs, pmap_axis_name=AXIS)
+      statistics = update_normalizer(statistics, data.obs)
     data = data.replace(obs=normalize(data.obs, normalizer), next_obs=normalize(data.next_obs, normalizer))
 
     # Targets of the critic, with the parameters before the update.

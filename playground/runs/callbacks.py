@@ -11,6 +11,7 @@ import numpy as np
 from playground.config import RunConfig
 from playground.envs.base import Env
 from playground.errors import PlaygroundError
+from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import CheckpointStore, checksum
 from playground.learning.evaluation import Recording
 from playground.learning.loop import Loop, Metrics
@@ -129,9 +130,8 @@ class RunCallbacks:
     if wanted and self._recording is not None and self._filmed != self._step:
       self._start_video(self._step, self._recording)
 
-  def finish(self, loop: Loop, state: TrainState, completed: bool) -> None:
-    """Waits for the video, and writes the run's result; call `end_training` first."""
-    policy = self._trainer.policy(state)
+  def finish(self, loop: Loop, policy: Policy, completed: bool) -> None:
+    """Waits for the video, and writes the run's result with the last policy; call `end_training` first."""
     if self._video:
       self._progress.phase("rendering the video")
       self._video.result()

@@ -12,6 +12,7 @@ from jax.stages import Compiled
 from playground.errors import CheckpointError, ConfigError, HardwareError, PlaygroundError
 from playground.hardware.mesh import device_memory
 from playground.hardware.setup import Hardware, setup
+from playground.learning.algorithm import Policy
 from playground.learning.evaluation import Recording
 from playground.learning.loop import CompiledFunctions, Loop
 from playground.learning.population import Population
@@ -131,11 +132,11 @@ def _train_group(
     progress.phase("training")
     loop = Loop(training.trainer, program, training.events, [config.seed for config in configs], members, population)
     state, completed = training.run(loop, plans, interrupts)
-    state = jax.device_get(state)
+    policies = jax.device_get(training.trainer.policy(state))
     for member in members:  # all first: no run's time has another's video in it, and videos are rendered side by side
       member.end_training()
     for i, member in enumerate(members):
-      member.finish(loop, training.trainer.agent(state, i), completed)
+      member.finish(loop, training.trainer.agent(policies, i), completed)
   for member in members:
     say_where(member.run_dir) if member.error is None else print(
       f"{member.name} failed: {member.error}", file=sys.stderr
@@ -208,9 +209,9 @@ class Member:
     """See `RunCallbacks.end_training`."""
     self._do(lambda callbacks: callbacks.end_training())
 
-  def finish(self, loop: Loop, state: TrainState, completed: bool) -> None:
+  def finish(self, loop: Loop, policy: Policy, completed: bool) -> None:
     """See `RunCallbacks.finish`."""
-    self._do(lambda callbacks: callbacks.finish(loop, state, completed))
+    self._do(lambda callbacks: callbacks.finish(loop, policy, completed))
 
   def _do(self, work: Callable[[RunCallbacks], None]) -> None:
     if self.error is not None or self._callbacks is None:

@@ -203,7 +203,7 @@ def _train_locked(
       loop = Loop(training.trainer, program, training.events, [config.seed], [callbacks])
       state, completed = training.run(loop, [plan], interrupts)
       callbacks.end_training()
-      callbacks.finish(loop, state, completed)
+      callbacks.finish(loop, training.trainer.policy(state), completed)
   say_where(run_dir)
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
 

@@ -11,9 +11,10 @@ from flax import linen
 
 from playground.config import compose, format_value
 from playground.errors import ConfigError
+from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import build_algorithm
 from playground.learning.hyperparameters import PPOConfig
-from playground.learning.networks import ActorCritic, NetworkConfig
+from playground.learning.networks import ActorCritic, NetworkConfig, update_normalizer
 from playground.settings import build
 from tests.dummy import Point
 
@@ -72,3 +73,21 @@ def test_python_and_the_command_line_refuse_the_same_values(config: dict[str, An
     build_algorithm(Point(), build(PPOConfig, config), None)
   with pytest.raises(ConfigError, match=message):
     compose(["env=CartpoleBalance", "agent=ppo", *(f"agent.{key}={format_value(x)}" for key, x in config.items())])
+
+
+def test_statistics_are_of_all_observations_on_all_devices_and_count_beyond_32_bits() -> None:
+  """Two devices and two updates; a tree with fetched statistics stays on the host."""
+  obs = np.random.default_rng(0).normal(3.0, 2.0, (2, 2, 50, 4)).astype(np.float32)  # update, device, environment, D
+  normalizer: Any = ActorCritic({"state": (4,)}, 2, NetworkConfig((8,), (8,))).init_normalizer()
+  one = lambda obs, state: update_normalizer(state, {"state": obs})
+  update = jax.jit(jax.vmap(one, (0, None), None, axis_name=AXIS))
+  for each in obs:
+    normalizer = jax.device_get(update(each, normalizer))
+  seen = obs.reshape(-1, 4)
+  np.testing.assert_allclose(normalizer.mean["state"], seen.mean(0), rtol=1e-5)
+  np.testing.assert_allclose(normalizer.std["state"], seen.std(0), rtol=1e-5)
+  assert all(isinstance(x, np.ndarray) for x in jax.tree.leaves(jax.tree.map(lambda x: x, normalizer)))
+  assert (int(normalizer.count.hi), int(normalizer.count.lo)) == (0, 200)
+  full = normalizer.replace(count=normalizer.count.replace(lo=np.uint32(2**32 - 1)))
+  count = update(obs[0], full).count
+  assert (int(count.hi), int(count.lo)) == (1, 99)

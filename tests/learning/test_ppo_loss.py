@@ -35,7 +35,8 @@ def test_loss_and_gradient_equal_brax(clip_value: float | None) -> None:
   draw = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)
   flags = lambda p: jnp.asarray(rng.random((T, B)) < p, jnp.float32)
   raw_obs = {"state": draw(T + 1, B, OBS) * 3 + 1, "privileged_state": draw(T + 1, B, PRIVILEGED) - 2}
-  normalizer = running_statistics.update(ours.init_normalizer(), raw_obs)
+  empty = ours.init_normalizer().replace(count=types.UInt64(hi=0, lo=0))  # pyright: ignore[reportCallIssue]
+  normalizer = running_statistics.update(empty, raw_obs)
   obs = normalize(raw_obs, normalizer)
   done, truncated = flags(0.3), flags(0.5)
   truncation = done * truncated

@@ -3,13 +3,12 @@
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training.acme import running_statistics
 from jax.flatten_util import ravel_pytree
 
 from playground.envs.base import Env
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy, gradient_step
-from playground.learning.networks import ActorCritic, ActorCriticParams, normalize
+from playground.learning.networks import ActorCritic, ActorCriticParams, normalize, update_normalizer
 from playground.learning.rollout import Environments, Transitions, unroll
 from reinforce.config import ReinforceConfig
 
@@ -38,7 +37,7 @@ class Reinforce(Algorithm[ReinforceConfig, ActorCritic, AlgorithmState]):
     grads, losses = jax.grad(self._loss, has_aux=True)(unravel(flat), data.replace(obs=obs), last_obs)
     flat, opt_state, norm, finite = gradient_step(self.optimizer, grads, flat, state.opt_state)
     if normalizer is not None:
-      normalizer = running_statistics.update(normalizer, self.networks.vectors(data.obs), pmap_axis_name=AXIS)
+      normalizer = update_normalizer(normalizer, self.networks.vectors(data.obs))
 
     metrics = {name: jnp.where(finite, value, 0.0) for name, value in jax.lax.pmean(losses, AXIS).items()}
     metrics |= {"grad_norm": jnp.where(finite, norm, 0.0), "gradient_steps": jnp.ones(())}
