@@ -48,7 +48,7 @@ def add_policy(path: str, note: str = "") -> int:
 
   Raises:
     PlaygroundError: no such run, or a policy without an ONNX form.
-    ConfigError: the run has no evaluation at its newest checkpoint.
+    ConfigError: the run has not been evaluated.
   """
   run = RunDirectory.open(path)
   export_run(path)
@@ -58,9 +58,9 @@ def add_policy(path: str, note: str = "") -> int:
     play(path, episodes=_EPISODES)
   scores = read_json(result)["scores"]
   rows = read_metrics(run.metrics_csv)
-  evaluated = rows[(rows["step"] == steps) & rows[RETURN].notna()]
+  evaluated = rows[(rows["step"] <= steps) & rows[RETURN].notna()]
   if evaluated.empty:
-    raise ConfigError(f"{path} was not evaluated at its newest checkpoint, step {steps}.")
+    raise ConfigError(f"{path} was not evaluated before its newest checkpoint, step {steps}.")
   config, manifest, row = run.config, run.manifest, evaluated.iloc[-1]
   git: dict[str, Plain] = manifest.get("git") or {}
   as_set, other = ("mode", "sampled") if config["agent"]["deterministic_eval"] else ("sampled", "mode")
@@ -81,6 +81,7 @@ def add_policy(path: str, note: str = "") -> int:
     "training": {
       **{kind: None if math.isnan(returns[kind]) else round(float(returns[kind]), 2) for kind in ("sampled", "mode")},
       "episodes": config["agent"]["num_eval_envs"],
+      "steps": int(row["step"]),  # fewer than the policy's where the run was stopped
     },
     "c_mujoco": {
       "action": "mode",

@@ -411,9 +411,9 @@ def _return_of(folder: Path) -> float | None:
 
 
 def round_policy(folder: str | Path, bits: int, chosen: Callable[[str], bool]) -> None:
-  """Rounds arrays of a checkpoint's item 'policy' to fewer significant bits; their dtype stays.
+  """Rounds arrays of a checkpoint's item 'policy' to fewer significant bits, and removes the path of its run.
 
-  The files are compressed: those of arrays of 4 bits take about a quarter of the space.
+  The dtype stays. The files are compressed: those of arrays of 4 bits take about a quarter of the space.
 
   Args:
     folder: the checkpoint.
@@ -432,6 +432,7 @@ def round_policy(folder: str | Path, bits: int, chosen: Callable[[str], bool]) -
   with _quiet_threads(), ocp.StandardCheckpointer() as checkpointer:
     checkpointer.save(checkpoint.path / "policy", _numbered(arrays), force=True)
   meta["sha256"]["policy"] = checksum(arrays)
+  meta["config"]["run_dir"] = None
   meta["meta_sha256"] = _meta_checksum(meta)
   (checkpoint.path / "meta" / "metadata").write_text(json.dumps(meta))
 

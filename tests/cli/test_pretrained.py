@@ -29,18 +29,22 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
   checkpoint = weights_of(f"pretrained:{folder.name}")
   assert (card["task"], card["steps"], card["c_mujoco"]["episodes"]) == (folder.name, checkpoint.step, 20)
   assert (card["status"], card["note"]) == ("open", "cut short")
-  assert card["training"]["sampled"] > 0 and card["training"]["mode"] > 0
+  assert card["training"]["sampled"] > 0 and card["training"]["mode"] > 0 and card["training"]["steps"] == card["steps"]
   assert not checkpoint.has("state")
   exact, shipped = Checkpoint(run / "checkpoints" / checkpoint.path.name).arrays("policy"), checkpoint.arrays("policy")
   for (name, *_), before, after in zip(checkpoint.meta["leaves"]["policy"], exact, shipped, strict=True):
     rtol = 2.0**-pretrained.CRITIC_BITS if name.startswith(".params.value") else 0
     np.testing.assert_allclose(after, before, rtol=rtol, err_msg=name)
-  texts = [path.read_text() for end in ("yaml", "json", "txt") for path in folder.rglob(f"*.{end}")]
-  assert len(texts) >= 5 and str(tmp_path) not in "".join(texts), "paths of this machine"
+  texts = [path.read_text() for name in ("*.yaml", "*.json", "*.txt", "metadata") for path in folder.rglob(name)]
+  assert len(texts) >= 6 and str(tmp_path) not in "".join(texts), "paths of this machine"
   console = Console(record=True, width=120)
   assert show_policies(console) == 0
   assert f"{card['c_mujoco']['return']:.1f} ±" in console.export_text()
-  metrics = run / "metrics.csv"
-  metrics.write_text(metrics.read_text().splitlines()[0] + "\n")
-  with pytest.raises(ConfigError, match="was not evaluated at its newest checkpoint"):
+
+  header, *rows = (metrics := run / "metrics.csv").read_text().splitlines(keepends=True)
+  metrics.write_text("".join([header, *(row for row in rows if row.startswith("0,"))]))  # stopped before the next one
+  assert add_policy(str(run)) == 0
+  assert yaml.safe_load((folder / "card.yaml").read_text())["training"]["steps"] == 0
+  metrics.write_text(header)
+  with pytest.raises(ConfigError, match="was not evaluated before its newest checkpoint"):
     add_policy(str(run))
