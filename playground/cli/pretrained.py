@@ -13,7 +13,7 @@ from playground.errors import ConfigError
 from playground.files import read_json
 from playground.learning.checkpoints import find_checkpoints
 from playground.pretrained import add, cards
-from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_metrics
+from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, newest_evaluation
 from playground.runs.run_dir import RunDirectory
 from playground.settings import Plain
 
@@ -57,11 +57,10 @@ def add_policy(path: str, note: str = "") -> int:
   if read_json(result).get("episodes") != _EPISODES:
     play(path, episodes=_EPISODES)
   scores = read_json(result)["scores"]
-  rows = read_metrics(run.metrics_csv)
-  evaluated = rows[(rows["step"] <= steps) & rows[RETURN].notna()]
-  if evaluated.empty:
+  row = newest_evaluation(run.metrics_csv, steps)
+  if row is None:
     raise ConfigError(f"{path} was not evaluated before its newest checkpoint, step {steps}.")
-  config, manifest, row = run.config, run.manifest, evaluated.iloc[-1]
+  config, manifest = run.config, run.manifest
   git: dict[str, Plain] = manifest.get("git") or {}
   as_set, other = ("mode", "sampled") if config["agent"]["deterministic_eval"] else ("sampled", "mode")
   returns = {as_set: row[RETURN], other: row.get(OTHER_RETURNS[other], math.nan)}

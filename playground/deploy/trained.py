@@ -17,7 +17,7 @@ from playground.envs.c_physics import on_c_physics
 from playground.envs.options import uses_vision
 from playground.envs.wrappers import wrap_for_training
 from playground.extras import need
-from playground.runs.csv_tracker import read_metrics
+from playground.runs.csv_tracker import newest_evaluation
 from playground.runs.loaded_policy import LoadedPolicy, load_policy
 from playground.settings import Section
 
@@ -86,15 +86,11 @@ def export_policy(trained: LoadedPolicy, state: State | None = None) -> Exported
 
 def _newest_evaluation(trained: LoadedPolicy) -> dict[str, float]:
   """Returns `steps` and the scores of the last evaluation in training, {} without one."""
-  table = read_metrics(trained.run_dir.metrics_csv)
-  if "eval/episode_reward" not in table:
+  last = newest_evaluation(trained.run_dir.metrics_csv, trained.checkpoint.step)
+  if last is None:
     return {}
-  evaluated = table[(table.step <= trained.checkpoint.step) & table["eval/episode_reward"].notna()]
-  if not len(evaluated):
-    return {}
-  last = evaluated.iloc[-1]
-  scores = {name.removeprefix("eval/"): float(last[name]) for name in table if str(name).startswith("eval/episode_")}
-  return {"steps": int(last.step)} | scores
+  scores = {name.removeprefix("eval/"): float(last[name]) for name in last if name.startswith("eval/episode_")}
+  return {"steps": int(last["step"])} | scores
 
 
 def switch_off_interval_events(config: TaskConfig) -> None:

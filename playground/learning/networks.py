@@ -51,8 +51,8 @@ def update_normalizer(normalizer: Normalizer, obs: Mapping[str, jax.Array]) -> N
   """Adds observations, [..., D] each, of all devices to the statistics, by Brax's Welford algorithm."""
   count: Any = normalizer.count
   counted = normalizer.replace(count=UInt64(count.hi, count.lo))  # pyright: ignore[reportCallIssue]
-  total: Any = (updated := running_statistics.update(counted, obs, pmap_axis_name=AXIS)).count
-  return updated.replace(count=Count(total.hi, total.lo))
+  updated: Any = running_statistics.update(counted, obs, pmap_axis_name=AXIS)
+  return updated.replace(count=Count(updated.count.hi, updated.count.lo))
 
 
 class Actor:

@@ -5,7 +5,7 @@ import io
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from playground.files import keep_copy, write_text
 
@@ -113,6 +113,15 @@ def read_metrics(path: Path) -> "pd.DataFrame":
   frame = pd.DataFrame(table.rows, columns=pd.Index(table.columns), dtype=str)
   kinds = {name: int if name == "step" else float for name in table.columns if name != STAGE}
   return frame.replace("", "nan").astype(kinds)
+
+
+def newest_evaluation(path: Path, step: int) -> dict[str, Any] | None:
+  """Returns the last row of a metrics.csv up to `step` that has an evaluation, None without one."""
+  table = read_metrics(path)
+  if RETURN not in table:
+    return None
+  evaluated = table[(table["step"] <= step) & table[RETURN].notna()]
+  return evaluated.iloc[-1].to_dict() if len(evaluated) else None
 
 
 def read_table(path: Path, known: Sequence[str] = ()) -> Table:
