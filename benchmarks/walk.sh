@@ -6,16 +6,13 @@ set -euo pipefail
 out=${1:-results/walk}
 four_at_a_time="launcher.slots_per_gpu=4 launcher.mps=true"
 
-# Agents together on Warp: a few minutes, past several evaluations.
-playground-run -m sweep=ppo_robust launcher=together sweep_dir="$out/ppo_robust"
-
 # Each alone on the GPU, for these have goals in minutes. Keep the policies.
 playground-run -m sweep=humanoids sweep_dir="$out/humanoids"
 
-# What is below public PPO.
+# The Go1's resets, and runs that were cut short.
 playground-run -m sweep=below_public launcher.slots_per_gpu=3 launcher.mps=true sweep_dir="$out/below_public"
 
-# HumanoidRun again (663 after 60 M steps), and where public PPO is slow or stalls.
+# HumanoidRun with other seeds (663 after 60 M steps), and where public PPO is slow or stalls.
 playground-run -m sweep=reppo_fast_td3 $four_at_a_time sweep_dir="$out/reppo_fast_td3"
 
 # In C MuJoCo: 20 episodes of each without a fall, with the gait's measures.
@@ -24,5 +21,5 @@ for job in "$out"/humanoids/jobs/*/ "$out"/below_public/jobs/*/; do
   playground play "$job" --episodes 20
 done
 
-playground-bench golden set=gpu
+playground-bench golden set=gpu workers=3
 playground-bench report rows="[results/reference,results/benchmarks,$out]"

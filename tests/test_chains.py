@@ -64,7 +64,7 @@ def test_the_command_line_wins_in_all_stages(configs: Path):
 def test_another_task_brings_its_own_files(configs: Path):
   write(configs, "{a: {num_timesteps: 1, overrides: []}, b: {num_timesteps: null, overrides: [env=Go1Getup]}}")
   a, b = compose([*MINE, "agent=ppo_v020"], configs).stages
-  assert (a.choices["tuned"], b.choices["tuned"]) == ("ppo_v020/Go1JoystickFlatTerrain", "ppo/Go1Getup")
+  assert (a.choices["tuned"], b.choices["tuned"]) == ("ppo_v020/Go1JoystickFlatTerrain", "ppo_paper/Go1Getup")
   assert b.agent.num_timesteps == 50_000_000
   assert (b.env.task, b.choices["robot"]) == ("playground.envs.locomotion.legged:LeggedTask", "go1")
 

@@ -148,6 +148,11 @@ def test_defaults_that_are_not_the_papers():
     "BerkeleyHumanoidJoystickRoughTerrain",
   )
   assert [agent(task).num_resets_per_eval for task in whole] == [1, 1, 1, 1]
+  getup = [compose(["env=Go1Getup", f"agent={name}"]).agent for name in ("ppo", "ppo_paper")]
+  assert [(each.num_timesteps, each.num_evals, each.num_resets_per_eval) for each in getup] == [
+    (100_000_000, 6, 30),
+    (50_000_000, 5, 10),
+  ]
   hopper = agent("HopperHop")
   assert (hopper.entropy_cost, hopper.init_at_random_ep_len, hopper.reward_scaling) == (1e-3, True, 10.0)
   assert [compose(["env=CheetahRun", f"agent={name}"]).agent.max_grad_norm for name in ("ppo", "ppo_paper")] == [
