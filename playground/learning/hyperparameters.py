@@ -19,6 +19,7 @@ from playground.settings import build
 
 ENTRY_POINTS = "playground.agents"
 ELSEWHERE = {"rsl_rl_ppo": " RSL-RL trains through its own runner: docs/rsl-rl.md."}  # agents of earlier versions
+SCHEDULE = ("num_timesteps", "num_evals", "num_resets_per_eval")
 _MOST = 2**31 - 1  # transitions on a device: they are drawn by int32
 
 # Settings of several classes.
@@ -39,10 +40,13 @@ class AgentConfig:
     algorithm: the class of the algorithm, `module:name`.
     traced: numbers that are arguments of the compiled program, not constants: another value needs no compilation, and
       agents of one program may differ in them. No Python branch may depend on one.
+    schedule: keys of how often the compiled functions are called, which none of the functions reads: another value needs
+      no compilation.
   """
 
   algorithm: ClassVar[str]
   traced: ClassVar[tuple[str, ...]] = ()
+  schedule: ClassVar[tuple[str, ...]] = ()
 
   num_timesteps: Annotated[
     int, count(1, 1e12), "environment steps in all, action repeats counted, to within one batch"
@@ -199,6 +203,7 @@ class PPOConfig(OnPolicyConfig):
   """Hyperparameters of PPO."""
 
   algorithm = "playground.learning.ppo:PPO"
+  schedule = SCHEDULE
   traced = (
     "learning_rate",
     "discounting",
@@ -273,6 +278,7 @@ class SACConfig(OffPolicyConfig):
   """Hyperparameters of SAC."""
 
   algorithm = "playground.learning.sac:SAC"
+  schedule = SCHEDULE
   traced = ("learning_rate", "alpha_learning_rate", "discounting", "tau", "reward_scaling")
 
   num_timesteps: Annotated[int, count(1, 1e12), "environment steps in all, action repeats and prefill counted"] = (
@@ -306,6 +312,7 @@ class REPPOConfig(OnPolicyConfig):
   """
 
   algorithm = "playground.learning.reppo:REPPO"
+  schedule = SCHEDULE
   traced = ("learning_rate", "discounting", "gae_lambda", "reward_scaling", "target_entropy")
 
   num_envs: int = 4096
@@ -378,6 +385,7 @@ class FastTD3Config(C51Config):
   """Hyperparameters of FastTD3; the defaults are those of public runs on DM Control."""
 
   algorithm = "playground.learning.fast_td3:FastTD3"
+  schedule = SCHEDULE
   traced = ("learning_rate", "discounting", "tau", "reward_scaling")
 
   deterministic_eval: Annotated[bool, "has no effect: the policy is deterministic"] = True
@@ -419,6 +427,7 @@ class FastSACConfig(C51Config):
   """Hyperparameters of FastSAC: the published ones, and FastTD3's where those are for robots alone."""
 
   algorithm = "playground.learning.fast_sac:FastSAC"
+  schedule = SCHEDULE
   traced = ("learning_rate", "alpha_learning_rate", "discounting", "tau", "reward_scaling", "target_entropy")
 
   deterministic_eval: bool = True

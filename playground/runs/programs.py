@@ -43,8 +43,8 @@ def stored_program(
 ) -> StoredProgram | None:
   """Returns the file of a run's compiled functions, named by the hash of everything that determines them.
 
-  The hash covers the sections of the configuration that `train.prepare` builds from, without the numbers that are
-  arguments; the task's values and arrays; the code, the versions and the machine (`fingerprint`).
+  The hash covers the sections of the configuration that `train.prepare` builds from, without the schedule and the
+  numbers that are arguments; the task's values and arrays; the code, the versions and the machine (`fingerprint`).
 
   Args:
     config: of the run.
@@ -62,9 +62,11 @@ def stored_program(
   placeholders = {name: np.ones_like(value) for name, value in trainer.settings.items()}
   task = env.with_settings(below("env", placeholders))
   numbers = [env.config, *(getattr(env, name) for name in env.managers)]  # methods bound to `env` refer to these
+  schedule = [f"agent.{name}" for name in config.agent.schedule]
   try:
     parts = {
-      "settings": _structure(config, ["env", "agent", "hardware", "video"], from_policy),
+      "settings": _structure(config, ["env", "agent", "hardware", "video"], from_policy, schedule),
+      "resets": config.agent.num_resets_per_eval > 0,
       "task": fingerprint.of_values(task, without=numbers),
       "arguments": [(name, value.shape) for name, value in placeholders.items()],
       "agents": trainer.num_agents,
@@ -76,13 +78,13 @@ def stored_program(
   return StoredProgram(Path(str(cache), "programs", f"{fingerprint.digest(parts)}.program"))
 
 
-def _structure(config: "RunConfig", sections: list[str], from_policy: bool) -> str:
-  """Returns sections of a configuration as text, without the numbers that are arguments of the program.
+def _structure(config: "RunConfig", sections: list[str], from_policy: bool, left_out: Iterable[str] = ()) -> str:
+  """Returns sections of a configuration as text, without some keys and the numbers that are arguments of the program.
 
   Raises:
     ConfigError: a term's number is invalid.
   """
-  traced = [f"agent.{name}" for name in config.agent.traced]
+  traced = [*left_out, *(f"agent.{name}" for name in config.agent.traced)]
   traced += [f"env.{name}" for name in task_class(config.resolved["env"]["task"]).settings_of(config.env)]
   resolved = without({name: config.resolved[name] for name in sections}, [*traced, *_startup_ranges(config)])
   resolved["init_from"] = from_policy

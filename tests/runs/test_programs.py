@@ -43,13 +43,29 @@ def test_a_reward_weight_is_an_argument():
   assert one != stored("/cache", *robot, "env.rewards.action_rate_l2.weight=0")
 
 
-@pytest.mark.parametrize("override", ["seed=2", "agent.learning_rate=1e-5", "tracking=csv", "checkpoint.keep=3"])
+@pytest.mark.parametrize(
+  "override",
+  [
+    "seed=2",
+    "agent.learning_rate=1e-5",
+    "agent.num_timesteps=3000",
+    "agent.num_evals=3",
+    "tracking=csv",
+    "checkpoint.keep=3",
+  ],
+)
 def test_what_is_no_constant_of_the_program_leaves_it(known: Path, override: str):
   assert stored("/cache", override) == known
 
 
 @pytest.mark.parametrize(
-  "override", ["env.episode_length=30", "agent.num_envs=16", "agent.network.policy_hidden_layer_sizes=[8]"]
+  "override",
+  [
+    "env.episode_length=30",
+    "agent.num_envs=16",
+    "agent.network.policy_hidden_layer_sizes=[8]",
+    "agent.num_resets_per_eval=1",
+  ],
 )
 def test_what_shapes_the_program_names_another(known: Path, override: str):
   assert stored("/cache", override) not in (known, None)
