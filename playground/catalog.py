@@ -114,10 +114,10 @@ def status(row: dict[str, str]) -> Status:
 
 
 def our_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]:
-  """Returns the rows of our runs of a task; a chain counts by its last stage."""
+  """Returns the rows of our runs of a task; of a chain's stages, which a table has in order, those of the last."""
   ours = [row for row in rows if row["task"] == task and row["who"] == "ours"]
-  chained = [row for row in ours if "chain" in row.get("experiment", "")]
-  return [row for row in ours if row not in chained] + chained[-1:]
+  last = {row["experiment"]: row["setting"] for row in ours if "chain" in row.get("experiment", "")}
+  return [row for row in ours if row["setting"] == last.get(row.get("experiment", ""), row["setting"])]
 
 
 def _reference(task: str) -> dict[str, str] | None:

@@ -35,3 +35,12 @@ def test_every_entry_is_what_the_task_is(task: str):
 )
 def test_status(row: dict[str, str], status: str):
   assert catalog.status(row) == status
+
+
+def test_of_a_chain_the_runs_of_its_last_stage_count():
+  row = lambda who, experiment, setting: {"task": "A", "who": who, "experiment": experiment, "setting": setting}
+  alone, first, last = row("ours", "", "seed=1"), row("ours", "a_chain", "stage=a"), row("ours", "a_chain", "stage=b")
+  other = row("ours", "b_chain", "stage=a")
+  rows = [alone, first, last, row("others", "", ""), other, first, last]
+  assert catalog.our_runs(rows, "A") == [alone, last, other, last]
+  assert catalog.our_runs(rows, "B") == []

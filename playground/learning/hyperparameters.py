@@ -40,8 +40,8 @@ class AgentConfig:
     algorithm: the class of the algorithm, `module:name`.
     traced: numbers that are arguments of the compiled program, not constants: another value needs no compilation, and
       agents of one program may differ in them. No Python branch may depend on one.
-    schedule: keys of how often the compiled functions are called, which none of the functions reads: another value needs
-      no compilation.
+    schedule: keys of how often the compiled functions are called, which none of the functions reads: another value
+      needs no compilation.
   """
 
   algorithm: ClassVar[str]
