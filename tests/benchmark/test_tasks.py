@@ -12,7 +12,7 @@ TASK = "CheetahRun"
 
 def run(value: float, **columns: str) -> Row:
   same = {"task": TASK, "agent": "ppo", "who": "ours", "seed": "1", "backend": "warp", "steps": "60000000"}
-  return {**same, "final_return": str(value), "final_mode_return": "", **columns}
+  return {**same, "setting": "", "final_return": str(value), "final_mode_return": "", **columns}
 
 
 def test_runs_that_differ_in_seed_alone_count_together():
