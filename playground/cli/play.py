@@ -13,7 +13,7 @@ from playground import registry
 from playground.deploy.contract import Contract
 from playground.deploy.menu import Menu
 from playground.deploy.policy import ActingPolicy, ExportedPolicy
-from playground.deploy.scripted import ScriptedPolicy, build_task
+from playground.deploy.scripted import ScriptedPolicy
 from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
@@ -91,13 +91,14 @@ def play(
 
     need_port(host, port)
   if agent is None:
-    opened = open_policy(path)
+    opened = open_policy(path, interval_events)
   else:
-    env = build_task(path, overrides, seed, randomize=randomize, interval_events=interval_events)
+    setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
+    section = configs.compose([f"env={path}", *overrides]).env
+    model_seed = seed if randomize else None
+    env = load_on_c_physics(path, section, interval_events=interval_events, model_seed=model_seed)
     opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
   exported, env = opened.exported, opened.env
-  if agent is None and not interval_events:
-    env = load_on_c_physics(exported.contract["task"], env.config, interval_events=False)
   need_camera(env.mj_model, camera, "--camera")
   if viewer:
     from playground.deploy.viewer import view
@@ -153,8 +154,8 @@ class Opened:
   trained: LoadedPolicy | None = None
 
 
-def open_policy(path: str) -> Opened:
-  """Reads a run's policy, or an exported one.
+def open_policy(path: str, interval_events: bool = True) -> Opened:
+  """Reads a run's policy, or an exported one, and builds its task, with or without interval events.
 
   Raises:
     PlaygroundError: no such run or policy.
@@ -162,14 +163,14 @@ def open_policy(path: str) -> Opened:
   if Path(path).suffix == ".onnx":
     exported = ExportedPolicy.load(path)
     setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
-    return Opened(exported, _task_of(exported, path), Path(path).expanduser().parent)
-  trained = load_exact(path)
+    return Opened(exported, _task_of(exported, path, interval_events), Path(path).expanduser().parent)
+  trained = load_exact(path, interval_events)
   folder = trained.run_dir.path / "export"
   folder.mkdir(exist_ok=True)
   return Opened(export_policy(trained), trained.env, folder, trained)
 
 
-def _task_of(exported: ExportedPolicy, path: str) -> Env:
+def _task_of(exported: ExportedPolicy, path: str, interval_events: bool) -> Env:
   """Builds the task of a policy's contract on C MuJoCo, and traces it so that invalid values raise here.
 
   Raises:
@@ -182,7 +183,7 @@ def _task_of(exported: ExportedPolicy, path: str) -> Env:
     default.pop("robot", None)  # another robot's section may hold other types
     config = configs.saved_section("env", config, default)
   try:
-    env = load_on_c_physics(task, config)
+    env = load_on_c_physics(task, config, interval_events=interval_events)
     obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
     entries = obs if isinstance(obs, Mapping) else {"state": obs}
     theirs = {row["entry"]: (tuple(row["shape"][1:]), row["type"]) for row in policy["inputs"]}

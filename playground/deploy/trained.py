@@ -1,5 +1,6 @@
 """Loads a run's policy with its task on C MuJoCo, to export or play it."""
 
+import functools
 import hashlib
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from playground.envs.c_physics import on_c_physics
 from playground.envs.options import uses_vision
 from playground.envs.wrappers import wrap_for_training
 from playground.extras import need
+from playground.randomization import Randomizer
 from playground.runs.csv_tracker import newest_evaluation
 from playground.runs.loaded_policy import LoadedPolicy, load_policy
 from playground.settings import Section
@@ -24,13 +26,18 @@ from playground.settings import Section
 _EXACT = "highest"  # precision of matrix products, as in the exported policy
 
 
-def load_exact(path: str | Path) -> LoadedPolicy:
+def load_exact(path: str | Path, interval_events: bool = True) -> LoadedPolicy:
   """Reads a run's newest checkpoint, or the one at `path`, with its task on C MuJoCo, on the CPU.
+
+  Args:
+    path: a run directory, one of its checkpoints, or `pretrained:<task>`.
+    interval_events: whether pushes and other interval events act.
 
   Raises:
     PlaygroundError: no such run or checkpoint, or one that does not fit.
   """
-  return load_policy(path, load_task=load_on_c_physics, platform="cpu", precision=_EXACT)
+  load_task = functools.partial(load_on_c_physics, interval_events=interval_events)
+  return load_policy(path, load_task=load_task, platform="cpu", precision=_EXACT)
 
 
 def record(trained: LoadedPolicy, num_envs: int, steps: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:
@@ -100,13 +107,16 @@ def switch_off_interval_events(config: TaskConfig) -> None:
       event.enabled = False
 
 
-def load_on_c_physics(task: str, config: Section | ConfigDict, interval_events: bool = True) -> Env:
+def load_on_c_physics(
+  task: str, config: Section | ConfigDict, *, interval_events: bool = True, model_seed: int | None = None
+) -> Env:
   """Builds a task on C MuJoCo.
 
   Args:
     task: its name.
     config: its section `env`.
     interval_events: whether pushes and other interval events act.
+    model_seed: of the model that the startup events draw; None is the nominal model.
 
   Raises:
     ConfigError: the task has images, and MuJoCo-Warp, which renders them, is not installed.
@@ -115,4 +125,8 @@ def load_on_c_physics(task: str, config: Section | ConfigDict, interval_events: 
   if not interval_events:
     switch_off_interval_events(own)
   own.impl = "warp" if uses_vision(own) else "jax"  # the smallest model to build; it is not simulated
-  return on_c_physics(registry.load(task, config=own))
+  env = registry.load(task, config=own)
+  if model_seed is not None:
+    for name, value in Randomizer(env.mj_model, own.events).sample(jax.random.PRNGKey(model_seed)).items():
+      getattr(env.mj_model, name)[:] = np.asarray(value)
+  return on_c_physics(env)

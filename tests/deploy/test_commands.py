@@ -200,7 +200,7 @@ def test_a_video_or_a_window(command: Command, run: Path, capsys: pytest.Capture
 def test_ctrl_c_is_no_traceback(
   command: Command, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-  def interrupted(path: str) -> None:
+  def interrupted(*_: object) -> None:
     signal.raise_signal(signal.SIGINT)
 
   monkeypatch.setattr(play, "open_policy", interrupted)

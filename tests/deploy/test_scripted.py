@@ -8,7 +8,8 @@ import pytest
 
 from playground import registry
 from playground.cli.main import main
-from playground.deploy.scripted import ScriptedPolicy, build_task
+from playground.config import compose
+from playground.deploy.scripted import ScriptedPolicy
 from playground.deploy.session import Session
 from playground.deploy.trained import load_on_c_physics
 from tests.command import Command, caller
@@ -20,7 +21,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
 
 
 def test_actions_of_a_batch() -> None:
-  env = build_task("CartpoleBalance", [], 0)
+  env = registry.load("CartpoleBalance")
   zero, random = (ScriptedPolicy(agent, "CartpoleBalance", env, 0) for agent in ("zero", "random"))
   obs = np.zeros((3, 2, 5))
   assert zero.actions(obs).shape == (3, 2, 1) and not zero.actions(obs).any()
@@ -46,5 +47,6 @@ def test_view_shows_it_in_the_browser(command: Command, monkeypatch: pytest.Monk
   assert not session.player.env.config.events.push.enabled
   calm = load_on_c_physics("Go1JoystickFlatTerrain", registry.config("Go1JoystickFlatTerrain"), interval_events=False)
   assert not calm.config.events.push.enabled, "of a policy's task"
-  drawn = build_task("Go1JoystickFlatTerrain", ["terrain=rough"], 1, randomize=True)
+  section = compose(["env=Go1JoystickFlatTerrain", "terrain=rough"]).env
+  drawn = load_on_c_physics("Go1JoystickFlatTerrain", section, model_seed=1)
   assert (session.player.env.mj_model.body_mass != drawn.mj_model.body_mass).any()
