@@ -160,7 +160,7 @@ class Recorder:
     self.rows.append((step, {k: v for k, v in metrics.items() if not k.startswith("time/")}))
     self.captured.append(captured)
 
-  def on_save(self, update: int, step: int, state: Any, final: bool) -> None:
+  def on_save(self, update: int, step: int, state: Any) -> None:
     self._check_fetched(state)
     self.saved.append((update, state))
 

@@ -85,8 +85,8 @@ class Callbacks(Protocol):
     """
     ...
 
-  def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
-    """Saves a state, which is on the host; `final` marks the end of training."""
+  def on_save(self, update: int, step: int, state: TrainState) -> None:
+    """Saves a state, which is on the host; the last one has no data in its replay buffer, which nothing reads again."""
     ...
 
   def should_stop(self) -> bool:
@@ -351,9 +351,10 @@ class Loop:
       state = self.functions.reset(state, self._key(self._reset_key, event), self.functions.model)
       jax.block_until_ready(state)
     late = any_process(time.perf_counter() - self._last_save > SAVE_EVERY_S)
-    due = late or event.evaluate or event is self.events[-1]
-    if due:
-      done.snapshot = jax.device_get(self.functions.gather(state))
+    last = event is self.events[-1]
+    if late or event.evaluate or last:
+      saved = self.functions.gather(state)
+      done.snapshot = jax.device_get(self.trainer.without_data(saved) if last else saved)
       self._last_save = time.perf_counter()
     return state, done
 
@@ -406,8 +407,7 @@ class Loop:
       captured = None if done.captured is None else done.captured[i]
       callbacks.on_metrics(step, row, captured, self.trainer.agent(recording, i))
       if snapshot is not None:
-        last = done.event is self.events[-1]
-        callbacks.on_save(done.event.update, step, self.trainer.agent(snapshot, i), last)
+        callbacks.on_save(done.event.update, step, self.trainer.agent(snapshot, i))
 
   def _key(self, key: jax.Array, event: ScheduleEvent) -> jax.Array:
     fold = lambda key: jax.random.fold_in(key, event.update)

@@ -173,13 +173,12 @@ class Trainer:
   def split(self, state: TrainState) -> tuple[Policy, TrainState]:
     """Returns the items `policy` and `state` of a checkpoint, which together are all but the replay buffer's data."""
     rest = state.replace(algorithm=state.algorithm.replace(params=None, normalizer=None), settings={})
-    return self.policy(state), self._without_data(rest)
+    return self.policy(state), self.without_data(rest)
 
   def experience(self, state: TrainState) -> np.ndarray | None:
-    """Returns the data of a fetched state's replay buffer; it is large, so only the newest checkpoint has it."""
-    if self._buffer is None or not self._buffer.saved:
+    """Returns the data of a fetched state's replay buffer, None without; only the newest checkpoint has it."""
+    if self._buffer is None or not self._buffer.saved or state.replay is None or state.replay.data is None:
       return None
-    assert state.replay is not None
     return np.asarray(state.replay.data)[: min(int(state.replay.inserted), self._buffer.slots)]
 
   def restore(self, checkpoint: Checkpoint, template: TrainState) -> tuple[TrainState, str]:
@@ -247,9 +246,10 @@ class Trainer:
 
   def _saved(self, state: PyTree) -> PyTree:
     """Returns the saved part of a state, or of its specs."""
-    return self._without_data(state) if self._buffer and not self._buffer.saved else state
+    return self.without_data(state) if self._buffer and not self._buffer.saved else state
 
-  def _without_data(self, state: PyTree) -> PyTree:
+  def without_data(self, state: PyTree) -> PyTree:
+    """Returns a state, or its specs, without the replay buffer's data."""
     return state if state.replay is None else state.replace(replay=state.replay.replace(data=None))
 
   # On each device

@@ -105,7 +105,7 @@ class RunCallbacks:
     self._check_numbers(step, taken, metrics, captured)
     self._rejected += check_updates(metrics, self._config.on_nonfinite.max_fraction, step)
 
-  def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
+  def on_save(self, update: int, step: int, state: TrainState) -> None:
     policy, rest = self._trainer.split(state)
     meta = {
       "update": update,
@@ -115,7 +115,7 @@ class RunCallbacks:
       "columns": self._trackers.columns,
       "settings": {key: np.asarray(value).tolist() for key, value in state.settings.items()},
     }
-    experience = None if final else self._trainer.experience(state)
+    experience = self._trainer.experience(state)
     self._store.save(step, policy, rest, meta, experience, None if self._copied else self._return)
 
   def should_stop(self) -> bool:
@@ -265,7 +265,7 @@ class NonMainCallbacks:
     check_fraction(bad * self._action_repeat / max(taken, 1), self._allowed, step)
     check_updates(metrics, self._allowed, step)
 
-  def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
+  def on_save(self, update: int, step: int, state: TrainState) -> None:
     """Does nothing: process 0 saves."""
 
   def should_stop(self) -> bool:

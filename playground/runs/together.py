@@ -199,8 +199,8 @@ class Member:
   ) -> None:
     self._do(lambda callbacks: callbacks.on_metrics(step, metrics, captured, recording))
 
-  def on_save(self, update: int, step: int, state: TrainState, final: bool) -> None:
-    self._do(lambda callbacks: callbacks.on_save(update, step, state, final))
+  def on_save(self, update: int, step: int, state: TrainState) -> None:
+    self._do(lambda callbacks: callbacks.on_save(update, step, state))
 
   def should_stop(self) -> bool:
     return self._interrupts.signum is not None or self.error is not None
