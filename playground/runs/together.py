@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Self, cast
 import jax
 from jax.stages import Compiled
 
-from playground.errors import CheckpointError, ConfigError, HardwareError, PlaygroundError
+from playground.errors import ConfigError, HardwareError, PlaygroundError
 from playground.hardware.mesh import device_memory
 from playground.hardware.setup import Hardware, setup
 from playground.learning.algorithm import Policy
+from playground.learning.checkpoints import CheckpointStore
 from playground.learning.evaluation import Recording
 from playground.learning.loop import CompiledFunctions, Loop
 from playground.learning.population import Population
@@ -107,8 +108,10 @@ def _train_group(
           plan.notices.append("No step has a checkpoint of all runs: the population starts from the beginning.")
         plan.checkpoints = [path for path in plan.checkpoints if path.name in steps]
     training = prepare(configs, plans, hardware, together=True)
-    if len({plan.update for plan in plans}) > 1:
-      raise CheckpointError("A checkpoint was damaged, and one run of the group is behind: start the sweep again.")
+    if len({plan.update for plan in plans}) > 1:  # a checkpoint is damaged, and its run is behind the others
+      _set_damaged_apart(configs, plans)
+      runs.close()
+      return max(_train_group(*group, interrupts, hardware) for group in _groups(configs, population))
     members = [Member(open_run(config, plan), interrupts) for config, plan in zip(configs, plans, strict=True)]
     for member in members:
       runs.enter_context(member)
@@ -144,6 +147,15 @@ def _train_group(
   if any(member.error for member in members):
     return 2
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+
+
+def _set_damaged_apart(configs: Sequence["RunConfig"], plans: Sequence[RestorePlan]) -> None:
+  """Moves damaged checkpoints away and prints it, so that the runs can be grouped by those that are left."""
+  for config, plan in zip(configs, plans, strict=True):
+    if plan.run_dir is not None and plan.step is not None and int(plan.checkpoints[0].name) > plan.step:
+      CheckpointStore(plan.run_dir.checkpoints, config.checkpoint.keep, plan.step).close()
+      for notice in plan.notices:
+        print(f"{plan.run_dir.path.name}: {notice}")
 
 
 def memory_needed(program: CompiledFunctions, hardware: Hardware) -> str:

@@ -14,13 +14,14 @@ import pandas as pd
 import pytest
 
 from playground.config import RunConfig, compose
+from playground.learning.checkpoints import find_checkpoints
 from playground.learning.population import Population
 from playground.runs.callbacks import RunCallbacks
 from playground.runs.programs import program_of
 from playground.runs.run_dir import RunDirectory
 from playground.runs.together import Member, _groups, train_together  # pyright: ignore[reportPrivateUsage]
 from playground.runs.train import train
-from tests.runs.helpers import TASK, resume
+from tests.runs.helpers import TASK, resume, truncate
 
 STEPS = 2000
 EFFORT = "env.rewards.action_l2.weight"
@@ -62,7 +63,7 @@ def test_each_agent_is_a_run_of_its_own(group: Path, tmp_path: Path) -> None:
 
 
 def test_what_was_cut_short_goes_on_together_or_alone(
-  group: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+  group: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
   with monkeypatch.context() as patch:
     asked = itertools.count()  # after every stretch
@@ -72,12 +73,20 @@ def test_what_was_cut_short_goes_on_together_or_alone(
   cut = {name: RunDirectory(tmp_path / "cut" / name) for name in AGENTS}
   assert [run.status["status"] for run in cut.values()] == ["preempted"] * 3
   shutil.copytree(tmp_path / "cut" / "b", tmp_path / "alone")
+  shutil.copytree(tmp_path / "cut", tmp_path / "damaged", symlinks=True)
   assert train_together(resumed(tmp_path / "cut", *AGENTS)) == 0
   assert {name: run.summary["params_sha256"] for name, run in cut.items()} == whole, "bit for bit"
 
   assert resume(tmp_path / "alone") == 0
-  final = [RunDirectory(path).summary["final_return"] for path in (tmp_path / "alone", group / "b")]
-  assert final[0] == pytest.approx(final[1], rel=1e-3)
+  newest = find_checkpoints(tmp_path / "damaged" / "b")[0]
+  truncate(newest)
+  assert train_together(resumed(tmp_path / "damaged", "a", "b")) == 0, "each from a step of its own"
+  said = capsys.readouterr().out
+  assert f"b: {newest} is damaged" in said and "Falling back to the checkpoint before it." in said
+  assert newest.with_name(f"damaged_{newest.name}").is_dir()
+  final = lambda path: RunDirectory(path).summary["final_return"]
+  for path in (tmp_path / "alone", tmp_path / "damaged" / "a", tmp_path / "damaged" / "b"):
+    assert final(path) == pytest.approx(final(group / ("b" if path.name == "alone" else path.name)), rel=1e-3)
 
 
 def test_what_ends_one_lets_the_others_go_on(
@@ -249,7 +258,9 @@ def test_what_the_program_of_a_robot_depends_on(override: str, same: bool) -> No
   assert (program_of(compose([*task, override])) == program_of(compose(task))) == same
 
 
-@pytest.mark.parametrize("override", ["tracking=wandb", "profile.enable=true", "hardware=multi_node"])
+@pytest.mark.parametrize(
+  "override", ["tracking=wandb", "profile.enable=true", "hardware=multi_node", "hardware.scale_envs=true"]
+)
 def test_what_trains_alone(override: str) -> None:
   assert program_of(compose([*BUDGET, override])) is None
 

@@ -33,7 +33,7 @@ from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import cut_short, train
 from tests.processes import WITHOUT_WARP
-from tests.runs.helpers import TASK, resume
+from tests.runs.helpers import TASK, resume, truncate
 
 BATCH = 80  # environment steps of one training step with debug=fast
 STEPS = 240_000  # seconds of training, so that a signal finds the run at work
@@ -104,12 +104,6 @@ def copy(whole: Path, tmp_path: Path) -> Path:
   (run / "summary.json").unlink()
   RunDirectory(run).set_status("running")
   return run
-
-
-def truncate(checkpoint: Path) -> None:
-  """Halves the file that holds the arrays of the training state."""
-  largest = max((p for p in (checkpoint / "state").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
-  os.truncate(largest, largest.stat().st_size // 2)
 
 
 def test_a_run_leaves_everything_behind(whole: Path) -> None:
