@@ -19,8 +19,8 @@ def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: S
   """Returns the population of the runs, None where `exploit_every` is 0.
 
   Raises:
-    ConfigError: there is only one run, the runs differ in program or task, so that returns are not comparable, or they
-      keep fewer than `KEEP` checkpoints.
+    ConfigError: there is only one run, the runs differ in program or task, so that returns are not comparable, they
+      keep fewer than `KEEP` checkpoints, or PPO adapts the learning rate that the population would set.
     UnknownNameError: a key of `explore` is not one of the agent's numbers that are arguments of the program.
   """
   if not exploit_every:
@@ -45,5 +45,11 @@ def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: S
   for key in explore:
     if key not in known:
       raise UnknownNameError(f"launcher.explore={key} must be one of {', '.join(known)}.{nearest(key, known)}")
+  rate = "agent.learning_rate"
+  if rate in explore and getattr(agent, "desired_kl", None) is not None:
+    raise ConfigError(
+      f"launcher.explore={rate} has no effect with agent.desired_kl, which adapts the rate: name other keys, or set "
+      "agent.desired_kl=null."
+    )
   limits = {key: settings(type(agent))[key.removeprefix("agent.")].limit or Limit() for key in explore}
   return Population(exploit_every, limits, configs[0].seed)

@@ -25,11 +25,12 @@ def program_of(config: "RunConfig") -> str | None:
   """Returns the settings that a run's compiled program depends on, as text; runs with equal texts can train together.
 
   Returns:
-    None for a run that trains alone: a chain, a run that W&B tracks (one run a process), a profiled run, and a run on
-    several machines.
+    None for a run that trains alone: a chain, a run that W&B tracks (one run a process), a profiled run, a run on
+    several machines, and one with `hardware.scale_envs`.
   """
-  alone = config.stages or config.tracking.wandb.enable or config.profile.enable or config.hardware.distributed.enable
-  if alone:
+  hardware = config.hardware
+  sized = hardware.distributed.enable or hardware.scale_envs  # by the devices of this start
+  if config.stages or config.tracking.wandb.enable or config.profile.enable or sized:
     return None
   names = [name for name in config.resolved if name not in ("seed", "run_dir", "resume", "init_from")]
   try:
@@ -39,7 +40,7 @@ def program_of(config: "RunConfig") -> str | None:
 
 
 def stored_program(
-  config: "RunConfig", trainer: Trainer, hardware: Hardware, from_policy: bool
+  config: "RunConfig", trainer: Trainer, hardware: Hardware, *, from_policy: bool, resets: bool, num_recorded: int
 ) -> StoredProgram | None:
   """Returns the file of a run's compiled functions, named by the hash of everything that determines them.
 
@@ -51,6 +52,8 @@ def stored_program(
     trainer: of the run.
     hardware: of the process.
     from_policy: whether the initial state is made from a policy.
+    resets: whether the schedule resets all environments.
+    num_recorded: recorded episodes of an evaluation, on each device.
 
   Returns:
     None where functions are not stored: without JAX's compilation cache, on several machines, on Warp (its functions
@@ -62,11 +65,13 @@ def stored_program(
   placeholders = {name: np.ones_like(value) for name, value in trainer.settings.items()}
   task = env.with_settings(below("env", placeholders))
   numbers = [env.config, *(getattr(env, name) for name in env.managers)]  # methods bound to `env` refer to these
-  schedule = [f"agent.{name}" for name in config.agent.schedule]
+  # A subclass says for itself that its functions read none of these.
+  schedule = [f"agent.{name}" for name in vars(type(config.agent)).get("schedule", ())]
   try:
     parts = {
-      "settings": _structure(config, ["env", "agent", "hardware", "video"], from_policy, schedule),
-      "resets": config.agent.num_resets_per_eval > 0,
+      "settings": _structure(config, ["env", "agent", "hardware"], from_policy, schedule),
+      "resets": resets,
+      "recorded": num_recorded,
       "task": fingerprint.of_values(task, without=numbers),
       "arguments": [(name, value.shape) for name, value in placeholders.items()],
       "agents": trainer.num_agents,

@@ -167,7 +167,9 @@ def prepare(
   num_recorded = min(config.video.episodes, agent.num_eval_envs // trainer.num_devices) * config.video.enable
   others = other_acts(trainer.algorithm)
   evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, trainer.mesh, num_recorded, others)
-  stored = stored_program(config, trainer, hardware, from_policy=plan.policy is not None)
+  resets = any(event.reset for event in events)
+  from_policy = plan.policy is not None
+  stored = stored_program(config, trainer, hardware, from_policy=from_policy, resets=resets, num_recorded=num_recorded)
   return Training(env, drawn, trainer, events, evaluate, draw, stored)
 
 

@@ -13,16 +13,20 @@ from playground.runs.programs import stored_program
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.train import prepare
 
+pytestmark = pytest.mark.stored_programs
 FAST = ("env=CartpoleBalance", "debug=fast", "hardware=cpu", "tuned=null")
 
 
 def stored(cache: str | None, *overrides: str, from_policy: bool = False, **parts: Any) -> Path | None:
+  """The file of a run's program; `parts` are attributes of its task."""
   config = compose([*FAST, *overrides])
   hardware = Hardware(make_mesh(1), None, {"compilation_cache": cache})
-  trainer = prepare([config], [RestorePlan()], hardware).trainer
+  training = prepare([config], [RestorePlan()], hardware)
+  if not parts and not from_policy:
+    return training.stored and training.stored.path
   for name, value in parts.items():
-    setattr(trainer.env.unwrapped, name, value)
-  program = stored_program(config, trainer, hardware, from_policy)
+    setattr(training.env.unwrapped, name, value)
+  program = stored_program(config, training.trainer, hardware, from_policy=from_policy, resets=False, num_recorded=0)
   return program and program.path
 
 
@@ -50,6 +54,8 @@ def test_a_reward_weight_is_an_argument():
     "agent.learning_rate=1e-5",
     "agent.num_timesteps=3000",
     "agent.num_evals=3",
+    "agent.num_resets_per_eval=1",  # the last of which is the end
+    "video.width=320",
     "tracking=csv",
     "checkpoint.keep=3",
   ],
@@ -64,7 +70,8 @@ def test_what_is_no_constant_of_the_program_leaves_it(known: Path, override: str
     "env.episode_length=30",
     "agent.num_envs=16",
     "agent.network.policy_hidden_layer_sizes=[8]",
-    "agent.num_resets_per_eval=1",
+    "agent.num_resets_per_eval=2",
+    "video.enable=true",
   ],
 )
 def test_what_shapes_the_program_names_another(known: Path, override: str):

@@ -87,6 +87,7 @@ def test_a_population_is_one_process(tmp_path: Path, started: list[list[str]]) -
     (["seed=1", "seed=2 agent.num_envs=64"], {}, "differ in more than seeds and numbers"),
     (["seed=1", "seed=2 env.events.damping.params.range=[0.8,1.2]"], {}, "need the same env"),
     (["seed=1", "seed=2"], {"explore": ["agent.num_envs"]}, "launcher.explore=agent.num_envs must be one of agent.l"),
+    (["seed=1 agent.desired_kl=0.01", "seed=2 agent.desired_kl=0.01"], {}, "has no effect with agent.desired_kl"),
     (["seed=1", "seed=2 checkpoint.keep=2"], {}, "differ in more than seeds and numbers"),
     (["seed=1 checkpoint.keep=2", "seed=2 checkpoint.keep=2"], {}, "checkpoint.keep=2 must be 3 or more with launcher"),
     (["seed=1", "seed=2", "seed=3"], {"max_agents": 2}, "launcher.max_agents=2 is below the 3 jobs"),
