@@ -183,7 +183,8 @@ class Episode(Wrapper):
     done = jnp.where(timed_out, 1.0, ended)
     sums = {k: jnp.where(was_done > 0, 0.0, v) for k, v in state.info["episode_metrics"].items()}
     values = {"sum_reward": reward, "length": jnp.full_like(reward, self.repeat)} | after.metrics
-    totals = {k: _SUMMARIES[kinds.get(k, "sum")](old, values[k], steps / self.repeat) for k, old in sums.items()}
+    count = sums["length"] / self.repeat + 1  # not of `steps`, which may begin at a random age
+    totals = {k: _SUMMARIES[kinds.get(k, "sum")](old, values[k], count) for k, old in sums.items()}
     totals |= {k: jnp.where(after.info["nonfinite"] > 0, sums[k], totals[k]) for k in kinds}
     info = after.info | {
       "steps": steps,

@@ -120,6 +120,6 @@ def c51_loss(
 
 def updates_actor(config: C51Config, index: jax.Array, step: jax.Array) -> jax.Array:
   """Whether the actor is updated after the critic update `index` of the training step `step`, []."""
-  multiple = config.grad_updates_per_step > 1
-  first = int(multiple and config.policy_frequency > 1)
-  return (index if multiple else step) % config.policy_frequency == first
+  count = config.grad_updates_per_step
+  first = int(count > 1 and config.policy_frequency > 1)
+  return (step * count + index) % config.policy_frequency == first

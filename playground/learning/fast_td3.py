@@ -55,7 +55,7 @@ class FastTD3(OffPolicy[FastTD3Config, FastTD3Networks]):
 
   def __init__(self, env: Env, config: FastTD3Config, network_precision: str | None = None):
     super().__init__(env, config, FastTD3Networks(env, config, network_precision))
-    self._noise_for = env.episode_length
+    self._noise_for = -(-env.episode_length // env.action_repeat)  # policy steps
 
   @property
   def optimizer(self) -> optax.GradientTransformation:
@@ -76,7 +76,7 @@ class FastTD3(OffPolicy[FastTD3Config, FastTD3Networks]):
     return jnp.clip(action + levels[:, None] * jax.random.normal(key, action.shape), -1, 1)
 
   def _noise_levels(self, step: jax.Array, count: int) -> jax.Array:
-    """Returns the noise std of this device's environments, [count], which changes every `episode_length` steps."""
+    """Returns the noise std of this device's environments, [count], which changes after each length of an episode."""
     key = jax.random.fold_in(jax.random.PRNGKey(0), step // self._noise_for)
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
     return jax.random.uniform(key, (count,), minval=self.config.min_noise, maxval=self.config.max_noise)

@@ -280,7 +280,7 @@ class ActorCritic(Actor):
 
 
 class SoftActorCriticParams(struct.PyTreeNode):
-  """The parameters of SAC's optimiser. The order matters: the critics come first, see `SAC._learn`.
+  """The parameters of SAC's optimiser. The order matters: the critics come first, see `SAC.learn`.
 
   Attributes:
     q: parameters of the twin critics, each array [2, ...].

@@ -105,11 +105,11 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     rollout_key, update_key = jax.random.split(key)
 
     # Collect: every environment gives the same number of trajectories.
-    normalizer: Normalizer | None = state.normalizer if config.normalize_observations else None
+    acting: Normalizer | None = state.normalizer if config.normalize_observations else None
     critic = functools.partial(networks.value, state.params.value) if config.bootstrap_on_timeout else None
 
     def trajectories(envs: Environments, key: jax.Array) -> tuple[Environments, PyTree]:
-      envs, data = unroll(envs, networks, state.params.policy, normalizer, key, config.unroll_length, critic)
+      envs, data = unroll(envs, networks, state.params.policy, acting, key, config.unroll_length, critic)
       return envs, (data, envs.state.obs)
 
     keys = jax.random.split(rollout_key, config.batch_size * config.num_minibatches // config.num_envs)
@@ -118,13 +118,14 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     last_obs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), last_obs)
 
     # Normalise once for all epochs, with statistics that include this data.
+    normalizer = acting
     if config.normalize_observations and networks.obs_keys:
       normalizer = update_normalizer(state.normalizer, networks.vectors(data.obs))
     obs, last_obs = normalize(data.obs, normalizer), normalize(networks.select(last_obs), normalizer)
 
     batch = Batch(obs, last_obs, data.raw_action, data.log_prob, data.reward, data.termination, data.truncation)
     if config.clipping_epsilon_value is not None:
-      batch = batch.replace(value=networks.value(state.params.value, normalize(data.obs, state.normalizer)))
+      batch = batch.replace(value=networks.value(state.params.value, normalize(data.obs, acting)))
     if data.final_value is not None:
       batch = pay_time_outs(batch, data.final_value, config)
     if (mirror := self.mirror) is not None:
@@ -142,8 +143,9 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     # Learn: several epochs, each over its own shuffle of the trajectories.
     flat, unravel = ravel_pytree(state.params)
 
-    def epoch(carry: tuple[jax.Array, PyTree, jax.Array], key: jax.Array) -> tuple[PyTree, jax.Array]:
+    def epoch(carry: tuple[jax.Array, PyTree, jax.Array], key: jax.Array) -> tuple[PyTree, PyTree]:
       *start, stopped = carry
+      runs = ~stopped
       shuffle_key, loss_key = jax.random.split(key)
       columns = jax.random.permutation(shuffle_key, batch.reward.shape[1]).reshape(config.num_minibatches, -1)
       data = self._with_targets(batch, unravel(carry[0])) if config.targets == "epoch" else batch
@@ -161,18 +163,19 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
       keys = jax.random.split(loss_key, config.num_minibatches)
       learned, log = jax.lax.scan(update, tuple(start), (columns, keys))
       if config.max_kl is not None:  # an epoch beyond the KL limit is the last one
-        learned = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), learned, tuple(start))
+        learned = jax.tree.map(lambda new, old: jnp.where(runs, new, old), learned, tuple(start))
+        log = jnp.where(runs, log, 0.0)
         kl = jax.lax.pmean(log[:, self.losses.index(KL)].mean(), AXIS)
         stopped |= kl > config.max_kl
-      return (*learned, stopped), log
+      return (*learned, stopped), (log, runs)
 
     epochs = jax.random.split(update_key, config.num_updates_per_batch)
-    (flat, opt_state, stopped), log = jax.lax.scan(epoch, (flat, state.opt_state, jnp.array(False)), epochs)
+    (flat, opt_state, stopped), (log, runs) = jax.lax.scan(epoch, (flat, state.opt_state, jnp.array(False)), epochs)
     params = unravel(flat)
 
     names = (*self.losses, "grad_norm", "nonfinite_updates")
-    metrics: Metrics = dict(zip(names, jax.lax.pmean(log.mean((0, 1)), AXIS), strict=True))
-    metrics["gradient_steps"] = jnp.float32(config.num_updates_per_batch * config.num_minibatches)
+    metrics: Metrics = dict(zip(names, jax.lax.pmean(log.mean(1).sum(0), AXIS) / runs.sum(), strict=True))
+    metrics["gradient_steps"] = jnp.float32(config.num_minibatches) * runs.sum()
     metrics["nonfinite_updates"] *= metrics["gradient_steps"]
     if vectors := jax.tree.leaves(networks.vectors(obs)):
       farthest = jnp.stack([jnp.abs(entry).max() for entry in vectors]).max()

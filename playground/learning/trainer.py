@@ -76,7 +76,7 @@ class Trainer:
     train: (state, model fields, number of training steps) -> (state, metrics); donates the state's buffers.
     reset: (state, key, model fields) -> state with all environments reset, except entries that outlast a full reset;
       donates the state's buffers.
-    copy: (state) -> state in new buffers, for a checkpoint.
+    gather: (state) -> the part that a checkpoint holds, in full in each process.
   """
 
   def __init__(

@@ -139,6 +139,25 @@ def test_episode_metrics_sum_one_episode() -> None:
   np.testing.assert_allclose(states[LENGTH + 1].info["episode_metrics"]["sum_reward"], rewards[LENGTH], rtol=1e-6)
 
 
+@pytest.mark.parametrize(("kind", "expected"), [("mean", -2.0), ("max", -2.0)])
+def test_a_summary_is_of_the_steps_taken_where_an_episode_begins_at_a_random_age(kind: str, expected: float) -> None:
+  class Constant(Counting):
+    summaries: ClassVar[Mapping[str, str]] = {"constant": kind}
+
+    def reset(self, rng: jax.Array, model: Any = None) -> State:
+      return super().reset(rng, model).replace(metrics={"constant": jnp.zeros(())})
+
+    def post_step(self, data: Any, info: Any, action: jax.Array) -> State:
+      return super().post_step(data, info, action).replace(metrics={"constant": jnp.float32(-2)})
+
+  wrapped = wrappers.wrap_for_training(Constant(episode_length=LENGTH))
+  state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), N))
+  state = state.replace(info=state.info | {"steps": state.info["steps"] + 2})
+  for _ in range(2):
+    state = jax.jit(wrapped.step)(state, jnp.full((N, 2), 0.1))
+    np.testing.assert_allclose(state.info["episode_metrics"]["constant"], expected)
+
+
 def test_action_repeat_sums_rewards_and_stops_at_a_termination() -> None:
   single = np.array([s.reward for s in roll(2, repeat=1)])
   np.testing.assert_allclose(roll(1, repeat=2)[1].reward, single[1] + single[2], rtol=1e-5)

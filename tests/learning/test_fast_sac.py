@@ -12,6 +12,7 @@ from jax.sharding import PartitionSpec as P
 
 from playground.errors import ConfigError
 from playground.hardware.mesh import jit_on_mesh, make_mesh
+from playground.learning.c51 import updates_actor
 from playground.learning.fast_sac import (
   BoundedNormalTanh,
   FastSAC,
@@ -119,6 +120,14 @@ def test_critics_and_temperature_move_in_each_update_and_the_actor_in_every_nth(
   assert float(jnp.abs(learned.log_alpha - params.log_alpha)) <= 8 * config.alpha_learning_rate * 1.01
   for now, before, slow in zip(*map(jax.tree.leaves, (learned.q, params.q, target)), strict=True):
     assert 0 < jnp.abs(slow - before).max() < jnp.abs(now - before).max()
+
+
+@pytest.mark.parametrize(("updates", "frequency"), [(1, 3), (2, 4), (3, 2), (8, 2), (8, 16), (5, 1)])
+def test_the_actor_is_updated_with_every_nth_of_all_critic_updates(updates: int, frequency: int) -> None:
+  config = dataclasses.replace(SMALL, grad_updates_per_step=updates, policy_frequency=frequency)
+  steps, indices = np.divmod(np.arange(48 * updates), updates)
+  turns = np.flatnonzero(updates_actor(config, jnp.asarray(indices), jnp.asarray(steps)))
+  assert len(turns) == 48 * updates // frequency and set(np.diff(turns)) == {frequency}
 
 
 def test_a_deviation_without_a_range_is_refused() -> None:

@@ -164,6 +164,7 @@ def test_an_epoch_that_goes_too_far_is_the_last() -> None:
     first.append(jax.device_get(trainer.policy(state).params))
     metrics.append(log)
   assert [float(log["stopped_early"]) for log in metrics] == [1, 0]
+  assert [float(log["gradient_steps"]) for log in metrics] == [SMALL_PPO.num_minibatches * n for n in (1, 3)]
   same = lambda a, b: all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
   assert not same(*first), "with room all three epochs count"
 
