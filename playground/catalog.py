@@ -6,17 +6,20 @@ reference runs in results/reference/. A task of another package is not in it.
 
 import dataclasses
 import json
+import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from statistics import fmean
 from typing import Literal, get_args
 
 from playground.files import read_csv
 
 Status = Literal["solved", "learning", "open", "not measured"]
-STATUSES = get_args(Status)
+STATUSES: tuple[Status, ...] = get_args(Status)
 FILE = Path(__file__).parent / "catalog.json"
 _REFERENCE = FILE.parents[1] / "results/reference"
+_NO_PUSHES = re.compile(r"events\.push\.enabled=false")
 _TABLES = ("dm_control", "locomotion", "manipulation", "vision")
 
 
@@ -34,10 +37,10 @@ class Entry:
     agent: the algorithm that its experiment trains with.
     budget: environment steps of its tuned set.
     experiment: its experiment.
-    status: solved, learning or open, see `status`; "not measured" without a reference run.
-    reference_return: return of the best reference run at its end, or of a chain's last stage.
-    reference_steps: environment steps of that run.
-    reference_agent: what trained it.
+    status: solved, learning or open, of the run that got furthest, see `status`; "not measured" without a run.
+    best_return: mean return at the end of the best runs of ours, see `best_runs`.
+    best_steps: environment steps of those runs, of a chain's last stage alone.
+    best_run: what trained them, see `run_name`.
   """
 
   task: str
@@ -50,9 +53,9 @@ class Entry:
   budget: int
   experiment: str
   status: Status
-  reference_return: float | None
-  reference_steps: int | None
-  reference_agent: str
+  best_return: float | None
+  best_steps: int | None
+  best_run: str
 
 
 @cache
@@ -74,7 +77,10 @@ def measure(task: str) -> Entry:
   observations = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
   groups = observations if isinstance(observations, dict) else {"state": observations}
   shown = ", ".join(f"{name} {' x '.join(map(str, group.shape))}" for name, group in groups.items())
-  row = _reference(task)
+  tables = [read_csv(_REFERENCE / f"{name}.csv") for name in _TABLES]
+  rows = [row for table in tables for row in our_runs(table, task)]
+  best = best_runs(rows, task)
+  reached = [STATUSES.index(status(row)) for row in rows]
   return Entry(
     task=task,
     suite=str(config.env.task).split(".")[2],
@@ -85,10 +91,10 @@ def measure(task: str) -> Entry:
     agent=str(config.agent_name),
     budget=int(config.agent.num_timesteps),
     experiment=experiment_name(task),
-    status=status(row) if row else "not measured",
-    reference_return=float(row["final_return"]) if row else None,
-    reference_steps=int(row["steps"]) if row else None,
-    reference_agent=row["agent"].split(",")[0] if row else "",
+    status=STATUSES[min(reached, default=-1)],
+    best_return=round(fmean(float(row["final_return"]) for row in best), 3) if best else None,
+    best_steps=int(best[0]["steps"]) if best else None,
+    best_run=run_name(best[0]) if best else "",
   )
 
 
@@ -116,17 +122,39 @@ def status(row: dict[str, str]) -> Status:
 def our_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]:
   """Returns the rows of our runs of a task; of a chain's stages, which a table has in order, those of the last."""
   ours = [row for row in rows if row["task"] == task and row["who"] == "ours"]
-  last = {row["experiment"]: row["setting"] for row in ours if "chain" in row.get("experiment", "")}
-  return [row for row in ours if row["setting"] == last.get(row.get("experiment", ""), row["setting"])]
+  last = {row["experiment"]: stage for row in ours if (stage := _stage_of(row))}
+  return [row for row in ours if _stage_of(row) == last.get(row.get("experiment", ""), "")]
 
 
-def _reference(task: str) -> dict[str, str] | None:
-  """The run of ours that got furthest; of several the one of the highest return."""
-  rows: list[dict[str, str]] = []
-  for name in _TABLES:
-    found = read_csv(_REFERENCE / f"{name}.csv")
-    rows += our_runs(found, task)
-  return max(rows, key=lambda row: (-STATUSES.index(status(row)), float(row["final_return"])), default=None)
+def _stage_of(row: dict[str, str]) -> str:
+  """Returns the stage of a chain that a row is of, "" without one."""
+  found = re.search(r"stage[ =](\w+)", row["setting"]) if "chain" in row.get("experiment", "") else None
+  return found.group(1) if found else ""
+
+
+def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]:
+  """Returns our runs of a task with the agent, setting, backend and steps of the highest mean final return.
+
+  A chain counts by its last stage. Runs without pushes count only if there are no others.
+  """
+  ours = our_runs(rows, task)
+  groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
+  for row in [row for row in ours if not _NO_PUSHES.search(row["setting"])] or ours:
+    groups.setdefault((row["agent"], row["setting"], row["backend"], row["steps"]), []).append(row)
+  return max(groups.values(), key=lambda runs: fmean(float(row["final_return"]) for row in runs), default=[])
+
+
+def run_name(row: dict[str, str]) -> str:
+  """Returns a run's agent, with the stage of a chain, the task of its first policy, and pushes that are off."""
+  setting = row["setting"]
+  chain = f", {row['experiment']}'s {stage}" if (stage := _stage_of(row)) else ""
+  start = re.search(r"init_from=<(\w+)>", setting)
+  return (
+    row["agent"].split(",")[0].replace("agent.", "")
+    + chain
+    + (f", from {start.group(1)}" if start else "")
+    + ", no pushes, nothing randomised" * bool(_NO_PUSHES.search(setting))
+  )
 
 
 def _write() -> None:

@@ -42,9 +42,9 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
     return 0
   console = Console()
   if not console.is_terminal:  # one line a task, however long
-    console = Console(width=200)
+    console = Console(width=240)
   console.print(_table(rows))
-  console.print(f"{len(rows)} tasks. Train one with playground train experiment=<experiment>.", soft_wrap=True)
+  console.print(f"{len(rows)} tasks. Train one with playground train env=<task>.", soft_wrap=True)
   return 0
 
 
@@ -57,14 +57,20 @@ def _table(rows: Iterable[Section]) -> Table:
   table.add_column("task", style="cyan", no_wrap=True)
   for name in ("suite", "robot", "observation"):
     table.add_column(name, overflow="fold")
-  for name in ("action", "backend", "agent", "budget", "status", "return", "experiment"):
-    table.add_column(name, overflow="fold", justify="right" if name in ("action", "budget", "return") else "left")
+  for name in ("action", "backend", "agent", "budget", "status", "best run of ours"):
+    table.add_column(name, overflow="fold", justify="right" if name in ("action", "budget") else "left")
   for row in rows:
-    score = row.get("reference_return")
     cells = {
       "budget": f"{row['budget'] / 1e6:g} M" if "budget" in row else "",
-      "return": "" if score is None else f"{score:.4g}",
+      "best run of ours": _best(row),
     }
     shown = {**row, **cells}
     table.add_row(*(Text(str(shown.get(str(column.header), ""))) for column in table.columns))
   return table
+
+
+def _best(row: Section) -> str:
+  """Formats a task's best return with the run that reached it."""
+  if row.get("best_return") is None:
+    return ""
+  return f"{row['best_return']:.4g} ({row['best_run']}, {row['best_steps'] / 1e6:.3g} M)"

@@ -4,8 +4,8 @@ import pytest
 
 from playground.benchmark.report import tasks
 from playground.benchmark.report.public import Curve
-from playground.benchmark.report.tasks import Row, best_runs, by_mode, table
-from playground.catalog import entries
+from playground.benchmark.report.tasks import Row, by_mode, table
+from playground.catalog import best_runs, entries, run_name
 
 TASK = "CheetahRun"
 
@@ -33,6 +33,18 @@ def test_a_chain_counts_by_its_last_stage():
   assert best_runs(rows, TASK) == rows[1:]
   assert best_runs([*rows, run(5)], TASK) == rows[1:]
   assert best_runs([*rows, run(10)], TASK) == [run(10)]
+
+
+def test_runs_without_pushes_count_only_alone():
+  off = run(40, setting="env.events.push.enabled=false")
+  assert best_runs([off, run(5)], TASK) == [run(5)]
+  assert best_runs([off], TASK) == [off]
+  assert run_name(off) == "ppo, no pushes, nothing randomised"
+
+
+def test_a_run_is_named_by_what_it_starts_from():
+  assert run_name(run(1, agent="reppo", setting="init_from=<WalkerWalk>")) == "reppo, from WalkerWalk"
+  assert run_name(run(1, experiment="go1_chain", setting="stage=rough")) == "ppo, go1_chain's rough"
 
 
 @pytest.mark.parametrize(

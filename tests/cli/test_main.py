@@ -39,9 +39,9 @@ def _stub(monkeypatch: pytest.MonkeyPatch, module: str, name: str, result: Any) 
 def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
   assert command("list") == 0
   lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-  assert lines[0] == "task suite robot observation action backend agent budget status return experiment"
+  assert lines[0] == "task suite robot observation action backend agent budget status best run of ours"
   (line,) = (line for line in lines if line.startswith("CartpoleBalance "))
-  assert line.startswith("CartpoleBalance dm_control state 5 1 jax ppo 60 M solved 99")
+  assert line.startswith("CartpoleBalance dm_control state 5 1 jax ppo 60 M solved 998.3 (ppo, 60.9 M)")
   assert lines[-1].startswith(f"{len(lines) - 2} tasks.")
   assert command("list", "go1", "--suite", "locomotion", "--backend", "jax", "--json") == 0
   rows = json.loads(capsys.readouterr().out)

@@ -19,7 +19,7 @@ Points = list[tuple[float, float]]  # (environment steps, return), steps ascendi
 SHARE = 0.95  # of the best public PPO at equal steps: below it a task counts as below
 _AS_SET = "as set"
 _AGENT = re.compile(r"(?<![a-z])(fast_sac|fast_td3|reppo|sac)(?![a-z])")
-_OTHER_EPISODES = "kengz/SLM-Lab"  # whose manipulation tasks have episodes of other lengths
+_SLM_LAB = "kengz/SLM-Lab"  # whose manipulation tasks have episodes of other lengths, and whose returns of 0.0 failed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,15 +146,15 @@ def _agent_of(label: str) -> str:
 
 @cache
 def public_curves() -> dict[str, list[Curve]]:
-  """Returns the public curves by task, one for each algorithm of a repository, without episodes of other lengths."""
+  """Returns the public curves by task, one for each algorithm of a repository, without what compares to nothing."""
   settings = {row["repository"]: row for row in _read("settings")}
   manipulation = {*tasks_of("manipulation")}
   curves: dict[str, list[Curve]] = {}
   key = lambda row: (row["task"], row["algorithm"], row["source"].partition("@")[0])
   for (task, algorithm, repository), rows in groupby(sorted(_read("returns"), key=key), key=key):
-    if repository == _OTHER_EPISODES and task in manipulation:
-      continue
     points = sorted((float(row["env_steps"]), float(row["return_mean"])) for row in rows)
+    if repository == _SLM_LAB and (task in manipulation or all(abs(value) < 0.05 for _, value in points)):
+      continue
     label = f"{algorithm}, {settings[repository]['actions']}"
     curves.setdefault(task, []).append(Curve(label, settings[repository]["actions"], points))
   return curves

@@ -85,7 +85,7 @@ def _grid(suite: str) -> str:
   cells = []
   for task, entry in entries().items():
     if entry.suite == suite:
-      score = "" if entry.reference_return is None else f", {entry.reference_return:.4g}"
+      score = "" if entry.best_return is None else f", {entry.best_return:.4g}"
       robot = f"<br>{entry.robot}" if entry.robot else ""
       cells.append(f"![{task}](gallery/{task}.webp)<br>{task}<br>{entry.status}{score}{robot}")
   rows = [cells[i : i + _GRID_WIDTH] for i in range(0, len(cells), _GRID_WIDTH)]

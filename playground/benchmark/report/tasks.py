@@ -4,24 +4,13 @@ import re
 from collections.abc import Sequence
 
 from playground.benchmark.report.public import at, is_ppo, public_curves
-from playground.catalog import Entry, our_runs
+from playground.catalog import Entry, best_runs, run_name
 from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
 
 _HEADER = ("task", "status", "best run", "M steps", "default budget", "runs (seeds)", "sampled", "mode")
 _PUBLIC = ("best public PPO", "best public")  # at as many steps
 _BY_MODE = ("reppo", "fast_td3", "fast_sac")  # whose agent.deterministic_eval is true by default
 Row = dict[str, str]
-
-
-def best_runs(rows: Sequence[Row], task: str) -> list[Row]:
-  """Returns our runs of a task with the agent, setting, backend and steps of the highest mean final return.
-
-  A chain counts by its last stage.
-  """
-  groups: dict[tuple[str, ...], list[Row]] = {}
-  for row in our_runs(rows, task):
-    groups.setdefault((row["agent"], row.get("setting", ""), row["backend"], row["steps"]), []).append(row)
-  return max(groups.values(), key=lambda runs: mean_and_ci95(_returns(runs, "final_return"))[0], default=[])
 
 
 def by_mode(row: Row) -> bool:
@@ -49,7 +38,7 @@ def table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
     mode = _with_ci(runs, "final_return" if by_mode(runs[0]) else "final_mode_return")
     public = [_public(entry.task, steps, ppo_only) for ppo_only in (True, False)]
     cells.append(
-      [entry.task, entry.status, _name(runs[0]), f"{steps / 1e6:.3g}", budget, count, sampled, mode, *public]
+      [entry.task, entry.status, run_name(runs[0]), f"{steps / 1e6:.3g}", budget, count, sampled, mode, *public]
     )
   return Table([*_HEADER, *_PUBLIC], cells)
 
@@ -65,14 +54,6 @@ def _with_ci(runs: Sequence[Row], column: str) -> str:
     return ""
   mean, ci95 = mean_and_ci95(values)
   return short(mean) + ("" if ci95 is None else f" ± {ci95:.0f}" if ci95 >= 10 else f" ± {ci95:.2g}")
-
-
-def _name(row: Row) -> str:
-  """Returns the agent, with the stage of a chain and a note on pushes and randomisation switched off."""
-  pushed = "events.push.enabled=false" in row.get("setting", "")
-  stage = re.search(r"stage[ =](\w+)", row.get("setting", "")) if "chain" in row.get("experiment", "") else None
-  chain = f", {row['experiment']}'s {stage.group(1)}" if stage else ""
-  return row["agent"].replace("agent.", "") + chain + ", no pushes, nothing randomised" * pushed
 
 
 def _public(task: str, steps: float, ppo_only: bool) -> str:
