@@ -91,10 +91,13 @@ def build_scene(
       in this order, after the robot's own sensors, but before the first of contacts between its parts and what follows.
 
   Raises:
-    ConfigError: an invalid MJCF or parameter, an unknown name, or a collision variant that the robot has no geoms for.
+    ConfigError: an invalid MJCF or parameter, a floor in the MJCF, an unknown name, or a collision variant that the
+      robot has no geoms for.
   """
   activate = lookup(COLLISIONS, collision, "env.scene.collision")
   spec = read_mjcf(mjcf)
+  if any(geom.name == "floor" for geom in spec.geoms):
+    raise ConfigError(f"env.robot.mjcf={mjcf} has a geom named floor: remove it, the scene adds the ground.")
   if collision != "feet" and not _full_geoms(spec):
     raise ConfigError(f"collision={collision}: {Path(mjcf).stem} has geoms for the feet only, choose collision=feet.")
   activate(spec)

@@ -1,5 +1,7 @@
 """The joystick task on the Go1: shapes, composition by config, pushes, starts, and what it keeps account of."""
 
+import re
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,6 +13,7 @@ from playground import registry
 from playground.config import compose
 from playground.envs.base import State
 from playground.errors import ConfigError, UnknownNameError
+from playground.robots.scene import find_mjcf
 from tests.envs.golden import BATCH, KEYS, compiled_task, load_task, recorded
 
 TASK = "Go1JoystickFlatTerrain"
@@ -258,6 +261,24 @@ def test_rewards_need_what_they_are_about() -> None:
 def test_joints_in_another_order(pushed: Any) -> None:
   with pytest.raises(ConfigError, match=r"env\.robot\.joints must name the model's joints in their order: FR_hip"):
     load_task(TASK, {"robot.joints": list(reversed(pushed.config.robot.joints))})
+
+
+SLIDES_AND_A_BALL = '<joint type="slide"/>' * 3 + '<joint type="ball"/>'  # as many numbers as a free joint
+
+
+@pytest.mark.parametrize(
+  ("ours", "theirs", "message"),
+  [
+    ("<freejoint/>", SLIDES_AND_A_BALL, "needs <freejoint/> as its first joint, in the body trunk"),
+    ("<position name=", '<motor ctrlrange="-1 1" name=', "the actuator FR_hip is no position servo"),
+  ],
+)
+def test_a_robot_without_a_free_joint_or_servos(ours: str, theirs: str, message: str, tmp_path: Path) -> None:
+  robot = tmp_path / "robot.xml"
+  mjcf = find_mjcf("go1")
+  robot.write_text(mjcf.read_text().replace(ours, theirs))
+  with pytest.raises(ConfigError, match=re.escape(message)):
+    load_task(TASK, {"robot.mjcf": str(robot), "robot.pd": None})
 
 
 def test_soft_limits_lie_within_the_hard_ones(pushed: Any) -> None:

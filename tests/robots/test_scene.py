@@ -99,6 +99,9 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
   )
   model = build_scene(str(other), floor_contacts=["skin"]).compile()
   assert (model.geom(0).name, model.sensor(0).name) == ("floor", "skin_floor_found")
+  other.write_text(other.read_text().replace("<body", '<geom name="floor" type="plane" size="1 1 1"/><body'))
+  with pytest.raises(ConfigError, match=r"ball\.xml has a geom named floor: remove it, the scene adds the ground"):
+    build_scene(str(other))
   other.write_text("<mujoco><wordbody/></mujoco>")
   with pytest.raises(ConfigError, match=r"ball\.xml is not an MJCF that MuJoCo reads: .*unrecognized element"):
     build_scene(str(other))

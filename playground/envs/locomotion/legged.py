@@ -63,6 +63,8 @@ class LeggedTask(Task):
 
   def prepare_model(self, mj_model: mujoco.MjModel, config: Any) -> None:
     set_gains(mj_model, **(config.robot.pd or {}))
+    if type(self).action_to_ctrl is LeggedTask.action_to_ctrl:
+      _need_servos(mj_model, config.robot.mjcf)
 
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> LeggedRobot:
     return LeggedRobot(mj_model, config.robot)
@@ -90,3 +92,14 @@ class LeggedTask(Task):
       "tracking_error/lin_vel": jnp.linalg.norm(c.command[:2] - linvel[:2]),
       "tracking_error/ang_vel": jnp.abs(c.command[2] - gyro[2]),
     }
+
+
+def _need_servos(mj_model: mujoco.MjModel, mjcf: str) -> None:
+  """Raises ConfigError where an actuator does not hold a position: an action is a joint's target."""
+  for i in range(mj_model.nu):
+    if not mj_model.actuator_biasprm[i, 1] < 0:
+      name = mj_model.actuator(i).name or f"number {i}"
+      raise ConfigError(
+        f"env.robot.mjcf={mjcf}: the actuator {name} is no position servo, and an action is a joint's target: "
+        'use <position inheritrange="1">, or a task with its own action_to_ctrl.'
+      )
