@@ -82,6 +82,8 @@ def parse_with_hydra(text: str) -> HydraOverride:
   try:
     return OverridesParser.create().parse_override(f"{key}={quoted(value)}" if key in _PATHS else text)
   except HydraException:
+    if group := next((group for group in ("env", "experiment") if text in options(group)), None):
+      raise ConfigError(f"{text!r} is not an override: write {group}={text}.") from None
     example = "such as env=CartpoleBalance or agent.num_envs=1024 (quote a value with special characters)"
     raise ConfigError(f"{text!r} is not an override: write key=value, {example}.") from None
 

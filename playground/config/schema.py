@@ -30,6 +30,10 @@ def check_key(key: str, schema: Section) -> None:
       raise _unknown_key(key, ".".join(parts[:i]), part, node, schema)
 
 
+# Names of other libraries.
+_MEANT = {"task": "env", "algo": "agent", "algorithm": "agent", "lr": "learning_rate", "gamma": "discounting"}
+
+
 def is_open(parts: Sequence[str], schema: Section) -> bool:
   """Whether a key is in a mapping of terms (`env.rewards`, ...), which may have entries of any name.
 
@@ -148,7 +152,7 @@ def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section)
     what = f"a list of {len(node)}" if isinstance(node, list) else "a single value"
     return UnknownNameError(f"{key} does not exist: {parent} is {what}.")
   known = [str(k) for k in node] if parent else [*schema, "robot", *DELTAS]
-  near = nearest_in(parent, part, known)
+  near = nearest_in(parent, _MEANT.get(part, part), known)
   if not near and not parent:  # perhaps only the section is missing
     near = nearest(part, _keys(schema))
   has = f"has {', '.join(known)}" if len(known) <= 12 or not near else f"has {len(known)} keys (--cfg job shows them)"

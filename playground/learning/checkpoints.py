@@ -369,6 +369,8 @@ def find_checkpoints(path: str | Path) -> list[Path]:
     folder = stages[-1] / "checkpoints"
   found = _by_step(folder)
   if not found:
+    if runs := sorted(run.name for run in path.glob("*/") if (run / "checkpoints").is_dir()):
+      raise NoCheckpointError(f"{path} is a folder of runs: name one, such as the newest, {path / runs[-1]}.")
     raise NoCheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
   return [found[step] for step in sorted(found, reverse=True)]
 

@@ -502,3 +502,7 @@ def test_find_checkpoints_where_there_is_none(tmp_path: Path, content: str | Non
   with pytest.raises(CheckpointError) as error:
     find_checkpoints(run)
   one_sentence(error, str(run), "holds no checkpoint" if content else "does not exist")
+  if content == "checkpoints":
+    with pytest.raises(CheckpointError) as error:
+      find_checkpoints(tmp_path)
+    one_sentence(error, "is a folder of runs: name one, such as the newest,", str(run))
