@@ -26,12 +26,13 @@ from playground import registry
 from playground.catalog import entries
 from playground.cli.main import _parser
 from playground.config import compose, config_dict, override_section
+from playground.deploy.export import export_run
 from playground.errors import UnknownNameError
 from playground.mdp import terms
 from playground.physics.backend import Physics
 from playground.randomization import Randomizer
 from playground.rendering.gl import find_gl
-from playground.robots.scene import build_scene
+from playground.robots.scene import build_scene, find_mjcf
 from playground.sweep.plan import compose_jobs
 from tests.packages import PACKAGES, install, run
 
@@ -285,6 +286,17 @@ assert config.commands.velocity.params.max == [0.8, 0.4, 1.0]
 """
   said = run(tmp_path / "site", "-c", composed + code)
   assert re.search(r"height 0\.2[345]\d m", said) and "[1, 1, 1, 1]" in said, said
+
+
+def test_the_controller_of_the_page_on_deployment_walks(tmp_path: Path):
+  code = files("deploy.md")["walk.py"]
+  assert not re.search(r"^ *(import|from) (jax|playground)", code, re.M), "without this package"
+  (tmp_path / "walk.py").write_text(code, encoding="utf-8")
+  assert export_run("pretrained:Go1JoystickFlatTerrain", out=str(tmp_path)) == 0
+  command = [sys.executable, "walk.py", ".", str(find_mjcf("go1"))]
+  said = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+  found = re.fullmatch(r"walked ([\d.]+) m in 10 s, height ([\d.]+) m\n", said)
+  assert found is not None and float(found.group(1)) > 8 and float(found.group(2)) > 0.25
 
 
 def test_the_page_on_randomisation_writes_events_that_fit_and_code_that_runs():
