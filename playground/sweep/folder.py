@@ -210,7 +210,8 @@ class SweepDirectory:
     jobs: Sequence[Job],
   ) -> "SweepDirectory":  # fmt: skip
     """Makes the folder and writes sweep.yaml; see the attributes. Raises CheckpointError if that fails."""
-    sweep = cls(Path(path), name, list(command), list(settings), list(lines), list(jobs), Path.cwd(), now())
+    path = Path(os.path.expanduser(path))
+    sweep = cls(path, name, list(command), list(settings), list(lines), list(jobs), Path.cwd(), now())
     try:
       sweep.path.mkdir(parents=True, exist_ok=True)
       sweep._write()

@@ -44,10 +44,12 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
   if not isinstance(chosen.search, GridConfig):
     from playground.sweep.search import first_values
 
-    (config,), jobs = configs.compose_all([first_values(lines)]), []
+    (config, _), jobs = configs.compose_all([first_values(lines), first_values(lines, inside=True)]), []
     name = _name(overrides, [config])
   else:
     combinations = configs.combinations(*sets)
+    if not combinations:
+      raise ConfigError("This sweep has no job: one of its keys has no value.")
     composed = configs.compose_all(combinations)
     name = _name(overrides, composed)
     varying = configs.varying(*sets)

@@ -11,7 +11,7 @@ from hydra.core.override_parser.types import Override as HydraOverride
 from playground import config as configs
 from playground.config.overrides import parse_with_hydra
 from playground.config.sweep_options import OptunaConfig
-from playground.errors import ConfigError, PlaygroundError
+from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.extras import install_command
 from playground.sweep.folder import Job, JobFolder, SweepDirectory
 
@@ -31,6 +31,9 @@ _SAMPLERS = {
 }
 
 
+_GOLDEN = 1.618  # divides an interval between whole numbers where no whole number is
+
+
 class Search:
   """Gets jobs from Optuna and reports their results."""
 
@@ -45,13 +48,19 @@ class Search:
     self._drawn: dict[str, BaseDistribution] = {
       str(o.get_key_element()): distribution(o) for o in parsed if o.is_sweep_override()
     }
-    self._study = optuna.create_study(
-      storage=JournalStorage(JournalFileBackend(str(sweep.path / "study.log"))),
-      sampler=_SAMPLERS[config.sampler](config.seed + len(sweep.jobs)),
-      direction=config.direction,
-      study_name=sweep.name,
-      load_if_exists=True,
-    )
+    log = sweep.path / "study.log"
+    try:
+      self._study = optuna.create_study(
+        storage=JournalStorage(JournalFileBackend(str(log))),
+        sampler=_SAMPLERS[config.sampler](config.seed + len(sweep.jobs)),
+        direction=config.direction,
+        study_name=sweep.name,
+        load_if_exists=True,
+      )
+    except Exception as error:  # of any type: the file may hold anything
+      raise CheckpointError(f"{log} is damaged: remove it, and the search goes on without what it knows.") from error
+    if self._study.direction.name.lower() != config.direction:
+      raise ConfigError(f"search.direction={config.direction}: this search began with the other one.")
     jobs = {job.name: job for job in sweep.jobs}
     for trial in self._study.get_trials(states=(TrialState.RUNNING,)):  # of an earlier start
       job = jobs.get(trial.user_attrs.get("job", ""))
@@ -94,7 +103,11 @@ class Search:
     if state == "preempted":
       return
     value = _value(folder, self._config.metric) if state == "finished" else None
-    (trial,) = [t for t in self._study.get_trials(deepcopy=False) if t.user_attrs.get("job") == job.name][-1:]
+    trials = [t for t in self._study.get_trials(deepcopy=False) if t.user_attrs.get("job") == job.name]
+    if not trials:
+      self._notify(f"{job.name} is left out of the search: study.log was removed since it began.")
+      return
+    trial = trials[-1]
     if trial.state == TrialState.RUNNING:
       self._study.tell(trial.number, value, state=TrialState.FAIL if value is None else None)
     elif value is not None:  # the job failed at first, and finished after a second start
@@ -135,8 +148,10 @@ def distribution(override: HydraOverride) -> CategoricalDistribution | FloatDist
   raise ConfigError(f"{override.input_line}: a search draws from interval(a, b), range(a, b) or a list.")
 
 
-def first_values(lines: Sequence[str]) -> list[str]:
+def first_values(lines: Sequence[str], inside: bool = False) -> list[str]:
   """Returns the overrides of an example job: the first value of each list, the low end of each interval.
+
+  With `inside` a value within an interval of floats, which is not whole: a search would draw such ones.
 
   Raises:
     ConfigError: no override has several values.
@@ -147,8 +162,10 @@ def first_values(lines: Sequence[str]) -> list[str]:
     if override.is_sweep_override():
       drawn = True
       draws = distribution(override)
-      low = draws.choices[0] if isinstance(draws, CategoricalDistribution) else draws.low
-      overrides.append(f"{override.get_key_element()}={low}")
+      value = draws.choices[0] if isinstance(draws, CategoricalDistribution) else draws.low
+      if inside and isinstance(draws, FloatDistribution):
+        value = draws.low + (draws.high - draws.low) / _GOLDEN
+      overrides.append(f"{override.get_key_element()}={value}")
     else:
       overrides.append(line)
   if not drawn:

@@ -87,7 +87,7 @@ def status_table(sweep: SweepDirectory, states: Mapping[str, JobState], rows: in
   """
   counts = Counter(state.status for state in states.values())
   title = f"{sweep.path}: {', '.join(f'{n} {status}' for status, n in counts.items())}"
-  table = Table(title=title, title_justify="left")
+  table = Table(title=Text(title), title_justify="left")
   for name in ("job", "status", "on", "steps", "return", "time", "why"):
     right = name in ("steps", "return", "time")
     wraps = name in ("job", "why")

@@ -18,6 +18,7 @@ from pathlib import Path
 from playground.interpreter import PYTHON
 from playground.runs.interrupts import on_signals
 from playground.runs.run_dir import now
+from playground.settings import Plain
 from playground.sweep.folder import STOP_FILE, JobFolder, SweepDirectory
 from playground.text import quoted
 
@@ -54,6 +55,7 @@ class Worker:
     self._sweep_path = self._folders[0].path.parents[1]
     self._child: subprocess.Popen[bytes] | None = None
     self._records: dict[JobFolder, dict[str, object]] = {}  # of the jobs that this worker has claimed
+    self._before: dict[JobFolder, dict[str, Plain]] = {}  # the status of each run before this start
 
   def stop(self) -> None:
     """Asks the job to save and exit."""
@@ -81,6 +83,7 @@ class Worker:
           del self._records[folder]
         else:
           locks.append(lock)
+          self._before[folder] = folder.run.status
       if not self._records:
         return 0
       if sweep.stop_file.exists():
@@ -160,7 +163,7 @@ class Worker:
 
   def _outcome(self, folder: JobFolder, code: int, why: str) -> tuple[str, str]:
     """Returns a job's status and its reason, in words."""
-    run = folder.run.status
+    run = folder.run.status if folder.run.status != self._before[folder] else {}  # else of an earlier start
     if code == 0 or (len(self._records) > 1 and run.get("status") == "finished"):
       return "finished", ""
     if why == "timeout":

@@ -1,7 +1,8 @@
 """Stands in for `playground-run` in tests of sweeps: leaves what a run leaves, in no time. `seed` says what happens.
 
 0 to 9 finish; 10 crashes; 11 hangs and does not listen; 12 is killed; 13 saves when it is asked to stop and finishes
-when it is resumed; 14 crashes at its first start only; 15 takes its time.
+when it is resumed; 14 crashes at its first start only; 15 takes its time;
+16 saves at its first start, and at its second ends before it has a status.
 """
 
 import json
@@ -31,6 +32,11 @@ def save(*_: object) -> None:
   sys.exit(143)
 
 
+if seed == 16 and again:
+  print("error: it is damaged.")
+  sys.exit(2)
+if seed == 16:
+  save()
 if seed == 11:
   signal.signal(signal.SIGTERM, signal.SIG_IGN)
 if seed == 13 and not again:

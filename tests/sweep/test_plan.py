@@ -101,6 +101,17 @@ def test_nothing_is_written_when_the_launcher_is_not_installed(
   assert list(here.iterdir()) == []
 
 
+def test_a_sweep_without_a_job_is_refused(here: Path) -> None:
+  with pytest.raises(ConfigError, match="This sweep has no job"):
+    plan(["seed=range(3,1)"])
+  assert list(here.iterdir()) == []
+
+
+def test_a_sweep_may_be_in_the_home_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setenv("HOME", str(here / "home"))
+  assert plan(["seed=1,2", "sweep_dir=~/mine"])[0].path == here / "home/mine"
+
+
 def test_nothing_is_written_when_a_job_cannot_work(here: Path) -> None:
   with pytest.raises(ConfigError, match=r"^Job experiment=quickstart agent\.num_envs=7: "):
     plan(["agent.num_envs=128,7"])

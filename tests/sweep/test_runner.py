@@ -63,6 +63,14 @@ def test_a_second_start_does_only_what_is_missing(tmp_path: Path) -> None:
   assert "1 finished already" in output(sweep)
 
 
+def test_a_start_that_fails_early_is_not_called_by_the_status_of_the_one_before(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 16)
+  assert run(sweep) != 0 and statuses(sweep) == {16: "preempted"}
+  assert run(sweep) != 0 and statuses(sweep) == {16: "failed"}
+  (state,) = sweep.states().values()
+  assert state.reason == "exit code 2: error: it is damaged."
+
+
 def test_on_error_stop(tmp_path: Path) -> None:
   sweep = make_sweep(tmp_path / "sweep", 10, 13, 0, 1, 2)
   assert run(sweep, "on_error=stop", *["launcher.cores_per_job=1"]) == 1

@@ -70,3 +70,10 @@ def test_nothing_to_draw_is_found_at_once(tmp_path: Path, monkeypatch: pytest.Mo
   with pytest.raises(ConfigError, match="search=optuna needs something to draw"):
     plan(["seed=1", "search=optuna"])
   assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interval_of_a_whole_number_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.chdir(tmp_path)
+  with pytest.raises(ConfigError, match=r"agent\.num_envs=.* has the wrong type"):
+    plan(["env=CartpoleBalance", "agent.num_envs=interval(4,16)", "search=optuna"])
+  assert list(tmp_path.iterdir()) == []
