@@ -66,9 +66,9 @@ def test_a_copy_is_made_once_and_again_for_another_policy(policies: Path) -> Non
   card = policies / TASK / "card.yaml"
   card.write_text(card.read_text() + "note: trained anew\n")
   working_copy(TASK, [TASK])
-  assert not (copied / "eval").exists()
+  assert not (copied / "eval").exists() and (copied.parent / f"{TASK}_old" / "eval").is_dir(), "nor is it lost"
   assert (copied / "card.yaml").read_text() == card.read_text()
-  assert sorted(path.name for path in copied.parent.iterdir()) == [TASK]
+  assert sorted(path.name for path in copied.parent.iterdir()) == [TASK, f"{TASK}_old"]
 
 
 def test_a_path_of_that_name_comes_first(policies: Path) -> None:
@@ -79,16 +79,16 @@ def test_a_path_of_that_name_comes_first(policies: Path) -> None:
 def test_a_task_that_has_changed_is_refused(policies: Path) -> None:
   saved = yaml.safe_load((POLICIES / TASK / "config.yaml").read_text())["env"]
   today = json.loads(json.dumps(registry.config(TASK).to_dict()))
-  check_task(POLICIES / TASK, saved, today)
+  check_task(TASK, saved, today)
   term = next(iter(today["observations"]["state"]))
   noisier = copy.deepcopy(today)
   noisier["observations"]["state"][term] = {**(today["observations"]["state"][term] or {}), "noise": {"uniform": 9.0}}
-  check_task(POLICIES / TASK, saved, noisier)
+  check_task(TASK, saved, noisier)
   del today["observations"]["state"][term]
   with pytest.raises(CheckpointError, match=r"env.observations has changed since .*playground-run env=G1Joystick"):
-    check_task(POLICIES / TASK, saved, today)
+    check_task(TASK, saved, today)
   with pytest.raises(CheckpointError, match=r"env.action_scale has changed"):
-    check_task(POLICIES / TASK, saved, {**noisier, "action_scale": 9.0})
+    check_task(TASK, saved, {**noisier, "action_scale": 9.0})
 
 
 def test_a_run_starts_from_one() -> None:

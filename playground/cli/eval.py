@@ -76,7 +76,7 @@ def evaluate_run(
   out = folder / name
   folder.mkdir(exist_ok=True)
   write_json(out, report)
-  console.print(f"written to {out}", soft_wrap=True)
+  console.print(f"written to {out}", soft_wrap=True, markup=False)
   if film:
     render_video(
       drawn,

@@ -45,7 +45,8 @@ def show_keys(prefix: str, overrides: Sequence[str]) -> int:
   if prefix in groups(roots):
     names = [name for name in listed_options(prefix, roots) if not name.split("/")[-1].startswith("_")]
     console.print(Text(f"{prefix}=<option>", style="bold"), Text(f"one of {', '.join(names)}"), sep=": ")
-    if prefix not in values and prefix not in _SECTIONS:
+    parent, _, name = _SECTIONS.get(prefix, prefix).rpartition(".")
+    if name not in (values[parent] if parent else values):
       return 0
   prefix = _SECTIONS.get(prefix, prefix)
   _print_terms_help(prefix, console)

@@ -120,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
   evaluate.add_argument("--video", metavar="FILE", help="also render an episode to this .mp4")
   evaluate.add_argument("--camera", metavar="NAME", help=_CAMERA)
   export = add(
-    "export", "deploy.export:export_run", "Write a run's policy as ONNX, with the contract that a controller needs."
+    "export", "deploy.export:export_run", "Write a policy as ONNX, with joint order, gains and rates in policy.yaml."
   )
   export.add_argument("path", metavar="run", help=_RUN)
   export.add_argument("--out", metavar="FOLDER", help="folder to write to (default: <run>/export)")

@@ -123,8 +123,9 @@ def play(
   if opened.folder is not None:
     out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}{'' if interval_events else '_no_events'}.json"
     played = {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "interval_events": interval_events}
+    out.parent.mkdir(exist_ok=True)
     write_json(out, played | {"scores": scores, "origin": origin})
-    console.print(f"written to {out}", soft_wrap=True)
+    console.print(f"written to {out}", soft_wrap=True, markup=False)
   if film:
     render_video(
       env.mj_model,
@@ -165,9 +166,7 @@ def open_policy(path: str, interval_events: bool = True) -> Opened:
     setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
     return Opened(exported, _task_of(exported, path, interval_events), Path(path).expanduser().parent)
   trained = load_exact(path, interval_events)
-  folder = trained.run_dir.path / "export"
-  folder.mkdir(exist_ok=True)
-  return Opened(export_policy(trained), trained.env, folder, trained)
+  return Opened(export_policy(trained), trained.env, trained.run_dir.path / "export", trained)
 
 
 def _task_of(exported: ExportedPolicy, path: str, interval_events: bool) -> Env:

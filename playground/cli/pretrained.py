@@ -50,9 +50,13 @@ def add_policy(path: str, note: str = "") -> int:
     PlaygroundError: no such run, or a policy without an ONNX form.
     ConfigError: the run has not been evaluated.
   """
-  run = RunDirectory.open(path)
+  newest = find_checkpoints(path)[0]  # of a chain, that of its last stage
+  run, steps = RunDirectory.open(newest.parents[1]), int(newest.name)
+  path = str(run.path)
+  for name in ("overrides.yaml", "manifest.json", "metrics.csv"):
+    if not (run.path / name).is_file():
+      raise ConfigError(f"{run.path / name} is missing: only a whole run can be added.")
   export_run(path)
-  steps = int(find_checkpoints(path)[0].name)
   result = run.path / f"export/play_step_{steps:012d}_seed_0.json"
   if read_json(result).get("episodes") != _EPISODES:
     play(path, episodes=_EPISODES)

@@ -131,7 +131,7 @@ def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Se
       given[key] = _resolve(given[key])
       _check_path(key, given[key])
   if given.get("resume") is not None:
-    return _compose_resumed(Path(os.path.expanduser(given["resume"])), parsed, roots)
+    return _compose_resumed(Path(os.path.expanduser(str(given["resume"]))), parsed, roots)
   config = _compose_new(parsed, files, roots)
   stages = stage_overrides(config.curriculum, parsed, roots)
   composed = tuple(_compose_stage(config, name, theirs, files, roots) for name, theirs in stages)
@@ -264,6 +264,8 @@ def _compose_new(parsed: Sequence[Override], files: Callable[..., _Files], roots
   """Composes the configuration of a command line."""
   config, choices, schema, added = files(*group_overrides(parsed))
   resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], schema)
+  if resolved["resume"] is not None:
+    raise ConfigError(f"resume={resolved['resume']} is for the command line alone: a file cannot set it.")
   check_limits(resolved)
   check_vision([override.key for override in parsed], resolved)
   check_chain(resolved, parsed, roots)
@@ -301,7 +303,7 @@ def _hydra(
       lines = [*overrides, *search_path_override(roots)]
       config = hydra.compose(name, overrides=lines, return_hydra_config=True)
       chosen = dict(config.hydra.runtime.choices)
-  except (HydraException, YAMLError, OmegaConfBaseException) as error:
+  except (HydraException, YAMLError, OmegaConfBaseException, ValueError, RecursionError) as error:
     files = " ".join(o for o in overrides if not o.startswith("~"))
     raise ConfigError(f"The files of {files or f'{name}.yaml'} do not compose: {first_line(error)}.") from None
   finally:
@@ -399,7 +401,7 @@ def _check_path(key: str, value: object) -> None:
   path = Path(os.path.expanduser(str(value)))
   wanted, what = (path / "config.yaml", "run directory") if key == "resume" else (path, "run directory or checkpoint")
   if not os.path.lexists(wanted):  # `find_checkpoints` reports a broken link
-    siblings = [p.name for p in path.parent.iterdir() if p.is_dir()] if path.parent.is_dir() else []
+    siblings = [p.name for p in path.parent.glob("*/") if p.name != path.name]
     raise ConfigError(f"{key}={value} is no {what}: {wanted} does not exist.{nearest(path.name, siblings)}")
 
 

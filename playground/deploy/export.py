@@ -58,8 +58,10 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   write_text(folder / "policy.yaml", _yaml(exported.contract))
   with replacing(folder / "policy.onnx") as temporary:
     temporary.write_bytes(exported.model)
-  console.print(_summary(exported.contract, len(actions), error, 1e6 * exported.latency(obs)), soft_wrap=True)
-  console.print(f"written to {folder / 'policy.onnx'} and policy.yaml", soft_wrap=True)
+  console.print(
+    _summary(exported.contract, len(actions), error, 1e6 * exported.latency(obs)), soft_wrap=True, markup=False
+  )
+  console.print(f"written to {folder / 'policy.onnx'} and policy.yaml", soft_wrap=True, markup=False)
   return 0
 
 

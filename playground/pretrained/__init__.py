@@ -16,6 +16,7 @@ from pathlib import Path
 import yaml
 
 from playground.errors import CheckpointError, UnknownNameError, nearest
+from playground.files import numbered
 from playground.settings import Plain, Section
 
 PREFIX = "pretrained:"
@@ -73,27 +74,28 @@ def working_copy(name: str, tasks: Container[str]) -> str:
       copy.parent.mkdir(parents=True, exist_ok=True)
       with tempfile.TemporaryDirectory(dir=copy.parent) as scratch:
         shutil.copytree(source, Path(scratch) / source.name)
-        if copy.exists():
-          copy.rename(Path(scratch) / "old")
+        if copy.exists():  # with the user's results
+          old = copy.rename(numbered(copy.with_name(f"{copy.name}_old")))
+          print(f"The policy of {source.name} has changed; your results with the old one are in {old}.")
         (Path(scratch) / source.name).rename(copy)
   except OSError as error:
     raise CheckpointError(f"{copy} cannot be written: {error.strerror}.") from error
   return str(copy)
 
 
-def check_task(folder: Path, saved: Section, today: Section) -> None:
+def check_task(task: str, saved: Section, today: Section) -> None:
   """Raises CheckpointError if a pretrained policy's task observes or acts otherwise today.
 
   Args:
-    folder: the policy's.
+    task: its name.
     saved: the env section that it was trained with.
     today: the task's.
   """
   for key in _MEANING:
     if _without_noise(saved.get(key)) != _without_noise(today.get(key)):
       raise CheckpointError(
-        f"The pretrained policy {folder.name} does not fit its task any more: env.{key} has changed since it was "
-        f"trained; train again with playground-run env={folder.name}."
+        f"The pretrained policy of {task} does not fit its task any more: env.{key} has changed since it was "
+        f"trained; train again with playground-run env={task}."
       )
 
 
@@ -155,10 +157,16 @@ def add(run: Path, task: str, entries: Section) -> Path:
   Returns:
     The folder.
   """
+  POLICIES.mkdir(parents=True, exist_ok=True)
+  with tempfile.TemporaryDirectory(dir=POLICIES) as scratch:  # the old one stays until the new one is whole
+    folder = _build(run, Path(scratch) / task, entries)
+    shutil.rmtree(POLICIES / task, ignore_errors=True)
+    return folder.rename(POLICIES / task)
+
+
+def _build(run: Path, folder: Path, entries: Section) -> Path:
   from playground.learning.checkpoints import round_policy  # imports JAX, which composing a run must not
 
-  folder = POLICIES / task
-  shutil.rmtree(folder, ignore_errors=True)
   copy_policy(run, folder)
   for checkpoint in (folder / "checkpoints").iterdir():
     round_policy(checkpoint, CRITIC_BITS, _is_critic)

@@ -50,7 +50,9 @@ class Dump:
         arrays = {name: file[name] for name in file.files}
       self.config: Section = json.loads(str(arrays.pop("config")))
       self.action = arrays.pop("action")
-    except (OSError, ValueError, KeyError) as error:
+      if not isinstance(self.config, dict):
+        raise TypeError("its config is no mapping")
+    except Exception as error:  # of any type: the file may hold anything
       raise CheckpointError(f"{path} is not a dump of a non-finite step (nan_dump/step_*.npz of a run).") from error
     part = lambda prefix: {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
     self._state, self.model, self.after = part("state"), part("model/"), part("after/")

@@ -31,7 +31,8 @@ def weights_of(path: str | Path) -> Checkpoint:
   checkpoint = Checkpoint(find_checkpoints(locate(str(path)))[0])
   folder = checkpoint.path.parents[1]
   if is_pretrained(folder):
-    check_task(folder, checkpoint.meta["config"]["env"], registry.config(folder.name).to_dict())
+    task = checkpoint.meta["env"]
+    check_task(task, checkpoint.meta["config"]["env"], registry.config(task).to_dict())
   return checkpoint
 
 
@@ -83,7 +84,7 @@ class RestorePlan:
         if run_dir.status:  # without a status, a chain made the run and starts it now
           plan.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
         # Only a chain sets this in the `config` of a resumed run; the chain may have been moved.
-        weights = config.init_from or run_dir.config["init_from"]
+        weights = config.init_from or _first_policy(run_dir)
         plan.weights = weights_of(weights) if weights else None
       return plan
     assert config.run_dir is not None, "composing names one"
@@ -140,6 +141,8 @@ class RestorePlan:
         self.state, notice = trainer.restore(checkpoint, template)
       except DamagedCheckpointError as error:
         if path == self.checkpoints[-1]:
+          if not (path / "state").is_dir():
+            raise CheckpointError(f"{path} holds a policy alone: init_from={path} starts a new run from it.") from None
           raise
         self.notices.append(
           f"{error} It is moved to checkpoints/damaged_{path.name}. Falling back to the checkpoint before it."
@@ -151,3 +154,18 @@ class RestorePlan:
       self.settings = checkpoint.meta.get("settings", {})
       self.notices.append(notice)
       return
+
+
+def _first_policy(run_dir: RunDirectory) -> str | None:
+  """Returns the path of the policy that a run starts from; that of a stage before it where the chain is now.
+
+  Raises:
+    CheckpointError: the stage before it is not finished.
+  """
+  path = run_dir.config["init_from"]
+  before = RunDirectory(run_dir.path.parent / Path(path or "").name)
+  if path is None or before.path == run_dir.path.parent or not before.status:
+    return path
+  if before.status.get("status") != "finished":
+    raise CheckpointError(f"{before.path} is not finished: resume={run_dir.path.parent} trains it first.")
+  return str(before.path)

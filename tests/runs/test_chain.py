@@ -17,7 +17,7 @@ import pytest
 
 from playground import registry
 from playground.config import RunConfig, compose, config_roots
-from playground.errors import ConfigError
+from playground.errors import CheckpointError, ConfigError
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
 from playground.learning.loop import Loop
 from playground.physics.backend import PhysicsData
@@ -232,6 +232,15 @@ def test_a_chain_goes_on_where_it_was_moved_to(whole: Path, tmp_path: Path, caps
   assert f"weights and observation statistics of {find_checkpoints(path / '1_near')[0]}" in said
   assert "stopped before its first checkpoint" not in said
   assert_same_result(path, whole)
+
+
+def test_a_stage_is_not_resumed_before_the_one_it_starts_from(whole: Path, tmp_path: Path) -> None:
+  path = shutil.copytree(whole, tmp_path / "cut")
+  shutil.rmtree(path / "2_far/checkpoints")
+  RunDirectory(path / "2_far").set_status("running")
+  RunDirectory(path / "1_near").set_status("preempted")
+  with pytest.raises(CheckpointError, match=re.escape(f"{path / '1_near'} is not finished: resume={path} trains it")):
+    resume(path / "2_far")
 
 
 def test_a_finished_chain_is_not_resumed(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
