@@ -1,7 +1,9 @@
 """`playground keys <prefix>`: prints value, allowed values and meaning of every key below a dotted prefix."""
 
 import inspect
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
@@ -16,6 +18,9 @@ from playground.errors import UnknownNameError
 from playground.mdp.options import OPTIONS
 from playground.settings import Plain, Section, Setting
 from playground.text import join
+
+if TYPE_CHECKING:
+  from playground.mdp.terms import Term
 
 _WIDE = 160  # columns, without a terminal
 _SECTIONS = {"robot": "env.robot", "randomization": "env.events"}  # group -> section of env that it sets
@@ -69,11 +74,11 @@ def _at(prefix: str, values: Section) -> Plain:
 
 def _rows(prefix: str, node: Plain, config: RunConfig, names: Section) -> Iterator[tuple[str, str, str, str]]:
   """Yields key, value, allowed values and help."""
-  comments = _comments(config)
+  comments, parameters = _comments(config), _parameters(prefix, config.resolved)
 
   def walk(key: str, value: Plain) -> Iterator[tuple[str, str, str, str]]:
     setting = definition(key, names)
-    help = meaning(setting, comments.get(key, ""))
+    help = meaning(setting, comments.get(key, "")) or parameters.get(key, ("", ""))[1]
     if _is_term(key, value):
       what, help = _term(key, value)
       yield key, what, "", help
@@ -84,7 +89,27 @@ def _rows(prefix: str, node: Plain, config: RunConfig, names: Section) -> Iterat
     for name, inner in value.items() if isinstance(value, Mapping) else ():
       yield from walk(join(key, name), inner)
 
-  return walk(prefix, node)
+  yield from walk(prefix, node)
+  for key, (default, help) in parameters.items():
+    inner = key.removeprefix(f"{prefix}.").removeprefix("params.")
+    given = node.get("params", node) if isinstance(node, Mapping) else {}
+    if "." not in inner and inner not in given:
+      yield key, f"({default})", "", help
+
+
+def _parameters(prefix: str, values: Section) -> dict[str, tuple[str, str]]:
+  """Returns default and meaning of each parameter, by key, of the term at a key or above it; {} without one."""
+  parts = prefix.split(".")
+  keys = [".".join(parts[:end]) for end in range(3, len(parts) + 1)]
+  key = next((key for key in keys if _is_term(key, _at(key, values))), None)
+  if key is None:
+    return {}
+  func = _bound(key, _at(key, values)).func
+  docs = "\n".join(inspect.getdoc(each) or "" for each in (func.__mro__ if inspect.isclass(func) else [func]))
+  said = {name: " ".join(text.split()) for name, text in re.findall(r"^  (\w+): (.*(?:\n    .*)*)", docs, re.M)}
+  arguments = inspect.signature(func).parameters.values()
+  defaults = {each.name: format_value(each.default) for each in arguments if each.default is not each.empty}
+  return {f"{key}.params.{name}": (defaults.get(name, ""), said.get(name, "")) for name in {**said, **defaults}}
 
 
 def _is_term(key: str, value: Plain) -> bool:
@@ -101,12 +126,16 @@ def _is_term(key: str, value: Plain) -> bool:
 
 def _term(key: str, entry: Section) -> tuple[str, str]:
   """Returns the fields of a term, and the first line of its function's docstring."""
-  from playground.mdp.terms import bind_one  # imports JAX, which keys other than terms do without
-
-  term = bind_one(key.split(".")[1], key, key.split(".")[-1], entry)
+  term = _bound(key, entry)
   func = "" if term.func.__name__ == term.name else f"{term.func.__name__} "
   fields = {name: value for name, value in entry.items() if name != "func" and value not in (None, {})}
   return f"{func}{format_value(fields)}", next(iter((inspect.getdoc(term.func) or "").splitlines()), "")
+
+
+def _bound(key: str, entry: Section) -> "Term":
+  from playground.mdp.terms import bind_one  # imports JAX, which keys other than terms do without
+
+  return bind_one(key.split(".")[1], key, key.split(".")[-1], entry)
 
 
 def _print_terms_help(prefix: str, console: Console) -> None:

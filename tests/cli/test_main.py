@@ -152,6 +152,11 @@ def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
     ),
     (["env.rewards", "env=Go1Getup"], ["factor on the function's value", "env.rewards.upright_exp"]),
     (["env.observations.privileged_state", "env=Go1JoystickFlatTerrain"], ["privileged_state.gyro"]),
+    (
+      ["env.commands.velocity.params", "env=Go1JoystickFlatTerrain"],
+      ["params.max [1.5, 0.8, 1.2] largest command of each component", "params.min (null) smallest; None is -max."],
+    ),
+    (["robot"], ["robot=<option>: one of aero_hand,"]),
     (["launcher", "launcher=slurm"], ["one of local, ray, slurm", "launcher.partition"]),
     (["debug"], ["debug=<option>: one of fast, profile"]),
   ],
