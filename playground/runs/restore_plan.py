@@ -157,15 +157,15 @@ class RestorePlan:
 
 
 def _first_policy(run_dir: RunDirectory) -> str | None:
-  """Returns the path of the policy that a run starts from; that of a stage before it where the chain is now.
+  """Returns the path of the policy that a run starts from; for a stage of a chain, where the chain is now.
 
   Raises:
     CheckpointError: the stage before it is not finished.
   """
-  path = run_dir.config["init_from"]
-  before = RunDirectory(run_dir.path.parent / Path(path or "").name)
-  if path is None or before.path == run_dir.path.parent or not before.status:
+  path, chain = run_dir.config["init_from"], run_dir.path.parent
+  if path is None or not (chain / "config.yaml").is_file() or not (chain / Path(path).name).is_dir():
     return path
+  before = RunDirectory(chain / Path(path).name)
   if before.status.get("status") != "finished":
-    raise CheckpointError(f"{before.path} is not finished: resume={run_dir.path.parent} trains it first.")
+    raise CheckpointError(f"{before.path} is not finished: resume={chain} trains it first.")
   return str(before.path)

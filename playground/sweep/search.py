@@ -57,6 +57,8 @@ class Search:
         study_name=sweep.name,
         load_if_exists=True,
       )
+    except OSError:
+      raise
     except Exception as error:  # of any type: the file may hold anything
       raise CheckpointError(f"{log} is damaged: remove it, and the search goes on without what it knows.") from error
     if self._study.direction.name.lower() != config.direction:
