@@ -5,6 +5,7 @@ import functools
 import gc
 import logging
 import os
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,6 +23,9 @@ GROWTH = max(1.5e9, MEMORY / 8)  # bytes by which it may grow before JAX forgets
 # JAX makes millions of objects that stay: at Python's own thresholds, looking through them again and again is a tenth
 # of all the time.
 gc.set_threshold(50_000, 50, 50)
+
+# A shell starts background jobs (`make test &`) with SIGINT ignored, and Python leaves it so.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def resident_bytes() -> int:
