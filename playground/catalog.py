@@ -19,7 +19,7 @@ Status = Literal["solved", "learning", "open", "not measured"]
 STATUSES: tuple[Status, ...] = get_args(Status)
 FILE = Path(__file__).parent / "catalog.json"
 _REFERENCE = FILE.parents[1] / "results/reference"
-_NO_PUSHES = re.compile(r"events\.push\.enabled=false")
+_NO_PUSHES = "events.push.enabled=false"  # in the setting of a run
 _TABLES = ("dm_control", "locomotion", "manipulation", "vision")
 
 
@@ -77,10 +77,9 @@ def measure(task: str) -> Entry:
   observations = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
   groups = observations if isinstance(observations, dict) else {"state": observations}
   shown = ", ".join(f"{name} {' x '.join(map(str, group.shape))}" for name, group in groups.items())
-  tables = [read_csv(_REFERENCE / f"{name}.csv") for name in _TABLES]
-  rows = [row for table in tables for row in our_runs(table, task)]
+  rows = [row for name in _TABLES for row in read_csv(_REFERENCE / f"{name}.csv")]
   best = best_runs(rows, task)
-  reached = [STATUSES.index(status(row)) for row in rows]
+  reached = [STATUSES.index(status(row)) for row in our_runs(rows, task)]
   return Entry(
     task=task,
     suite=str(config.env.task).split(".")[2],
@@ -139,7 +138,7 @@ def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]
   """
   ours = our_runs(rows, task)
   groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
-  for row in [row for row in ours if not _NO_PUSHES.search(row["setting"])] or ours:
+  for row in [row for row in ours if _NO_PUSHES not in row["setting"]] or ours:
     groups.setdefault((row["agent"], row["setting"], row["backend"], row["steps"]), []).append(row)
   return max(groups.values(), key=lambda runs: fmean(float(row["final_return"]) for row in runs), default=[])
 
@@ -153,7 +152,7 @@ def run_name(row: dict[str, str]) -> str:
     row["agent"].split(",")[0].replace("agent.", "")
     + chain
     + (f", from {start.group(1)}" if start else "")
-    + ", no pushes, nothing randomised" * bool(_NO_PUSHES.search(setting))
+    + ", no pushes, nothing randomised" * (_NO_PUSHES in setting)
   )
 
 

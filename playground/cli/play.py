@@ -93,7 +93,7 @@ def play(
   if agent is None:
     opened = open_policy(path, interval_events)
   else:
-    setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
+    _set_up_cpu()
     section = configs.compose([f"env={path}", *overrides]).env
     model_seed = seed if randomize else None
     env = load_on_c_physics(path, section, interval_events=interval_events, model_seed=model_seed)
@@ -163,10 +163,14 @@ def open_policy(path: str, interval_events: bool = True) -> Opened:
   """
   if Path(path).suffix == ".onnx":
     exported = ExportedPolicy.load(path)
-    setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
+    _set_up_cpu()
     return Opened(exported, _task_of(exported, path, interval_events), Path(path).expanduser().parent)
   trained = load_exact(path, interval_events)
   return Opened(export_policy(trained), trained.env, trained.run_dir.path / "export", trained)
+
+
+def _set_up_cpu() -> None:
+  setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
 
 
 def _task_of(exported: ExportedPolicy, path: str, interval_events: bool) -> Env:
