@@ -106,13 +106,13 @@ def status(row: dict[str, str]) -> Status:
   if row["note"].startswith("solved"):
     return "solved"
   success, falls = row.get("success"), row.get("falls_per_episode")
-  if falls == "":  # not logged yet
+  if falls == "" and row["episode_length"]:  # not logged yet
     falls = 1 - float(row["episode_length"]) / 1000
   if success:
     return "solved" if float(success) >= 0.9 else "learning" if float(success) > 0 else "open"
   if falls:
     return "solved" if float(falls) <= 0.2 else "learning" if float(falls) < 0.9 else "open"
-  if "success" in row:
+  if "success" in row or falls == "":  # of a suite without a highest return
     return "learning"
   score = float(row["final_return"])
   return "solved" if score >= 750 else "learning" if score >= 50 else "open"
