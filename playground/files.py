@@ -22,12 +22,19 @@ from playground.settings import Plain, plain
 
 def need_folder(folder: Path, option: str) -> None:
   """Raises ConfigError, which names the option that it is of, where no folder can be or be written to; makes none."""
+  if (reason := unwritable(folder)) is not None:
+    raise ConfigError(f"{option} cannot be written: {reason}.")
+
+
+def unwritable(folder: Path) -> str | None:
+  """Returns why no folder can be there or be written to, None where one can; makes none."""
   folder = folder.absolute()
   there = next(path for path in (folder, *folder.parents) if os.path.exists(path))
   try:
     tempfile.TemporaryDirectory(dir=there).cleanup()  # permissions alone say yes to root, and of /proc
-  except OSError as error:
-    raise ConfigError(f"{option} cannot be written: {there} is not a folder that you may write to.") from error
+  except OSError:
+    return f"{there} is not a folder that you may write to"
+  return None
 
 
 def need_file(path: Path, suffix: str, option: str) -> None:

@@ -1,6 +1,7 @@
 """`playground eval <run>`: evaluates a trained policy on this machine."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import jax
 from rich.console import Console
@@ -8,7 +9,7 @@ from rich.table import Table
 
 from playground.envs.locomotion.gait_metrics import with_gait_metrics
 from playground.errors import ConfigError
-from playground.files import need_folder, write_json
+from playground.files import unwritable, write_json
 from playground.learning.evaluation import make_evaluator
 from playground.paper import paper_table
 from playground.rendering.video import need_camera, need_place, render_video
@@ -41,15 +42,12 @@ def evaluate_run(
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run or checkpoint, or one that does not fit, no such camera, or no folder that can be
-      written to.
+    PlaygroundError: no such run or checkpoint, or one that does not fit, or no such camera.
   """
   console = Console()
   film = need_place(video, camera)
   trained = load_policy(path)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
-  folder = trained.run_dir.path / "eval"
-  need_folder(folder, str(folder))
   count = run.agent.num_eval_envs if episodes is None else episodes
   if count < 1:
     raise ConfigError(f"--episodes={count} must be above 0.")
@@ -73,10 +71,7 @@ def evaluate_run(
   report |= {"scores": scores} | hardware.machine
   report |= {"hardware_in_paper": real} if real else {}
   name = f"step_{checkpoint.step:012d}_seed_{seed}{'_deterministic' * deterministic}.json"
-  out = folder / name
-  folder.mkdir(exist_ok=True)
-  write_json(out, report)
-  console.print(f"written to {out}", soft_wrap=True, markup=False)
+  save(trained.run_dir.path / "eval" / name, report, console)
   if film:
     render_video(
       drawn,
@@ -87,6 +82,14 @@ def evaluate_run(
       **episodes_of(recording, 1),
     )
   return 0
+
+
+def save(out: Path, report: Mapping[str, object], console: Console) -> None:
+  """Writes a report into a folder of a run and says where, or why it cannot."""
+  if (reason := unwritable(out.parent)) is None:
+    out.parent.mkdir(exist_ok=True)
+    write_json(out, report)
+  console.print(f"not written: {reason}" if reason else f"written to {out}", soft_wrap=True, markup=False)
 
 
 def _table(title: str, scores: Mapping[str, float], real: Sequence[Mapping[str, str]]) -> Table:

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from playground import config as configs
 from playground import registry
+from playground.cli.eval import save
 from playground.deploy.contract import Contract
 from playground.deploy.menu import Menu
 from playground.deploy.policy import ActingPolicy, ExportedPolicy
@@ -20,7 +21,6 @@ from playground.envs.base import Env
 from playground.envs.locomotion.gait_metrics import with_gait_metrics
 from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.extras import need
-from playground.files import need_folder, write_json
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
@@ -72,8 +72,7 @@ def play(
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run, policy or camera, no display for the viewer, no port for the browser, or no folder
-      that can be written to.
+    PlaygroundError: no such run, policy or camera, no display for the viewer, or no port for the browser.
   """
   console = console or Console()
   if episodes < 1:
@@ -113,8 +112,6 @@ def play(
     following = None if given.parent.name == "checkpoints" else LATEST
     watch(Session(env, exported, seed, menu, following), host, port, console)
     return 0
-  if opened.folder is not None:
-    need_folder(opened.folder, str(opened.folder))
   evaluate = make_evaluator(with_gait_metrics(env), exported.act, episodes, make_mesh(1), 1 if film else 0)
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {}, {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
@@ -123,9 +120,7 @@ def play(
   if opened.folder is not None:
     out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}{'' if interval_events else '_no_events'}.json"
     played = {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "interval_events": interval_events}
-    out.parent.mkdir(exist_ok=True)
-    write_json(out, played | {"scores": scores, "origin": origin})
-    console.print(f"written to {out}", soft_wrap=True, markup=False)
+    save(out, played | {"scores": scores, "origin": origin}, console)
   if film:
     render_video(
       env.mj_model,

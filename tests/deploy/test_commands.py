@@ -108,6 +108,9 @@ def test_a_run_that_cannot_be_written_to_is_said_before_anything_is_traced(
   monkeypatch.setattr("playground.deploy.export.record", pytest.fail)
   assert command("export", str(copied)) == 2
   assert f"error: {copied / 'export'} cannot be written:" in capsys.readouterr().err
+  monkeypatch.undo()
+  assert command("play", str(copied), "--episodes", "1") == 0
+  assert f"not written: {copied / 'export'} is not a folder" in capsys.readouterr().out
 
 
 def test_a_damaged_policy_and_one_of_another_task(
