@@ -17,6 +17,11 @@ def format_value(value: object) -> str:
   return f"[{', '.join(map(format_value, value))}]" if isinstance(value, list | tuple) else str(value)
 
 
+def millions(steps: float) -> str:
+  """Formats a number of steps in millions, with three digits or all before the point."""
+  return f"{steps / 1e6:.3g}" if steps < 1e9 else f"{steps / 1e6:,.0f}"
+
+
 def quoted(value: object) -> str:
   """A value for Hydra's command line, whatever characters it has.
 

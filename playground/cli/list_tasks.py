@@ -11,6 +11,7 @@ from rich.text import Text
 from playground.catalog import Entry, entries
 from playground.errors import UnknownNameError, nearest
 from playground.settings import Plain, Section
+from playground.text import millions
 
 FILTERS = ("suite", "robot", "status", "backend")
 
@@ -73,4 +74,4 @@ def _best(row: Section) -> str:
   """Formats a task's best return with the run that reached it."""
   if row.get("best_return") is None:
     return ""
-  return f"{row['best_return']:.4g} ({row['best_run']}, {row['best_steps'] / 1e6:.3g} M)"
+  return f"{row['best_return']:.4g} ({row['best_run']}, {millions(row['best_steps'])} M)"

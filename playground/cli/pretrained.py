@@ -16,6 +16,7 @@ from playground.pretrained import add, cards
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, newest_evaluation
 from playground.runs.run_dir import RunDirectory
 from playground.settings import Plain
+from playground.text import millions
 
 _EPISODES = 20  # in C MuJoCo
 _COLUMNS = ("task", "agent", "status", "M steps", "return", "in C MuJoCo", "falls")
@@ -30,7 +31,7 @@ def show_policies(console: Console | None = None) -> int:
     trained, plain = card["training"], card["c_mujoco"]
     score = trained["sampled"] if trained["mode"] is None else trained["mode"]
     falls = f"{plain['falls']}/{plain['episodes']}"
-    steps = f"{card['steps'] / 1e6:.3g}"
+    steps = millions(card["steps"])
     table.add_row(task, card["agent"], card["status"], steps, f"{score:.1f}", _interval(plain), falls)
   (console or Console()).print(table)
   return 0

@@ -9,9 +9,9 @@ from itertools import groupby, pairwise
 
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.sections import Notes, runs_by_step
+from playground.catalog import entries
 from playground.config.files import shipped, task_names
 from playground.files import read_csv
-from playground.paper import tasks_of
 from playground.reporting import figures
 from playground.reporting.page import Block, Heading, Image, Table, Text
 
@@ -39,17 +39,19 @@ class Curve:
 
 def beside_public(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   """Draws each task's best run of ours over public curves, and a table with the tasks where we are below first."""
-  ours, theirs = our_best(evidence), public_curves()
+  theirs = public_curves()
+  starts = {task: min((c.points[0][0] for c in curves if is_ppo(c)), default=0) for task, curves in theirs.items()}
+  ours = our_best(evidence, starts)
   shared = sorted(set(ours) & set(theirs))
   if not shared:
     return
   yield Heading(2, "Beside public curves")
   yield Text(
-    "Our best run of each task and algorithm over what public repositories report (`benchmarks/public/`). `At equal "
-    "steps` is the best public PPO there, read between its points and never beyond our last step; our PPO is below "
-    f"where it has under {SHARE:.0%} of that. Policies act as `our actions` and the public names say (as set: as the "
-    "run's agent.deterministic_eval says, sampled by default). Public settings stand below the table, ours are in the "
-    "run's name."
+    "Our best run of each task and algorithm, of those that train as long if there are any, over what public "
+    "repositories report (`benchmarks/public/`). `At equal steps` is the best public PPO there, read between its "
+    f"points and never beyond our last step; our PPO is below where it has under {SHARE:.0%} of that. Policies act as "
+    "`our actions` and the public names say (as set: as the run's agent.deterministic_eval says, sampled by default). "
+    "Public settings stand below the table, ours are in the run's name."
   )
   panels = {task: _panel(ours[task], theirs[task]) for task in shared}
   drawn = figures.curves(panels, "million control steps", "return").decode()
@@ -116,8 +118,11 @@ def at(points: Points, steps: float) -> float | None:
   return points[-1][1]
 
 
-def our_best(evidence: Evidence) -> dict[str, list[Curve]]:
-  """Returns the curves of each task that end highest, one for each algorithm and kind of action."""
+def our_best(evidence: Evidence, starts: Mapping[str, float]) -> dict[str, list[Curve]]:
+  """Returns the curves of each task that end highest, one for each algorithm and kind of action.
+
+  Curves that reach the task's step in `starts`, if there are any, come before higher ones that end sooner.
+  """
   found: dict[str, list[Curve]] = {}
   for actions, curves in ((_AS_SET, evidence.curves), ("mode", evidence.mode_curves)):
     for name, points in curves.items():
@@ -133,7 +138,8 @@ def our_best(evidence: Evidence) -> dict[str, list[Curve]]:
   best: dict[str, dict[tuple[str, str], Curve]] = {}
   for task, curves in found.items():
     ascending = [dataclasses.replace(curve, points=sorted(curve.points)) for curve in curves]
-    for curve in sorted(ascending, key=lambda curve: curve.points[-1][1]):
+    ends = lambda curve, start=starts.get(task, 0): (curve.points[-1][0] >= start, curve.points[-1][1])
+    for curve in sorted(ascending, key=ends):
       best.setdefault(task, {})[_agent_of(curve.label), curve.actions] = curve  # the highest is the last
   return {task: list(curves.values()) for task, curves in best.items()}
 
@@ -148,7 +154,7 @@ def _agent_of(label: str) -> str:
 def public_curves() -> dict[str, list[Curve]]:
   """Returns the public curves by task, one for each algorithm of a repository, without what compares to nothing."""
   settings = {row["repository"]: row for row in _read("settings")}
-  manipulation = {*tasks_of("manipulation")}
+  manipulation = {task for task, entry in entries().items() if entry.suite == "manipulation"}
   curves: dict[str, list[Curve]] = {}
   key = lambda row: (row["task"], row["algorithm"], row["source"].partition("@")[0])
   for (task, algorithm, repository), rows in groupby(sorted(_read("returns"), key=key), key=key):

@@ -13,6 +13,7 @@ from playground.catalog import Entry, entries
 from playground.errors import ConfigError
 from playground.files import read_csv, write_text
 from playground.reporting.page import Block, Heading, Table, to_markdown
+from playground.text import millions
 
 TABLES = {  # name of the pages results-<name>.md and runs-<name>.md -> their tables
   "dm-control": ("dm_control",),
@@ -111,18 +112,14 @@ def _blocks(rows: Sequence[Row]) -> Iterator[Block]:
 def _run(row: Row) -> tuple[str, str, str]:
   """Returns a run's agent and setting (or the other package), the backend, and millions of steps."""
   if (who := row["who"]) != "ours":
-    return who, row["backend"], _millions(row)
+    return who, row["backend"], millions(float(row["steps"]))
   setting = " ".join(_BUDGET.sub("", f"{row['agent']} {row.get('setting', '')}").split())
   for long, short in _SHORT.items():
     setting = setting.replace(long, short)
   if row.get("experiment", "").endswith("_chain"):
     setting = f"{row['experiment']} {setting.removeprefix('ppo ')}"
   setting = setting if len(setting) <= _LONG else f"{setting[: setting.rindex(' ', 0, _LONG)]} …"
-  return setting.replace("ppo agent=", ""), row["backend"], _millions(row)
-
-
-def _millions(row: Row) -> str:
-  return f"{float(row['steps']) / 1e6:.3g}"
+  return setting.replace("ppo agent=", ""), row["backend"], millions(float(row["steps"]))
 
 
 def _cells(key: tuple[str, ...], runs: Sequence[Row]) -> list[str]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from playground.benchmark.report.public import at, is_ppo, public_curves
 from playground.catalog import Entry, best_runs, run_name
 from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
+from playground.text import millions
 
 _HEADER = ("task", "status", "best run", "M steps", "default budget", "runs (seeds)", "sampled", "mode")
 _PUBLIC = ("best public PPO", "best public")  # at as many steps
@@ -27,7 +28,7 @@ def table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
   """
   cells = []
   for entry in entries:
-    budget = f"{entry.budget / 1e6:.3g}"
+    budget = millions(entry.budget)
     runs = best_runs(rows, entry.task)
     if not runs:
       cells.append([entry.task, entry.status, NOT_MEASURED, "", budget, "", "", "", "", ""])
@@ -37,9 +38,9 @@ def table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
     sampled = "" if by_mode(runs[0]) else _with_ci(runs, "final_return")
     mode = _with_ci(runs, "final_return" if by_mode(runs[0]) else "final_mode_return")
     public = [_public(entry.task, steps, ppo_only) for ppo_only in (True, False)]
-    cells.append(
-      [entry.task, entry.status, run_name(runs[0]), f"{steps / 1e6:.3g}", budget, count, sampled, mode, *public]
-    )
+    cells.append([entry.task, entry.status, run_name(runs[0]), millions(steps), budget, count, sampled, mode, *public])
+  if not any(row[-1] for row in cells):
+    return Table(_HEADER, [row[: -len(_PUBLIC)] for row in cells])
   return Table([*_HEADER, *_PUBLIC], cells)
 
 
@@ -69,5 +70,5 @@ def _public(task: str, steps: float, ppo_only: bool) -> str:
   if curves:
     first = min(curve.points[0][0] for curve in curves)
     value, name = max((curve.points[0][1], named(curve)) for curve in curves if curve.points[0][0] == first)
-    return f"{short(value)} after {first / 1e6:.3g} ({name})"
+    return f"{short(value)} after {millions(first)} ({name})"
   return ""
