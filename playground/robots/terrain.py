@@ -34,10 +34,16 @@ def rough(
   """Perlin noise (paper: appendix "Locomotion", rough terrain).
 
   `elevation` is from the lowest point to the highest, `wavelength` that of the broadest bumps. Each of the `octaves`
-  has half the wavelength and half the height of the one before.
+  has half the wavelength and half the height of the one before. Raises ConfigError where the last is finer than the
+  height field's points.
   """
   rng = np.random.default_rng(seed)
   cells = 2 * HALF_EXTENT / wavelength
+  if cells * 2 ** (octaves - 1) > POINTS:
+    raise ConfigError(
+      f"env.scene.terrain_params: octaves={octaves} from wavelength={wavelength:g} m on are finer than the "
+      f"{POINTS} points of the height field: choose fewer octaves or a longer wavelength."
+    )
   noise = sum(0.5**i * _perlin(rng, max(1, round(cells * 2**i))) for i in range(octaves))
   return _add_height_field(spec, _stretch(np.asarray(noise), elevation))
 

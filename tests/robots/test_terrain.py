@@ -123,6 +123,12 @@ def test_cylinders_of_the_full_collision_variants_stand_on_height_fields() -> No
     ("flat", {"seed": 1}, r"env\.scene\.terrain_params\.seed does not exist: flat takes no parameters"),
     ("stairs", {"step_height": 0}, "no heights: choose terrain=flat"),
     ("slope", {"platform": 0}, r"terrain_params\.platform=0 must be a number above 0"),
+    (
+      "rough",
+      {"octaves": 14},
+      r"octaves=14 from wavelength=0\.5 m on are finer than the 256 points of the height field",
+    ),
+    ("rough", {"wavelength": 1e-6, "octaves": 1}, "octaves=1 from wavelength=1e-06 m on are finer"),
     ("rough", {"wavelength": -1.0}, r"terrain_params\.wavelength=-1\.0 must be a number above 0"),
   ],
 )
