@@ -16,8 +16,10 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
+from playground.errors import ConfigError
 from playground.hardware.mesh import GROUP
 from playground.physics.warp_kernels import KernelBuild, cancel_prestart, quiet_warp
+from playground.text import first_line
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
@@ -121,12 +123,20 @@ class Physics:
       derived: the names out of `DERIVED_FIELDS` that the task reads.
       **buffers: `naconmax_per_env`, `naccdmax_per_env` and `njmax`: Warp's buffers, see `EnvConfig`. The environments
         of a batch, the axis `WORLDS` of the `jax.vmap` around, share the contacts.
+
+    Raises:
+      ConfigError: the model has something that MJX does not implement.
     """
     self.mj_model = mj_model
     self.impl = impl
     self.derived = derived
     self._forward = mjx.forward if impl == "warp" else jax.jit(mjx.forward)  # most of the time of tracing: traced once
-    self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, _device(), impl=impl)
+    try:
+      self.model = _put_on_warp(mj_model) if impl == "warp" else mjx.put_model(mj_model, _device(), impl=impl)
+    except NotImplementedError as error:
+      raise ConfigError(
+        f"MJX cannot simulate this model with env.impl={impl}: {first_line(error)}; change it in the MJCF."
+      ) from error
     self._buffers = buffers
 
   def without_dynamics(self) -> "Physics":

@@ -4,13 +4,15 @@ import re
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import pytest
 
 from playground import registry
 from playground.config import compose
+from playground.errors import ConfigError
 from playground.hardware.mesh import GROUP, make_mesh
 from playground.learning.trainer import Trainer, trainer_settings
-from playground.physics.backend import WORLDS, batch_size
+from playground.physics.backend import WORLDS, Physics, batch_size
 from playground.runs.train import model_sampler
 
 
@@ -30,6 +32,15 @@ def test_warps_buffers_grow_with_the_environments_of_all_agents_on_a_device() ->
   jax.vmap(batch, axis_name=GROUP)(jnp.zeros((3, 4)))
   environment(jnp.zeros(()))
   assert sizes == [4, 12, 1]
+
+
+@pytest.mark.parametrize("impl", ["jax", "warp"])
+@pytest.mark.parametrize("option", ["integrator='implicit'", "solver='PGS'"])
+def test_what_mjx_does_not_implement(option: str, impl: str) -> None:
+  model = mujoco.MjModel.from_xml_string(f"<mujoco><option {option}/></mujoco>")
+  name = option.split("'")[1].upper()
+  with pytest.raises(ConfigError, match=rf"^MJX cannot .* env\.impl={impl}: .*{name}.*; change it in the MJCF\.$"):
+    Physics(model, impl=impl)
 
 
 @pytest.mark.slow
