@@ -138,6 +138,10 @@ def test_crouched_start() -> None:
   ("overrides", "message"),
   [
     ({"support": ["FR", "FLL"]}, r"env\.support: 'FLL' is unknown.*Did you mean 'FL'\?"),
+    (
+      {"robot.feet": ["FR", "FL", "RX", "RL"]},
+      r"^env\.robot\.feet: 'RX' is unknown; choose from .*Did you mean 'RR'\?",
+    ),
     ({"robot.keyframe": "hom"}, r"the key 'hom', which the model does not have.*Did you mean 'home'\?"),
     ({"rewards.lifted_leg_deviation_l2.func": "joint_deviation"}, "Did you mean 'joint_deviation_l"),
   ],

@@ -49,10 +49,11 @@ class Stand(LeggedTask):
 
 
 def _legs(spec: mujoco.MjSpec, feet: Iterable[str]) -> list[mujoco.MjsBody]:
-  """The bodies between the robot's first one and the foot sites."""
+  """The bodies between the robot's first one and the foot sites; raises UnknownNameError."""
   root, bodies = spec.worldbody.first_body().name, []
+  sites = {site.name: site for site in spec.sites}
   for foot in feet:
-    body = spec.site(foot).parent
+    body = lookup(sites, foot, "env.robot.feet").parent
     while body.name != root:
       bodies.append(body)
       body = body.parent
