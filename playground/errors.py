@@ -68,6 +68,7 @@ def lookup(table: Mapping[str, T], name: str, key: str) -> T:
     UnknownNameError: the table has no such name; the message gives the nearest.
   """
   if name not in table:
-    has = f"; choose from {', '.join(table)}" if len(table) <= _MANY else ""
+    known = f"choose from {', '.join(table)}" if table else "there are none"
+    has = f"; {known}" if len(table) <= _MANY else ""
     raise UnknownNameError(f"{key}: {name!r} is unknown{has}.{nearest(str(name), table)}")
   return table[name]

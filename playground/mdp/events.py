@@ -381,7 +381,5 @@ def _uniform(key: jax.Array, reach: Span, shape: tuple[int, ...] = ()) -> jax.Ar
 
 def _uniform_vector(key: jax.Array, low: Sequence[float], high: Sequence[float], size: int) -> jax.Array:
   if not len(low) == len(high) == size or any(a > b for a, b in zip(low, high, strict=True)):
-    raise ConfigError(
-      f"env.events: low={list(low)} and high={list(high)} must be {size} numbers each, none above high."
-    )
+    raise ConfigError(f"low={list(low)} and high={list(high)} must be {size} numbers each, none above high.")
   return jax.random.uniform(key, (size,), minval=jnp.array(low), maxval=jnp.array(high))

@@ -74,8 +74,11 @@ def test_times_may_be_exponential() -> None:
 
 
 def test_refusals() -> None:
-  with pytest.raises(ConfigError, match=r"params\.min=\[2\.0, 0, 0\] must not be above"):
-    bound(UniformVelocity(MAX, (2.0, 0, 0)))
+  (term,) = bind("commands", {"mine": {"func": "uniform_velocity", "params": {"max": MAX, "min": [2.0, 0.0, 0.0]}}})
+  with pytest.raises(
+    ConfigError, match=r"^env\.commands\.mine: min=\[2\.0, 0\.0, 0\.0\] must not be above max=\[1\.5, "
+  ):
+    term.instantiate(SimpleNamespace(dt=0.02))
   with pytest.raises(ConfigError, match=r"velocity\.params\.nonzero_probability=.* must be 3 numbers from 0 to 1"):
     walk = {"func": "velocity_walk", "params": {"max": MAX, "nonzero_probability": (1.0, 1.0)}}
     bind("commands", {"velocity": walk})
@@ -139,3 +142,12 @@ def test_gaits_are_the_robots() -> None:
     gait("wlk")
   with pytest.raises(ConfigError, match=r"env\.robot\.gaits\.trot must hold 2 phases"):
     gait("trot")
+
+
+def test_a_robot_without_gaits() -> None:
+  robot: Any = LeggedRobot.__new__(LeggedRobot)
+  robot._gaits = {}
+  (term,) = bind("commands", {"gait": {"params": {"modes": ["walk"]}}})
+  message = r"^env\.commands\.gait: env\.robot\.gaits is empty or missing, so that there is no gait 'walk'\.$"
+  with pytest.raises(ConfigError, match=message):
+    term.instantiate(SimpleNamespace(dt=0.02, robot=robot))

@@ -10,8 +10,10 @@ import pytest
 from flax import struct
 
 from playground.envs.task import InitialState
+from playground.errors import ConfigError
 from playground.mdp import events
 from playground.mdp.events import PushByForce, PushByForceRegularly, PushBySettingVelocity, PushObjectByWrench
+from playground.mdp.terms import bind
 
 KEYS = jax.random.split(jax.random.PRNGKey(0), 2000)
 MASS = 12.0
@@ -30,6 +32,8 @@ def env(dt: float = 0.02) -> Any:
 
 
 # Starts
+
+BOUNDS = {"low": [0.0, 0.0, 2.0], "high": [1.0, 1.0, 1.0]}
 
 START = InitialState(jnp.array([1.0, 2.0, 0.3, 0.8, 0.0, 0.6, 0.0, 0.2, -0.5]), jnp.full(8, 7.0))
 
@@ -107,6 +111,13 @@ def test_a_cube_lies_anyhow_about_a_place() -> None:
   np.testing.assert_allclose([qpos[:, :3].min(0), qpos[:, :3].max(0)], [low, high], atol=1e-3)
   np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1, rtol=1e-4)
   np.testing.assert_allclose(qpos[:, 3:7].mean(0), 0, atol=0.06)
+
+
+def test_bounds_of_a_start_that_cannot_be_name_their_event() -> None:
+  (term,) = bind("events", {"mine": {"func": "reset_goal_uniform", "mode": "reset", "params": BOUNDS}})
+  message = r"^env\.events\.mine: low=\[0\.0, 0\.0, 2\.0\] and high=\[1\.0, 1\.0, 1\.0\] must be 3 numbers each"
+  with pytest.raises(ConfigError, match=message):
+    term(KEYS[0], env(), START)
 
 
 # Pushes
