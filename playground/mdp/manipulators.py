@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from mujoco.mjx._src.math import quat_to_mat
 
-from playground.errors import lookup
+from playground.errors import ConfigError, lookup
 from playground.mdp.context import Robot, StepContext
 from playground.mdp.poses import Pose, angle_between
 from playground.physics.backend import PhysicsData
@@ -71,9 +71,23 @@ class ArmRobot(Manipulator):
     return slice(start, start + 3)
 
   def touching(self, data: PhysicsData, geom: str) -> jax.Array:
-    """Returns which contact sensors of a geom report a contact, bool, shape [sensors]; raises UnknownNameError."""
+    """Returns which contact sensors of a geom report a contact, bool, shape [sensors].
+
+    Raises:
+      ConfigError: the scene has no such geom, or no contact sensor of it.
+    """
     self.find("geom", geom, "a term")
-    return data.sensordata[contact_addresses(self.mj_model, geom)] > 0
+    addresses = contact_addresses(self.mj_model, geom)
+    if not addresses.size:
+      raise ConfigError(f"the scene has no contact sensor of geom {geom!r}.")
+    return data.sensordata[addresses] > 0
+
+  def contact_normals(self, data: PhysicsData) -> jax.Array:
+    """Returns the readings of the sensors `<geom>_<other>_normal`, shape [sensors, 3]; raises ConfigError for none."""
+    rows = [rows for name, rows in self._rows.items() if name.endswith("_normal")]
+    if not rows:
+      raise ConfigError("the scene has no contact sensor <geom>_<other>_normal.")
+    return data.sensordata[_span(np.concatenate(rows))].reshape(-1, 3)
 
 
 class Hand(Manipulator):

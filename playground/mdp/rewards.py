@@ -414,7 +414,7 @@ def no_contact(c: ArmContext, geom: str) -> jax.Array:
 
 def contact_normal_horizontal(c: ArmContext) -> jax.Array:
   """|e_z x n|, n the mean normal of the fingers' contacts with the object: 1 for pushing from the side."""
-  normal = normalize(c.data.sensordata[:18].reshape(6, 3).mean(axis=0))
+  normal = normalize(c.robot.contact_normals(c.data).mean(axis=0))
   return jnp.linalg.norm(jnp.cross(jnp.array([0.0, 0.0, 1.0]), normal))
 
 

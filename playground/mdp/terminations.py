@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from playground.errors import ConfigError
 from playground.limits import AtLeast0, Share
 from playground.mdp.context import StepContext
 from playground.mdp.legged import LeggedContext
 from playground.mdp.manipulators import ArmContext, HandContext
+from playground.text import format_value
 
 Bounds = Sequence[float | None]
 
@@ -89,6 +91,10 @@ def object_at_goal(c: ArmContext) -> jax.Array:
 
 
 def _outside(position: jax.Array, low: Bounds, high: Bounds) -> jax.Array:
+  if not len(low) == len(high) == 3:
+    raise ConfigError(
+      f"low={format_value(low)} and high={format_value(high)} must have an entry for each of x, y and z."
+    )
   lower = np.array([-np.inf if bound is None else bound for bound in low])
   upper = np.array([np.inf if bound is None else bound for bound in high])
   return ((position < lower) | (position > upper)).any()

@@ -31,7 +31,7 @@ from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.options import OPTIONS, is_model_field, keys
 from playground.moved import renamed_function
 from playground.settings import below, members, problem
-from playground.text import format_value
+from playground.text import first_line, format_value
 from playground.trust import trusted_object
 
 # Modules whose public functions and classes are the registered terms of a kind.
@@ -71,7 +71,10 @@ class Term(NamedTuple):
 
   @contextlib.contextmanager
   def reading(self, *args: Any) -> Iterator[None]:
-    """Raises ConfigError, with the term's key, where it reads what the task, robot or context in `args` lacks."""
+    """Raises ConfigError, with the term's key, where it reads what the task, robot or context in `args` lacks.
+
+    So it does where a term of this package gets arrays whose sizes do not go together.
+    """
     try:
       yield
     except ConfigError as error:
@@ -82,6 +85,12 @@ class Term(NamedTuple):
       if not any(error.obj is part for part in parts):
         raise
       raise ConfigError(f"{self.key} needs {error.name!r}, which this task does not have.") from error
+    except (TypeError, ValueError) as error:
+      # The innermost term: `is_terminated` reads the terminations, of which another package's keeps its traceback.
+      inner = vars(error).setdefault("term", self)
+      if type(error) not in (TypeError, ValueError) or not inner.func.__module__.startswith("playground.mdp."):
+        raise
+      raise ConfigError(f"{self.key} does not fit this task: {first_line(error)}.") from error
 
   def instantiate(self, env: Any) -> "Term":
     """Returns the same term with an instance of its class, bound to a task."""

@@ -8,16 +8,32 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import pytest
 import yaml
 
 import playground
 from playground import registry
 from playground.errors import ConfigError, UnknownNameError
+from playground.mdp.manipulators import ArmContext, ArmRobot
 from playground.mdp.options import RewardOptions, is_model_field
 from playground.mdp.rewards import action_rate_l2
 from playground.mdp.terms import MODULES, Term, bind, find, registered
+from playground.physics.backend import mjx
+from playground.robots.tabletop import build_tabletop
 from playground.trust import trust
+from tests.mdp.context import context
+
+
+@pytest.fixture(scope="module")
+def arm() -> ArmContext:
+  """The Panda and a cube: seven joints, eight actuators; contact sensors of the floor, the fingers and the cube."""
+  spec = build_tabletop("panda_single_cube")
+  spec.body("mocap_target").geoms[0].name = "target"  # which no sensor watches
+  model = spec.compile()
+  env: Any = SimpleNamespace(robot=ArmRobot(model, "home", r"joint\d"), dt=0.02)
+  data: Any = mjx.make_data(model, impl="jax")
+  return ArmContext(env, data, {}, jnp.zeros(8))
 
 
 def rewards(section: Any) -> list[Term]:
@@ -205,6 +221,59 @@ def test_an_error_inside_a_term_is_its_own() -> None:
     term(SimpleNamespace())
   with pytest.raises(AttributeError, match="shape"):
     term._replace(func=lambda c: [].shape)(SimpleNamespace())  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_sizes_that_do_not_fit_are_an_error_of_the_config_in_our_terms_only() -> None:
+  c = context(data={"actuator_force": jnp.zeros(3)})  # of two joints
+  (term,) = rewards({"power": {"func": "joint_power_l1", "weight": 1.0}})
+  with pytest.raises(ConfigError, match=r"^env\.rewards\.power does not fit this task: .*\(2,\).*\(3,\)\.$") as raised:
+    term(c)
+  assert isinstance(raised.value.__cause__, TypeError)
+  theirs = term._replace(func=lambda c: c.joint_vel + c.data.actuator_force)
+  (ending,) = rewards({"is_terminated": {"weight": 1.0}})
+  c.env.terminations.any = theirs  # pyright: ignore[reportAttributeAccessIssue]
+  for func in (theirs, ending):
+    with pytest.raises(TypeError, match="incompatible shapes"):
+      func(c)
+
+
+@pytest.mark.parametrize(
+  ("kind", "entry", "message"),
+  [
+    ("rewards", {"func": "joint_power_l1", "weight": 1.0}, "does not fit this task: mul got incompatible shapes"),
+    ("terminations", {"func": "power_above", "params": {"limit": 1.0}}, "does not fit this task: mul got"),
+    ("observations", {"func": "target_error"}, "does not fit this task: sub got incompatible shapes"),
+    (
+      "rewards",
+      {"func": "joint_vel_within_limits", "weight": 1.0, "params": {"limits": [1.0, 2.0]}},
+      "does not fit this task: .*incompatible shapes",
+    ),
+    (
+      "terminations",
+      {"func": "body_out_of_bounds", "params": {"body": "box", "low": [0.0, None], "high": [1.0, 1.0]}},
+      r"low=\[0\.0, null\] and high=\[1\.0, 1\.0\] must have an entry for each of x, y and z",
+    ),
+    (
+      "terminations",
+      {"func": "site_out_of_bounds", "params": {"site": "gripper", "low": [0], "high": [1]}},
+      ".*each of x, y and z",
+    ),
+    ("rewards", {"func": "contact_normal_horizontal", "weight": 1.0}, "the scene has no contact sensor .*_normal"),
+    (
+      "rewards",
+      {"func": "no_contact", "weight": 1.0, "params": {"geom": "target"}},
+      "the scene has no contact sensor of geom 'target'",
+    ),
+    (
+      "terminations",
+      {"func": "illegal_contact", "params": {"geoms": ["target"]}},
+      "the scene has no contact sensor of geom 'target'",
+    ),
+  ],
+)
+def test_terms_that_an_arm_has_not(kind: str, entry: Any, message: str, arm: ArmContext) -> None:
+  with pytest.raises(ConfigError, match=rf"^env\.{kind}\.mine:? {message}"):
+    bind(kind, {"mine": entry})[0](arm)
 
 
 def test_functions_have_the_names_under_which_they_are_registered() -> None:
