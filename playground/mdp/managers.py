@@ -188,7 +188,11 @@ class ObservationManager(_Manager):
 def _bind_observation(group: str, name: str, entry: Any, noisy: list[str]) -> Term:
   """Binds a term; `noisy` are those above it in its group that have noise of their own."""
   key = f"env.observations.{group}.{name}"
-  if group != ACTOR and name == ACTOR and not dict(entry.items() if hasattr(entry, "items") else {"func": entry}):
+  if group != ACTOR and name == ACTOR:
+    if not hasattr(entry, "items") or dict(entry.items()):
+      raise ConfigError(
+        f"{key}={format_value(entry)} must be {{}}, all of env.observations.{ACTOR}: a term needs another name."
+      )
     return Term(name, key, lambda c: None, {}, ObservationOptions())
   term = bind_one("observations", key, name, entry)
   if term.options.noise is None:

@@ -285,6 +285,12 @@ def test_a_policy_reads_something(section: Any) -> None:
     bound(section)
 
 
+@pytest.mark.parametrize("entry", [{"func": "qpos"}, {"history": 2}, "qpos"], ids=str)
+def test_the_entry_for_all_that_the_policy_reads_is_empty(entry: Any) -> None:
+  with pytest.raises(ConfigError, match=r"^env\.observations\.critic\.state=.* must be \{\}, all of env"):
+    manager(critic={"state": entry})
+
+
 # Events
 
 
