@@ -9,7 +9,7 @@ from playground import registry
 from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_evaluation
-from playground.errors import lookup
+from playground.errors import ConfigError, lookup
 from playground.pytree import PyTree
 from playground.settings import Section
 
@@ -78,6 +78,10 @@ def load_task(task: str, overrides: Section | None = None, physics: str = "mjx")
 
   Raises:
     UnknownNameError: no such task, key or physics.
+    ConfigError: `c` for a task that draws its model anew for each episode.
   """
   place = lookup({"c": on_c_physics, "mjx": lambda env: env}, physics, "physics")
-  return place(registry.load(task, overrides=overrides))
+  env = registry.load(task, overrides=overrides)
+  if physics == "c" and env.unwrapped.redraws:
+    raise ConfigError("physics='c' has one model, but env.events draws its fields for each episode: use physics='mjx'.")
+  return place(env)

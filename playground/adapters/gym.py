@@ -147,15 +147,18 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
     physics: str = "mjx",
     entry: str | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    render_mode: None = None,
   ):
     """Builds a task; see `GymEnv` for arguments and errors.
 
     Raises:
-      ConfigError: `AutoresetMode.DISABLED`.
+      UnknownNameError: another autoreset mode than `NextStep` and `SameStep`.
+      ConfigError: a render mode.
     """
-    mode = AutoresetMode(autoreset_mode)
-    if mode == AutoresetMode.DISABLED:
-      raise ConfigError("autoreset_mode='Disabled' is not there: choose 'NextStep' or 'SameStep'.")
+    if render_mode is not None:
+      raise ConfigError(f"render_mode={render_mode!r}: a batch renders nothing, one environment (gymnasium.make) does.")
+    modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
+    mode = lookup(modes, str(getattr(autoreset_mode, "value", autoreset_mode)), "autoreset_mode")
     self.metadata = self.metadata | {"autoreset_mode": mode}
     same_step = mode == AutoresetMode.SAME_STEP
     env = load_task(task, overrides, physics)
@@ -176,12 +179,16 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
       begun = jax.lax.cond(ended.any(), lambda: where_done(ended, start(key), after), lambda: after)
       return begun, (after if same_step else begun).replace(data=None)
 
-    self._start, self._advance = jax.jit(start), jax.jit(advance)
+    self._start, self._advance, self._where = jax.jit(start), jax.jit(advance), jax.jit(where_done)
     self._state: State | None = None
 
   def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[PyTree, Info]:
+    """Starts the next episodes, of the environments in `options["reset_mask"]` (bool, [num_envs]) if that is there."""
     super().reset(seed=seed)
-    state = self._state = self._start(self._key())
+    state, mask = self._start(self._key()), (options or {}).get("reset_mask")
+    if mask is not None and self._state is not None:
+      state = self._where(np.asarray(mask, bool), state, self._state)
+    self._state = state
     return self._seen(state)
 
   def step(self, actions: np.ndarray) -> tuple[PyTree, np.ndarray, np.ndarray, np.ndarray, Info]:

@@ -12,6 +12,7 @@ from playground.config import format_value
 from playground.deploy.graph import OUTPUT, input_names
 from playground.envs.base import PIXELS, Env, State
 from playground.errors import CheckpointError
+from playground.mdp.commands import Gait, UniformVelocity, VelocityWalk
 from playground.mdp.options import OPTIONS, ObservationOptions
 from playground.settings import plain
 from playground.text import first_docstring_line
@@ -72,14 +73,15 @@ def describe_policy(
       "actions": "the mode of the trained distribution, in [-1, 1]",
     },
     "rate_hz": 1 / policy_dt,
+    "control_hz": 1 / env.dt,  # of the steps that frames, histories and delays count; above rate_hz with action repeats
     "observation": [term for entry in vectors for term in _observation(env, entry)],
     "cameras": [_camera(env, entry) for entry in images if entry == f"{PIXELS}{env.config.vision.camera}"],
     "frames": env_config.get("observation_frames", 1),
     "delays": dict(_delays(env_config)),
     "action": _action(env, env_config, state),
-    "actuators": _actuators(env.mj_model, _home(env.mj_model, env_config)),
+    "actuators": _actuators(env.mj_model, _home(env, env_config)),
     "joints": [env.mj_model.joint(i).name or "(free)" for i in range(env.mj_model.njnt)],
-    **_commands(env_config),
+    **_commands(env),
     "env": env_config,
   }
   return plain(contract)
@@ -179,11 +181,12 @@ def _options(options: ObservationOptions, noise_level: float) -> dict[str, objec
   }
 
 
-def _commands(config: Contract) -> Contract:
-  """Returns the parameters of the commands `velocity` (as `command`) and `gait`, if the task has them."""
-  terms = config.get("commands") or {}
-  found = {key: (terms.get(name) or {}).get("params") for key, name in (("command", "velocity"), ("gait", "gait"))}
-  return {key: params for key, params in found.items() if params}
+def _commands(env: Env) -> Contract:
+  """Returns the parameters of the task's velocity command (as `command`) and of its gait, if it has them."""
+  manager = getattr(env.unwrapped, "commands", None)
+  terms = manager.terms if manager else []
+  kinds = (("command", UniformVelocity | VelocityWalk), ("gait", Gait))
+  return {key: dict(term.params) for key, kind in kinds for term in terms if isinstance(term.instance, kind)}
 
 
 def _camera(env: Env, entry: str) -> dict[str, object]:
@@ -233,14 +236,17 @@ def _action(env: Env, config: Contract, state: State) -> dict[str, object]:
   return law
 
 
-def _home(mj_model: mujoco.MjModel, config: Contract) -> tuple[str, np.ndarray]:
+def _home(env: Env, config: Contract) -> tuple[str, np.ndarray]:
   """Returns the name of the reference pose, and its `qpos` [nq]."""
+  mj_model = env.mj_model
   keyframes = [mj_model.key(i).name for i in range(mj_model.nkey)]
   if not keyframes:
     return "qpos0", mj_model.qpos0
-  name = config.get("robot", {}).get("keyframe", "home")
+  name = config.get("keyframe") or config.get("robot", {}).get("keyframe", "home")
   name = name if name in keyframes else keyframes[0]
-  return f"keyframe {name}", mj_model.key(name).qpos
+  qpos = mj_model.key(name).qpos
+  start = np.asarray(getattr(getattr(env.unwrapped, "robot", None), "init_qpos", qpos))  # an arm's is within its limits
+  return f"keyframe {name}", np.where(np.isclose(start, qpos, atol=1e-6), qpos, start)
 
 
 def _actuators(mj_model: mujoco.MjModel, home: tuple[str, np.ndarray]) -> list[dict[str, object]]:

@@ -79,6 +79,8 @@ class Player:
       self.episode_return += float(self.state.reward)
       for name in self.terms:
         self.terms[name] += float(self.state.metrics[_TERM + name])
+      if self.state.done:
+        break
     self._steps += self.env.action_repeat
     return self.state
 

@@ -130,6 +130,8 @@ class Session:
     old = self.player
     config: Any = config_dict(old.env.config)
     config.scene.terrain = name
+    if config.scene.get("terrain_params"):
+      config.scene.terrain_params = {}  # are of the other terrain
     env = load_on_c_physics(old.exported.contract["task"], config)
     number, self.players = len(self.players), [Player(env, old.exported, self._seed)]
     self.players[0].command = old.command

@@ -1,6 +1,7 @@
 """Shows a policy in MuJoCo's native viewer, with pushes by mouse and commands by arrow keys."""
 
 import os
+import queue
 import sys
 import threading
 import time
@@ -57,7 +58,9 @@ def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
   player = Player(env, exported, seed)
   data = mujoco.MjData(env.mj_model)
 
-  def on_key(key: int) -> None:
+  keys: queue.SimpleQueue[int] = queue.SimpleQueue()  # the window's thread adds to it, this one empties it
+
+  def obey(key: int) -> None:
     if key == _RESET:
       player.reset()
     elif key == _AUTOMATIC:
@@ -70,11 +73,13 @@ def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
 
   console.print(_HELP, soft_wrap=True)
   others = set(threading.enumerate())
-  with noted_signals() as ended, mujoco.viewer.launch_passive(env.mj_model, data, key_callback=on_key) as window:
+  with noted_signals() as ended, mujoco.viewer.launch_passive(env.mj_model, data, key_callback=keys.put) as window:
     with window.lock():
       follow(window.cam, env.mj_model)
     while window.is_running() and not ended.is_set():
       began = time.perf_counter()
+      while not keys.empty():
+        obey(keys.get())
       state = player.policy_step()
       with window.lock():
         for name in ("qpos", "mocap_pos", "mocap_quat"):

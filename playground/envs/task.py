@@ -1,7 +1,9 @@
 """A task made of terms: the base of all tasks on legs, with hands and with arms."""
 
 import abc
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
+from types import CodeType, FunctionType
 from typing import Any, ClassVar
 
 import jax
@@ -70,6 +72,9 @@ class Task(Env):
     self.observations = ObservationManager(config)
     if any(not term.func.__module__.startswith("playground.") for term in self.terms()):
       self.derived = DERIVED_FIELDS  # another package's term may read any of them
+    else:
+      read = set().union(*(_attributes_read(term.func) for term in self.terms()))
+      self.derived = (*self.derived, *(name for name in DERIVED_FIELDS if name in read - {*self.derived}))
     super().__init__(config, mj_model)
     self.robot = self.make_robot(mj_model, config)
     self.commands = CommandManager(config.get("commands"), self)
@@ -155,10 +160,11 @@ class Task(Env):
     after = {**info, "rng": rng, "last_act": action, "last_last_act": info["last_act"]}
     after |= self.commands.step(c, command_key) | self.next_info(c, own_key)
     after |= {"observation_buffers": buffers} if buffers else {}
-    return State(data, obs, self.total(rewards), c.terminated.astype(jnp.float32), self._metrics(c, rewards), after)
+    reward = self.clipped(self.total(rewards))
+    return State(data, obs, reward, c.terminated.astype(jnp.float32), self._metrics(c, rewards), after)
 
   def total(self, rewards: Mapping[str, jax.Array]) -> jax.Array:
-    """Returns the reward of a step from its weighted terms: clip(dt * total).
+    """Returns the reward of a step from its weighted terms, before `reward_clip`: dt * total.
 
     `reward_total: product` multiplies the sum of the terms of positive weight by exp(0.2 * the sum of the others).
     """
@@ -166,9 +172,11 @@ class Task(Env):
     if self._reward_total == "product":
       signed = lambda gain: add(rewards[t.name] for t in self.rewards.terms if (t.options.weight > 0) == gain)
       gains, costs = signed(True), signed(False)
-      reward = gains * jnp.exp(0.2 * costs) * self.dt
-    else:
-      reward = add(rewards.values()) * self.dt
+      return gains * jnp.exp(0.2 * costs) * self.dt
+    return add(rewards.values()) * self.dt
+
+  def clipped(self, reward: jax.Array) -> jax.Array:
+    """Returns a step's reward within `reward_clip`."""
     return jnp.clip(reward, *self._reward_clip) if self._reward_clip else reward
 
   def _metrics(self, c: StepContext, rewards: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
@@ -185,3 +193,16 @@ class Task(Env):
       return self.context(self, state.data, state.info, jnp.zeros(self.action_size))
 
     return self.observations.sizes(first)
+
+
+def _attributes_read(func: Callable[..., Any]) -> set[str]:
+  """Returns the names of attributes that a function reads, and the functions that it wraps or encloses."""
+  func = inspect.unwrap(func)
+  if not isinstance(func, FunctionType):
+    return set()
+  codes, names = [func.__code__], set[str]()
+  for code in codes:
+    names.update(code.co_names)
+    codes += [part for part in code.co_consts if isinstance(part, CodeType)]
+  enclosed = [cell.cell_contents for cell in func.__closure__ or ()]
+  return names.union(*(_attributes_read(value) for value in enclosed if isinstance(value, FunctionType)))

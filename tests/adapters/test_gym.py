@@ -150,9 +150,22 @@ def test_only_who_ended_has_a_last_observation() -> None:
   assert upright[1] > 0 and upright[0] == upright[2] == 0
 
 
-def test_a_batch_that_never_begins_anew_is_refused() -> None:
-  with pytest.raises(ConfigError, match="autoreset_mode='Disabled' is not there: choose 'NextStep' or 'SameStep'"):
+def test_what_a_batch_does_not_do_is_refused() -> None:
+  with pytest.raises(ConfigError, match="autoreset_mode: 'Disabled' is unknown; choose from NextStep, SameStep"):
     GymVectorEnv(3, "CartpoleBalance", autoreset_mode="Disabled")
+  with pytest.raises(ConfigError, match="render_mode='rgb_array': a batch renders nothing"):
+    gymnasium.make_vec("playground/CartpoleBalance", num_envs=3, render_mode="rgb_array")
+  drawn = {"field": "geom_friction", "target": "floor", "column": 0, "operation": "set", "range": [0.4, 1.0]}
+  with pytest.raises(ConfigError, match="use physics='mjx'"):
+    GymEnv("Go1JoystickFlatTerrain", {"events.friction": {"mode": "reset", "func": "model_field", "params": drawn}})
+
+
+def test_a_mask_begins_some_episodes_anew() -> None:
+  envs = GymVectorEnv(3, "CartpoleBalance", SHORT, "c")
+  envs.reset(seed=0)
+  before, *_ = envs.step(np.ones((3, 1), np.float32))
+  after, _ = envs.reset(options={"reset_mask": np.array([False, True, False])})
+  assert [np.array_equal(a, b) for a, b in zip(after, before, strict=True)] == [True, False, True]
 
 
 def test_one_entry_of_a_dict_observation() -> None:

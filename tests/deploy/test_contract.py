@@ -53,7 +53,8 @@ def test_a_joystick_policy() -> None:
   assert observation["joint_vel"]["delay"] == [0, 2]
   assert (observation["past"]["history"], observation["past"]["noise"]) == (2, {"same_as": "joint_pos_rel"})
   assert said["policy"]["inputs"] == [{"name": "obs", "entry": "state", "shape": [1, 72], "type": "float32"}]
-  assert (said["rate_hz"], said["frames"], said["cameras"], said["delays"]) == (50, 1, [], {})
+  assert (said["rate_hz"], said["control_hz"], said["frames"]) == (50, 50, 1)
+  assert (said["cameras"], said["delays"]) == ([], {})
   law = said["action"]
   assert (law["law"], law["base"], law["scale"]) == ("ctrl = base + scale * action", "default_pose", 0.5)
   assert law["clipped_to"]["lower"][0] == pytest.approx(-0.863)
@@ -82,6 +83,20 @@ def test_frames_and_a_gait() -> None:
   last = said["observation"][-1]
   assert (last["name"], last["start"], last["size"], last["what"][:15]) == ("past_frames", 103, 103, "All terms above")
   assert (said["frames"], said["gait"]["modes"]) == (2, ["walk"])
+
+
+def test_a_command_by_another_name_and_repeated_actions() -> None:
+  config = registry.config("Go1JoystickFlatTerrain").commands.velocity.to_dict()
+  overrides = {"commands": {"velocity": None, "walk": {**config, "func": "uniform_velocity"}}, "action_repeat": 2}
+  said = contract("Go1JoystickFlatTerrain", 48, overrides)
+  assert said["command"]["max"] == [1.5, 0.8, 1.2]
+  assert (said["rate_hz"], said["control_hz"]) == (25, 50)
+
+
+def test_an_arm_begins_within_the_limits_of_its_joints() -> None:
+  elbow = contract("PandaOpenCabinet", 55)["actuators"][3]
+  assert (elbow["joint"], elbow["default_of"]) == ("joint4", "keyframe upright")
+  assert elbow["default"] == pytest.approx(-0.0698)
 
 
 @pytest.mark.parametrize("kind", ["observations", "rewards", "terminations", "commands", "events"])

@@ -61,6 +61,12 @@ def test_what_the_watcher_asks_for() -> None:
   assert (player.state.info["age"], player.episode_return) == (1, 0)
 
 
+def test_nothing_is_earned_after_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+  step = Commanded.post_step
+  monkeypatch.setattr(Commanded, "post_step", lambda *args: step(*args).replace(done=jnp.ones(())))
+  assert Player(Commanded(action_repeat=4), NO_ACTION).policy_step().info["age"] == 1
+
+
 def test_an_episode_that_breaks_begins_anew() -> None:
   player = Player(Commanded(nan_at=2), NO_ACTION)
   player.policy_step()

@@ -1,6 +1,6 @@
 """Arms at a table: scene, servo targets and success. The terms of a task's config define everything else."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -9,7 +9,9 @@ import mujoco
 
 from playground.envs.base import State
 from playground.envs.task import InitialState, Task
+from playground.errors import ConfigError
 from playground.mdp.manipulators import ArmContext, ArmRobot
+from playground.mdp.terms import Term
 from playground.physics.backend import PhysicsData, mjx
 from playground.robots.tabletop import build_tabletop
 
@@ -55,8 +57,12 @@ class TabletopTask(Task):
 
   def at_goal(self, c: ArmContext) -> jax.Array:
     """Returns whether the object is where it should be, bool."""
-    near, angle = self.goal_distance(c) < self.config.success_distance, self.config.get("success_angle")
-    return near if angle is None else near & (c.goal_angle < angle)
+    return (self.goal_distance(c) < self.config.success_distance) & self.turned(c)
+
+  def turned(self, c: ArmContext) -> jax.Array:
+    """Returns whether the object is turned as it should be, bool; true without a `success_angle`."""
+    angle = self.config.get("success_angle")
+    return jnp.array(True) if angle is None else c.goal_angle < angle
 
   def measure(self, c: ArmContext) -> dict[str, jax.Array]:
     return {"success": c.at_goal.astype(jnp.float32), "position_error_cm": 100 * jnp.linalg.norm(c.object_to_goal)}
@@ -95,8 +101,18 @@ class Bimanual(TabletopTask):
 
   arm_joints = r"(left|right)/(?!.*_finger).*"
 
+  def __init__(self, config: Any):
+    super().__init__(config)
+    need_weights(self.rewards.terms)
+
   def total(self, rewards: Mapping[str, jax.Array]) -> jax.Array:
     return super().total(rewards) / sum(term.options.weight for term in self.rewards.terms)
+
+
+def need_weights(terms: Sequence[Term]) -> None:
+  """Raises ConfigError where the weighted mean of reward terms has no value."""
+  if sum(term.options.weight for term in terms) <= 0:
+    raise ConfigError("env.rewards: the reward is the terms' weighted mean: their weights must add up to more than 0.")
 
 
 class ProgressTask(TabletopTask):
@@ -124,4 +140,4 @@ class ProgressTask(TabletopTask):
     potential, best = state.reward, info["best_potential"]
     reward = jnp.maximum(potential - best, 0.0) + self.bonus(ArmContext(self, data, info, action), potential)
     best = {"best_potential": jnp.maximum(potential, best)}
-    return state.replace(reward=jnp.where(info["first_step"], 0.0, reward), info=state.info | best)
+    return state.replace(reward=self.clipped(jnp.where(info["first_step"], 0.0, reward)), info=state.info | best)

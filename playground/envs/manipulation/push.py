@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from mujoco.mjx._src.math import axis_angle_to_quat, quat_mul
 
 from playground.envs.base import State
-from playground.envs.manipulation.arm import ArmTask
+from playground.envs.manipulation.arm import ArmTask, need_weights
 from playground.envs.task import InitialState
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.errors import ConfigError
@@ -56,6 +56,7 @@ class PushCube(ArmTask):
     if len(config.curriculum.distance) != len(config.curriculum.angle):
       raise ConfigError("env.curriculum.distance and env.curriculum.angle must have an entry for each level.")
     super().__init__(config)
+    need_weights([term for term in self.rewards.terms if term.name not in _BONUSES])
     self._action_delay = tuple(config.action_delay)
     self.observations = _DelayedObservations(config, tuple(config.observation_delay))
     self._max_ctrl = jnp.array(config.max_torque / self.mj_model.actuator_gear[_ARM, 0])
@@ -135,7 +136,7 @@ class PushCube(ArmTask):
     return super().measure(c) | {
       "success": reached.astype(jnp.float32),
       "success_1": (jnp.linalg.norm(c.object_to_goal) < self.config.success_distance).astype(jnp.float32),
-      "success_2": (c.goal_angle < self.config.success_angle).astype(jnp.float32),
+      "success_2": self.turned(c).astype(jnp.float32),
       "goals_reached": c.info["goals_reached"] + reached,
       "curriculum_level": self._next_level(c).astype(jnp.float32),
     }

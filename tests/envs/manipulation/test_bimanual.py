@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from playground import registry
 from playground.envs.base import State
+from playground.errors import ConfigError
 from tests.envs.golden import recorded, without_physics
 
 HANDOVER, PEG = "AlohaHandOver", "AlohaSinglePegInsertion"
@@ -138,3 +140,9 @@ def test_the_right_hands_part_begins_where_the_box_is_passed() -> None:
   held = lambda x: placed([x, 0, 0.2], **{"left/gripper": [x, 0, 0.22], "right/gripper": [x, 0, 0.18]})
   for x, pays in ((-0.15, 1.0), (-0.05, 2.0), (0.05, 2.0)):
     np.testing.assert_allclose(step(HANDOVER, state, **held(x)).metrics["reward/grippers_at_box_exp"], pays, rtol=1e-5)
+
+
+def test_weights_without_a_mean_are_refused() -> None:
+  names = registry.config(HANDOVER).rewards
+  with pytest.raises(ConfigError, match="their weights must add up to more than 0"):
+    registry.load(HANDOVER, overrides={f"rewards.{name}.weight": 0.0 for name in names})

@@ -278,3 +278,9 @@ def test_the_level_outlasts_episodes_and_all_else_begins_anew(push: Any) -> None
 def test_refuses(overrides: dict[str, Any], message: str) -> None:
   with pytest.raises(ConfigError, match=message):
     load_task(TASK, overrides)
+
+
+def test_a_clipped_reward_and_any_turn(state: State) -> None:
+  env = without_physics(TASK, **SILENT, reward_clip=[0.0, 1e-5], success_angle=None)
+  after = step(env, state)
+  assert after.reward == pytest.approx(1e-5) and after.metrics["success_2"] == 1
