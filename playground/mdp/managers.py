@@ -13,7 +13,7 @@ from playground.limits import at_least_0
 from playground.mdp import delays
 from playground.mdp.context import StepContext
 from playground.mdp.options import ObservationOptions
-from playground.mdp.terms import Term, bind, bind_one
+from playground.mdp.terms import Term, bind, bind_one, plain
 from playground.physics.backend import PhysicsData
 from playground.text import format_value
 
@@ -189,9 +189,9 @@ def _bind_observation(group: str, name: str, entry: Any, noisy: list[str]) -> Te
   """Binds a term; `noisy` are those above it in its group that have noise of their own."""
   key = f"env.observations.{group}.{name}"
   if group != ACTOR and name == ACTOR:
-    if not hasattr(entry, "items") or dict(entry.items()):
+    if (given := plain(entry)) != {}:
       raise ConfigError(
-        f"{key}={format_value(entry)} must be {{}}, all of env.observations.{ACTOR}: a term needs another name."
+        f"{key}={format_value(given)} must be {{}}, for all of env.observations.{ACTOR}: give a term another name."
       )
     return Term(name, key, lambda c: None, {}, ObservationOptions())
   term = bind_one("observations", key, name, entry)

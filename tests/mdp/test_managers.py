@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from ml_collections import ConfigDict
 
 from playground.envs.locomotion.legged import LeggedTask
 from playground.errors import ConfigError, UnknownNameError
@@ -285,9 +286,9 @@ def test_a_policy_reads_something(section: Any) -> None:
     bound(section)
 
 
-@pytest.mark.parametrize("entry", [{"func": "qpos"}, {"history": 2}, "qpos"], ids=str)
+@pytest.mark.parametrize("entry", [ConfigDict({"func": "qpos"}), {"func": "qpos"}, "{func: qpos}"], ids=type)
 def test_the_entry_for_all_that_the_policy_reads_is_empty(entry: Any) -> None:
-  with pytest.raises(ConfigError, match=r"^env\.observations\.critic\.state=.* must be \{\}, all of env"):
+  with pytest.raises(ConfigError, match=r"^env\.observations\.critic\.state=\{func: qpos\} must be \{\}, for all of"):
     manager(critic={"state": entry})
 
 
