@@ -106,7 +106,8 @@ def test_totals(total: str, clip: Any, value: float) -> None:
   task.rewards = RewardManager({name: {"weight": weight} for name, weight in weights.items()})
   task.dt, task._reward_total, task._reward_clip = 0.02, total, clip
   rewards = {"upright_exp": 2.0, "constant": 1.0, "pose_l2": -1.0, "action_l2": -0.5}
-  np.testing.assert_allclose(task.total({name: jnp.array(v) for name, v in rewards.items()}), value, rtol=1e-6)
+  reward = task.clipped(task.total({name: jnp.array(v) for name, v in rewards.items()}))
+  np.testing.assert_allclose(reward, value, rtol=1e-6)
 
 
 # Observations

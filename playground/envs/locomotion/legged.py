@@ -57,8 +57,9 @@ class LeggedTask(Task):
     if config.restricted_joint_range:
       if "restricted_range" not in config.robot:
         raise ConfigError(f"env.restricted_joint_range: robot={config.robot.name} has no restricted_range.")
+      joints = {joint.name: joint for joint in spec.joints}
       for name in config.robot.restricted_range:
-        spec.joint(name).range = config.robot.restricted_range[name]
+        lookup(joints, name, "env.robot.restricted_range").range = config.robot.restricted_range[name]
     return spec
 
   def prepare_model(self, mj_model: mujoco.MjModel, config: Any) -> None:
