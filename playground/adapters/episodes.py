@@ -78,7 +78,7 @@ def load_task(task: str, overrides: Section | None = None, physics: str = "mjx")
 
   Raises:
     UnknownNameError: no such task, key or physics.
-    ConfigError: `c` for a task that draws its model anew for each episode.
+    ConfigError: `c` for a task that draws a new model for each episode.
   """
   place = lookup({"c": on_c_physics, "mjx": lambda env: env}, physics, "physics")
   env = registry.load(task, overrides=overrides)
