@@ -40,7 +40,7 @@ class _VelocityCommand:
   def bind(self, env: Any) -> None:
     low = [-high for high in self.max] if self.min is None else self.min
     if any(a > b for a, b in zip(low, self.max, strict=True)):
-      raise ConfigError(f"min={list(low)} must not be above max={list(self.max)}.")
+      raise ConfigError(f"params.max={list(self.max)} must not be below min={list(low)}.")
     self._dt: float = env.dt
 
   def reset(self, key: jax.Array) -> Info:

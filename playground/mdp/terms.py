@@ -79,7 +79,8 @@ class Term(NamedTuple):
       yield
     except ConfigError as error:
       has_key = str(error).startswith(tuple(f"env.{kind}." for kind in MODULES))  # of a term that this one reads
-      raise error if has_key else type(error)(f"{self.key}: {error}") from None
+      key = f"{self.key}." if str(error).startswith("params.") else f"{self.key}: "
+      raise error if has_key else type(error)(f"{key}{error}") from None
     except AttributeError as error:
       parts = [part for arg in args for part in (arg, getattr(arg, "env", arg), getattr(arg, "robot", arg))]
       if not any(error.obj is part for part in parts):

@@ -10,9 +10,11 @@ from typing import Any
 
 import pytest
 
+from playground.catalog import entries
 from playground.cli.main import main
 from playground.errors import CheckpointError
 from playground.mdp import observations
+from playground.text import millions
 from tests.command import Command, caller
 
 
@@ -41,7 +43,9 @@ def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
   lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
   assert lines[0] == "task suite robot observation action backend agent budget status best run of ours"
   (line,) = (line for line in lines if line.startswith("CartpoleBalance "))
-  assert line.startswith("CartpoleBalance dm_control state 5 1 jax ppo 60 M solved 998.3 (ppo, 60.9 M)")
+  best = entries()["CartpoleBalance"]
+  shown = f"solved {best.best_return:.4g} ({best.best_run}, {millions(best.best_steps or 0)} M)"
+  assert line.startswith(f"CartpoleBalance dm_control state 5 1 jax ppo 60 M {shown}")
   assert lines[-1].startswith(f"{len(lines) - 2} tasks.")
   assert command("list", "go1", "--suite", "locomotion", "--backend", "jax", "--json") == 0
   rows = json.loads(capsys.readouterr().out)

@@ -76,7 +76,7 @@ def test_times_may_be_exponential() -> None:
 def test_refusals() -> None:
   (term,) = bind("commands", {"mine": {"func": "uniform_velocity", "params": {"max": MAX, "min": [2.0, 0.0, 0.0]}}})
   with pytest.raises(
-    ConfigError, match=r"^env\.commands\.mine: min=\[2\.0, 0\.0, 0\.0\] must not be above max=\[1\.5, "
+    ConfigError, match=r"^env\.commands\.mine\.params\.max=\[1\.5, .*\] must not be below min=\[2\.0, 0\.0, 0\.0\]"
   ):
     term.instantiate(SimpleNamespace(dt=0.02))
   with pytest.raises(ConfigError, match=r"velocity\.params\.nonzero_probability=.* must be 3 numbers from 0 to 1"):
