@@ -181,3 +181,8 @@ def test_limits_on_torques_can_be_lifted() -> None:
   limited, free = build(REORIENT).mj_model, build(REORIENT, torque_limits=False).mj_model
   np.testing.assert_allclose(limited.jnt_actfrcrange[:16], np.tile([-0.2196, 0.2196], (16, 1)))
   assert limited.jnt_actfrclimited[:16].all() and not free.jnt_actfrclimited.any()
+
+
+def test_a_reward_of_another_family_may_read_fields_that_the_hand_does_not_keep() -> None:
+  plain, added = build(REORIENT), build(REORIENT, rewards__joint_acc_l2__weight=-1e-6)
+  assert set(added.derived) - set(plain.derived) == {"qacc"}
