@@ -345,6 +345,8 @@ class PushBySettingVelocity:
   interval_s: Span
 
   def bind(self, env: Any) -> None:
+    if not hasattr(env.robot, "root"):
+      raise ConfigError("the robot has no free root, whose velocity this event changes.")
     self.dt: float = env.dt
 
   def reset(self, key: jax.Array, model: mjx.Model) -> Info:

@@ -103,7 +103,7 @@ class LeggedRobot(Robot):
     """Returns the feet's phases at the start of a gait, rad; raises ConfigError if there is not one for each foot."""
     if not self._gaits:
       raise ConfigError(f"env.robot.gaits is empty or missing, so that there is no gait {name!r}.")
-    phases = lookup(self._gaits, name, "env.commands.gait.params.modes")
+    phases = lookup(self._gaits, name, "params.modes")
     if len(phases) != len(self.feet):
       raise ConfigError(f"env.robot.gaits.{name} must hold {len(self.feet)} phases, one for each foot.")
     return list(phases)

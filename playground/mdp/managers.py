@@ -246,11 +246,11 @@ class CommandManager(_Manager):
 
   def reset(self, key: jax.Array) -> Info:
     """Returns the entries of `info` that an episode starts with."""
-    return _union(term.instance.reset(k) for term, k in _with_keys(self.terms, key))
+    return _union(term.run("reset", k) for term, k in _with_keys(self.terms, key))
 
   def step(self, c: StepContext, key: jax.Array) -> Info:
     """Returns the entries of `info` for the next step."""
-    return _union(term.instance.step(c, k) for term, k in _with_keys(self.terms, key))
+    return _union(term.run("step", c, k) for term, k in _with_keys(self.terms, key))
 
 
 class EventManager(_Manager):
@@ -279,14 +279,14 @@ class EventManager(_Manager):
 
   def reset(self, key: jax.Array, model: Any) -> Info:
     """Returns the entries of `info` of the interval events that an episode starts with."""
-    return _union(term.instance.reset(k, model) for term, k in _with_keys(self.groups["interval"], key))
+    return _union(term.run("reset", k, model) for term, k in _with_keys(self.groups["interval"], key))
 
   def step(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
     """Returns the physics after the interval events, and `info`."""
     changed = dict(info)
     for term in self.groups["interval"]:
       if term.options.enabled:
-        data, entries = term.instance.step(data, changed)
+        data, entries = term.run("step", data, changed)
         changed |= entries
     return data, changed
 

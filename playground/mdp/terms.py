@@ -100,6 +100,11 @@ class Term(NamedTuple):
       instance.bind(env)
     return self._replace(instance=instance)
 
+  def run(self, method: str, *args: Any) -> Any:
+    """Calls a method of the instance; raises as `reading`."""
+    with self.reading(*args):
+      return getattr(self.instance, method)(*args)
+
   def with_settings(self, values: Mapping[str, Any]) -> "Term":
     """Returns the same term with other numbers (`weight`, `noise.<kind>`, `params.<name>`), by key in the config."""
     own = below(self.key.removeprefix("env."), values)

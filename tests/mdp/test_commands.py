@@ -138,7 +138,7 @@ def test_swing_height() -> None:
 
 def test_gaits_are_the_robots() -> None:
   np.testing.assert_allclose(gait("late").reset(KEYS[0])["phase"], [0.0, -0.5 * np.pi], rtol=1e-6)
-  with pytest.raises(UnknownNameError, match=r"gait\.params\.modes: 'wlk' is unknown.*Did you mean 'walk'"):
+  with pytest.raises(UnknownNameError, match=r"^params\.modes: 'wlk' is unknown.*Did you mean 'walk'"):
     gait("wlk")
   with pytest.raises(ConfigError, match=r"env\.robot\.gaits\.trot must hold 2 phases"):
     gait("trot")

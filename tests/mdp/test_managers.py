@@ -312,12 +312,23 @@ def test_events_that_cannot_be(entry: Any, message: str) -> None:
     EventManager({"x": entry}, None)
 
 
+def test_an_interval_event_that_does_not_fit_the_task() -> None:
+  robot = SimpleNamespace(root=1)
+  jump = {"func": "push_by_setting_velocity", "mode": "interval", "params": {"velocity": [1, 1], "interval_s": [1, 1]}}
+  events = EventManager({"jump": jump}, SimpleNamespace(dt=0.02, robot=robot))
+  data: Any = SimpleNamespace(qvel=jnp.zeros(1), replace=None)
+  with pytest.raises(ConfigError, match=r"^env\.events\.jump does not fit this task: "):
+    events.step(data, {"rng": KEY, **events.reset(KEY, None)})
+  with pytest.raises(ConfigError, match=r"^env\.events\.jump: the robot has no free root"):
+    EventManager({"jump": jump}, SimpleNamespace(dt=0.02, robot=SimpleNamespace()))
+
+
 def test_events_that_are_switched_off_do_nothing_but_are_there() -> None:
   reset = {"func": "reset_root_xy", "mode": "reset", "enabled": False, "params": {"distance": 1.0}}
   jump = {"func": "push_by_setting_velocity", "params": {"velocity": [1.0, 1.0], "interval_s": [0.02, 0.02]}}
   model_field = {"mode": "startup", "params": {"field": "body_mass"}}
   section = {"a": reset, "b": {**jump, "mode": "interval", "enabled": False}, "model_field": model_field, "c": None}
-  events = EventManager(section, SimpleNamespace(dt=0.02))
+  events = EventManager(section, SimpleNamespace(dt=0.02, robot=SimpleNamespace(root=1)))
   initial = object()
   assert events.start(KEY, None, initial) is initial
   info = {"rng": KEY, **events.reset(KEY, None)}
