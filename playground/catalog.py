@@ -38,7 +38,7 @@ class Entry:
     budget: environment steps of its tuned set.
     experiment: its experiment.
     status: solved, learning or open, of the run that got furthest, see `status`; "not measured" without a run.
-    best_return: mean return at the end of the best runs of ours, see `best_runs`.
+    best_return: mean of `reached_return` of the best runs of ours, see `best_runs`.
     best_steps: environment steps of those runs, of a chain's last stage alone.
     best_run: what trained them, see `run_name`.
   """
@@ -91,7 +91,7 @@ def measure(task: str) -> Entry:
     budget=int(config.agent.num_timesteps),
     experiment=experiment_name(task),
     status=STATUSES[min(reached, default=-1)],
-    best_return=round(fmean(float(row["final_return"]) for row in best), 3) if best else None,
+    best_return=round(fmean(map(reached_return, best)), 3) if best else None,
     best_steps=int(best[0]["steps"]) if best else None,
     best_run=run_name(best[0]) if best else "",
   )
@@ -132,15 +132,24 @@ def _stage_of(row: dict[str, str]) -> str:
 
 
 def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]:
-  """Returns our runs of a task with the agent, setting, backend and steps of the highest mean final return.
+  """Returns our runs of a task with the agent, setting, backend and steps of the highest mean of `reached_return`.
 
-  A chain counts by its last stage. Runs without pushes count only if there are no others.
+  Of several within 2 % of the highest, those with the most runs count. A chain counts by its last stage. Runs without
+  pushes count only if there are no others.
   """
   ours = our_runs(rows, task)
   groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
   for row in [row for row in ours if _NO_PUSHES not in row["setting"]] or ours:
     groups.setdefault((row["agent"], row["setting"], row["backend"], row["steps"]), []).append(row)
-  return max(groups.values(), key=lambda runs: fmean(float(row["final_return"]) for row in runs), default=[])
+  mean = lambda runs: fmean(map(reached_return, runs))
+  highest = max(map(mean, groups.values()), default=0.0)
+  close = [runs for runs in groups.values() if mean(runs) >= highest - 0.02 * abs(highest)]
+  return max(close, key=lambda runs: (len(runs), mean(runs)), default=[])
+
+
+def reached_return(row: dict[str, str]) -> float:
+  """Returns the mean return of a run's last evaluation: of the policy's mode, else of sampled actions."""
+  return float(row.get("final_mode_return") or row["final_return"])
 
 
 def run_name(row: dict[str, str]) -> str:
