@@ -120,6 +120,9 @@ def test_globs(glob: str, names: list[str]):
     "seed=glob(*)": "seed=glob(*): seed has no options that a glob could stand for.",
     "env=CartpoleBalance,CartpoleSwngup": "env=CartpoleSwngup does not exist",
     "env=[1": "'env=[1' is not an override",
+    "seed=range(0,2,0)": "seed=range(0,2,0) has no values: range() arg 3 must not be zero.",
+    "seed=1,2 seed=3,4": "seed=1,2 seed=3,4: give all values of seed in one list.",
+    "seed=0,1 seed=2": "seed=0,1 seed=2: give all values of seed in one list.",
   }.items(),
 )
 def test_what_is_refused(folder: Path, line: str, message: str):
@@ -147,10 +150,13 @@ def test_what_is_refused(folder: Path, line: str, message: str):
     "params: {seed: []}": "sweep=bad: params.seed=[] must be a value or a list of values.",
     "params: {agent: {num_envs: 1}}": "sweep=bad: params.agent={num_envs: 1} must be a value or a list of values.",
     "params: {env: CartpoleBalanc}": "env=CartpoleBalanc does not exist",
+    "jobs: ['seed=\"1']": "sweep=bad: its job 'seed=\"1' cannot be read: No closing quotation.",
+    "params: &a {seed: *a}": "sweep=bad: its file cannot be read: ",
+    "params: {seed: é}": "sweep=bad: its file cannot be read: ",
   }.items(),
 )
 def test_files_that_are_no_sweep(folder: Path, text: str, message: str):
-  (folder / "bad.yaml").write_text(text)
+  (folder / "bad.yaml").write_text(text, encoding="latin-1")
   with pytest.raises(ConfigError) as caught:
     expand(["sweep=bad"])
     listed_jobs(["sweep=bad"])

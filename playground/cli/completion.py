@@ -57,7 +57,7 @@ def candidates(line: str, parser: argparse.ArgumentParser) -> list[str]:
     parser: of the program `playground`, with its commands.
   """
   words = _split(line)
-  if not words:
+  if len(words) + line[-1:].isspace() < 2:
     return []
   program, *words, current = [Path(words[0]).name, *words[1:], *([""] if line[-1:].isspace() else [])]
   if program == "playground" and not words:

@@ -147,6 +147,7 @@ def _parser() -> argparse.ArgumentParser:
   pretrained.add_argument(
     "--note", default="", metavar="TEXT", help="with --add: a remark on the training, for its card"
   )
+  pretrained.add_argument("--replace", action="store_true", help="with --add: replace the policy of the same task")
   sweep = add("sweep", _sweep, "Show a sweep, collect its results, or run its missing jobs.")
   sweep.add_argument(
     "action",
@@ -236,7 +237,7 @@ def _view(args: argparse.Namespace) -> int:
 def _pretrained(args: argparse.Namespace) -> int:
   from playground.cli import pretrained
 
-  return pretrained.add_policy(args.add, args.note) if args.add else pretrained.show_policies()
+  return pretrained.add_policy(args.add, args.note, args.replace) if args.add else pretrained.show_policies()
 
 
 def _sweep(args: argparse.Namespace) -> int:

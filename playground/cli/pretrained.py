@@ -37,19 +37,20 @@ def show_policies(console: Console | None = None) -> int:
   return 0
 
 
-def add_policy(path: str, note: str = "") -> int:
+def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   """Exports a run's newest policy, measures it in C MuJoCo and copies it, with its card, into the package.
 
   Args:
     path: a run directory.
     note: a remark on the training for the card, such as that the run was stopped early.
+    replace: whether the policy of the same task is replaced.
 
   Returns:
     The exit code, 0.
 
   Raises:
     PlaygroundError: no such run, or a policy without an ONNX form.
-    ConfigError: the run has not been evaluated.
+    ConfigError: the run has not been evaluated, or the package has a policy of its task.
   """
   newest = find_checkpoints(path)[0]  # of a chain, that of its last stage
   run, steps = RunDirectory.open(newest.parents[1]), int(newest.name)
@@ -57,6 +58,12 @@ def add_policy(path: str, note: str = "") -> int:
   for name in ("overrides.yaml", "manifest.json", "metrics.csv"):
     if not (run.path / name).is_file():
       raise ConfigError(f"{run.path / name} is missing: only a whole run can be added.")
+  task = str(run.config["choices"]["env"])
+  if (old := cards().get(task)) and not replace:
+    raise ConfigError(
+      f"There is a policy of {task} already: {old['agent']}, {millions(old['steps'])} M steps, return "
+      f"{old['c_mujoco']['return']:g} in C MuJoCo. --replace replaces it."
+    )
   export_run(path)
   result = run.path / f"export/play_step_{steps:012d}_seed_0.json"
   if read_json(result).get("episodes") != _EPISODES:
@@ -70,7 +77,7 @@ def add_policy(path: str, note: str = "") -> int:
   as_set, other = ("mode", "sampled") if config["agent"]["deterministic_eval"] else ("sampled", "mode")
   returns = {as_set: row[RETURN], other: row.get(OTHER_RETURNS[other], math.nan)}
   card = {
-    "task": config["choices"]["env"],
+    "task": task,
     "agent": config["choices"]["agent"],
     "status": _status(scores),
     "steps": steps,
@@ -95,7 +102,7 @@ def add_policy(path: str, note: str = "") -> int:
       "falls": round(scores.get("episode_fall", 0.0) * _EPISODES),
     },
   }
-  folder = add(run.path, card["task"], card)
+  folder = add(run.path, task, card)
   size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
   print(f"{folder}: {size / 1e6:.1f} MB")
   return 0

@@ -56,6 +56,10 @@ def expand(overrides: Sequence[str]) -> list[str]:
   keys = {override.key_or_group for override in given}
   listed = [parse_with_hydra(text) for override in named for text in _read(str(override.value()))[0]]
   chosen = [*(o for o in listed if o.key_or_group not in keys), *(o for o in given if o not in named)]
+  for override in chosen:
+    twice = [str(o.input_line) for o in chosen if o.key_or_group == override.key_or_group]
+    if override.is_sweep_override() and len(twice) > 1:
+      raise ConfigError(f"{' '.join(twice)}: give all values of {override.key_or_group} in one list.")
   return [*_checked(chosen, roots), *filter(is_hydras, overrides)]
 
 
@@ -71,7 +75,11 @@ def listed_jobs(overrides: Sequence[str]) -> list[list[str]]:
   found = []
   for override in (override for override in given if override.key_or_group == "sweep"):
     for text in _read(str(override.value()))[1]:
-      parsed = [parse_with_hydra(part) for part in shlex.split(text)]
+      try:
+        parts = shlex.split(text)
+      except ValueError as error:
+        raise ConfigError(f"{override.input_line}: its job {text!r} cannot be read: {error}.") from None
+      parsed = [parse_with_hydra(part) for part in parts]
       lines = _checked([o for o in parsed if o.key_or_group not in keys], config_roots())
       if whole := [*split(lines)[0], *filter(is_of_command, lines)]:
         raise ConfigError(f"{override.input_line}: {whole[0]} in its job {text!r} is of the whole sweep.")
@@ -165,7 +173,10 @@ def _values(text: str) -> list[str]:
     return [text]
   if not override.is_discrete_sweep():  # an interval: a search draws from it
     return []
-  return [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+  try:
+    return [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+  except ValueError as error:
+    raise ConfigError(f"{text} has no values: {error}.") from None
 
 
 def _checked(overrides: Iterable[HydraOverride], roots: Sequence[Path]) -> list[str]:
@@ -200,7 +211,7 @@ def _read(name: str) -> tuple[list[str], list[str]]:
     raise UnknownNameError(f"sweep={name} does not exist: choose from {', '.join(known)}.{nearest(name, known)}")
   try:
     content = OmegaConf.to_container(OmegaConf.load(shipped("sweeps") / f"{name}.yaml"))
-  except (YAMLError, OmegaConfBaseException) as error:
+  except (YAMLError, OmegaConfBaseException, ValueError, RecursionError, OSError) as error:
     raise ConfigError(f"sweep={name}: its file cannot be read: {first_line(error)}.") from None
   if not isinstance(content, Mapping) or not content or not set(content) <= {"params", "jobs"}:
     raise ConfigError(f"sweep={name}: its file must hold `params:` or `jobs:` or both, and nothing else.")

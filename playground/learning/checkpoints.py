@@ -358,6 +358,8 @@ def find_checkpoints(path: str | Path) -> list[Path]:
     CheckpointError: there is no checkpoint.
   """
   path = Path(os.path.expanduser(path))
+  if "checkpoints" in Path.cwd().parts:  # a checkpoint may be named from inside its run's folder
+    path = Path(os.path.abspath(path))
   if path.name == BEST and path.parent.name == "checkpoints" and path.parent.is_dir():
     return [_linked(path)]
   if not path.exists():

@@ -270,6 +270,12 @@ class PPOConfig(OnPolicyConfig):
         f"agent.num_envs={self.num_envs} does not divide {product} = {self.batch_size * self.num_minibatches}: choose "
         "sizes so that every environment gives the same number of trajectories."
       )
+    low, high = self.min_learning_rate, self.max_learning_rate
+    if self.desired_kl is not None and not low <= self.learning_rate <= high:
+      raise ConfigError(
+        f"agent.learning_rate={self.learning_rate:g} must be from agent.min_learning_rate={low:g} to "
+        f"agent.max_learning_rate={high:g}, between which agent.desired_kl adapts it."
+      )
     super().check(num_devices)
 
 

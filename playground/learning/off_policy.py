@@ -69,8 +69,8 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
   def __init__(self, env: Env, config: ConfigT, networks: NetworksT):
     if config.prefill_updates * config.num_envs * env.action_repeat >= config.num_timesteps:
       raise ConfigError(
-        f"agent.num_timesteps={config.num_timesteps} is over before agent.min_replay_size={config.min_replay_size} "
-        "transitions are collected, so nothing would be learned."
+        f"{config.num_timesteps:,} environment steps are over before agent.min_replay_size={config.min_replay_size} "
+        "transitions are collected, so nothing would be learned: train for longer."
       )
     shape = lambda *size: jax.ShapeDtypeStruct(size, jnp.float32)
     self._inside = groups_inside(env, networks.obs_sizes)

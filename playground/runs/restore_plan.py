@@ -2,9 +2,9 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -20,6 +20,9 @@ from playground.learning.trainer import Settings, Trainer, TrainState
 from playground.pretrained import check_task, is_pretrained, locate
 from playground.pytree import PyTree
 from playground.runs.run_dir import RunDirectory
+from playground.text import format_value
+
+_ONLY_AT_FIRST = ("value_dtype", "policy_output_scale")  # keys of networks that their weights do not depend on
 
 
 def weights_of(path: str | Path) -> Checkpoint:
@@ -83,9 +86,7 @@ class RestorePlan:
       except NoCheckpointError:
         if run_dir.status:  # without a status, a chain made the run and starts it now
           plan.notices.append(f"{config.resume} stopped before its first checkpoint: starting from the beginning.")
-        # Only a chain sets this in the `config` of a resumed run; the chain may have been moved.
-        weights = config.init_from or _first_policy(run_dir)
-        plan.weights = weights_of(weights) if weights else None
+        plan.start_over(config)
       return plan
     assert config.run_dir is not None, "composing names one"
     if config.resolved["run_dir"] is not None:  # else `create` numbers the name if it is taken
@@ -93,6 +94,17 @@ class RestorePlan:
     if config.init_from is not None:
       return cls(weights=weights_of(config.init_from))
     return cls()
+
+  def start_over(self, config: RunConfig) -> None:
+    """Plans that a resumed run starts from the beginning: from the weights that it started from, without checkpoints.
+
+    Raises:
+      CheckpointError: the weights are missing or damaged.
+    """
+    assert self.run_dir is not None, "only a resumed run can start over"
+    # Only a chain sets this in the `config` of a resumed run; the chain may have been moved.
+    weights = config.init_from or _first_policy(self.run_dir)
+    self.checkpoints, self.weights = [], weights_of(weights) if weights else None
 
   @contextlib.contextmanager
   def locked(self, config: RunConfig) -> Iterator[Self]:
@@ -126,9 +138,12 @@ class RestorePlan:
     if not self.checkpoints and self.weights is None:
       return
     if self.weights is not None:
-      theirs = self.weights.meta["config"].get("agent", {}).get("name")
-      if theirs != name:
-        raise CheckpointError(f"{self.weights.path} was trained by {theirs}: agent={name} cannot start from it.")
+      theirs = self.weights.meta["config"].get("agent", {})
+      if theirs.get("name") != name:
+        raise CheckpointError(
+          f"{self.weights.path} was trained by {theirs.get('name')}: agent={name} cannot start from it."
+        )
+      _check_networks(self.weights.path, theirs, dataclasses.asdict(trainer.config))
       self.policy = self.weights.restore("policy", trainer.policy_shape())
       source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
       self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is fresh.")
@@ -156,6 +171,18 @@ class RestorePlan:
       return
 
 
+def _check_networks(path: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
+  """Raises CheckpointError where a checkpoint's weights would compute something else in these agents' networks."""
+  for key in ("normalize_observations", *(f"network.{name}" for name in ours["network"] if name not in _ONLY_AT_FIRST)):
+    *section, name = key.split(".")
+    there, here = (side.get(section[0], {}) if section else side for side in (theirs, ours))
+    if name in there and format_value(there[name]) != format_value(here[name]):
+      raise CheckpointError(
+        f"{path} was trained with agent.{key}={format_value(there[name])}: a run with agent.{key}="
+        f"{format_value(here[name])} cannot start from it."
+      )
+
+
 def _first_policy(run_dir: RunDirectory) -> str | None:
   """Returns the path of the policy that a run starts from; for a stage of a chain, where the chain is now.
 
@@ -163,7 +190,10 @@ def _first_policy(run_dir: RunDirectory) -> str | None:
     CheckpointError: the stage before it is not finished.
   """
   path, chain = run_dir.config["init_from"], run_dir.path.parent
+  number = lambda stage: int(prefix) if (prefix := stage.partition("_")[0]).isdecimal() else 0
   if path is None or not (chain / "config.yaml").is_file() or not (chain / Path(path).name).is_dir():
+    return path
+  if number(Path(path).name) >= number(run_dir.path.name):  # a stage of another chain
     return path
   before = RunDirectory(chain / Path(path).name)
   if before.status.get("status") != "finished":

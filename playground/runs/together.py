@@ -61,7 +61,8 @@ def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explo
     except Interrupted as interrupt:
       print(f"Interrupted by {interrupt}.")
       return exit_code(interrupt.signum)
-  return exit_code(interrupts.signum) if interrupts.signum is not None and any(codes) else max(codes, default=0)
+  unfinished = any(codes) or len(codes) < len(groups)
+  return exit_code(interrupts.signum) if interrupts.signum is not None and unfinished else max(codes, default=0)
 
 
 def _groups(
@@ -103,9 +104,10 @@ def _train_group(
     plans = [runs.enter_context(RestorePlan.find(config).locked(config)) for config in configs]
     if population:
       steps = _shared_steps(plans)
-      for plan in plans:
+      for config, plan in zip(configs, plans, strict=True):
         if plan.checkpoints and not steps:
           plan.notices.append("No step has a checkpoint of all runs: the population starts from the beginning.")
+          plan.start_over(config)
         plan.checkpoints = [path for path in plan.checkpoints if path.name in steps]
     training = prepare(configs, plans, hardware, together=True)
     if len({plan.update for plan in plans}) > 1:  # a checkpoint is damaged, and its run is behind the others

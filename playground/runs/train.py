@@ -280,7 +280,9 @@ def say_where(run_dir: RunDirectory) -> None:
     "checkpoints": run_dir.checkpoints,
   }
   if (best := run_dir.checkpoints / BEST).is_dir():
-    places["best"] = f"{best} (return {format_return(summary['best_return'])} after {summary['best_step']:,} steps)"
+    known = summary["best_step"] is not None  # metrics.csv may have been removed
+    score = f" (return {format_return(summary['best_return'])} after {summary['best_step']:,} steps)" if known else ""
+    places["best"] = f"{best}{score}"
   for name, path in places.items():
     print(f"  {name:12}{path}")
   videos = sorted(run_dir.videos.glob("*.mp4"))

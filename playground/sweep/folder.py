@@ -240,6 +240,10 @@ class SweepDirectory:
     """The group of the sweep's runs in W&B."""
     return f"{self.name}/{self.path.resolve().name}"
 
+  def in_cwd(self) -> contextlib.AbstractContextManager[None]:
+    """Changes to `cwd` for a while: relative paths in overrides mean what they mean to the jobs."""
+    return contextlib.chdir(self.cwd) if self.cwd.is_dir() else contextlib.nullcontext()
+
   @property
   def stop_file(self) -> Path:
     """Returns the stop file: while it exists, workers stop their jobs, on any machine."""

@@ -54,7 +54,8 @@ class LocalLauncher:
     self, sweep: SweepDirectory, config: LocalConfig, command: Sequence[str] = COMMAND, slots: Sequence[Slot] = ()
   ):
     """See `runner.Launcher`; `slots` replace those of `config` on this machine."""
-    self.check(config, sweep.jobs)
+    with sweep.in_cwd():
+      self.check(config, sweep.jobs)
     self._mps = MultiProcessService(sweep.path) if config.mps else None
     cores = sorted(os.sched_getaffinity(0))
     self.slots = slots or make_slots(visible_gpus()[: config.gpus], config.slots_per_gpu, cores, config.cores_per_job)

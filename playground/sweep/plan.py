@@ -2,6 +2,7 @@
 
 import os
 import re
+import sys
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 from playground import config as configs
 from playground.config import RunConfig
 from playground.config.sweep_options import GridConfig, SweepSettings
-from playground.errors import ConfigError
+from playground.errors import CheckpointError, ConfigError
 from playground.files import numbered
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.runner import launcher_class
@@ -58,7 +59,7 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
       for number, (job, config) in enumerate(zip(combinations, composed, strict=True))
     ]
   lines = [line for line in lines if not configs.is_of_command(line)]
-  found = _find(chosen.sweep_dir, name, lines, jobs)
+  found = _find(chosen.sweep_dir, name, settings, lines, jobs)
   if found is not None:
     return found, chosen
   launcher_class(chosen.launcher).check(chosen.launcher, jobs)
@@ -93,7 +94,9 @@ def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
   return "_".join(names[:2]) + (f"_and_{len(names) - 2}_more" if len(names) > 2 else "")
 
 
-def _find(path: str | None, name: str, lines: Sequence[str], jobs: Sequence[Job]) -> SweepDirectory | None:
+def _find(
+  path: str | None, name: str, settings: Sequence[str], lines: Sequence[str], jobs: Sequence[Job]
+) -> SweepDirectory | None:
   """Returns an earlier sweep of the same jobs; None without one.
 
   Raises:
@@ -103,23 +106,29 @@ def _find(path: str | None, name: str, lines: Sequence[str], jobs: Sequence[Job]
     if not (Path(os.path.expanduser(path)) / "sweep.yaml").exists():
       return None
     sweep = SweepDirectory.open(path)
-    if not _same(sweep, lines, jobs):
+    if not _same(sweep, settings, lines, jobs):
       raise ConfigError(
         f"sweep_dir={path} holds a sweep of other jobs ({' '.join(sweep.command)}): name another folder, or give the "
         "same command to go on with it."
       )
     return sweep
   for folder in sorted((ROOT / name).glob("*/sweep.yaml"), reverse=True):
-    sweep = SweepDirectory.open(folder.parent)
-    if _same(sweep, lines, jobs):
+    try:
+      sweep = SweepDirectory.open(folder.parent)
+    except CheckpointError as error:
+      print(f"{error} It is passed over.", file=sys.stderr)
+      continue
+    if _same(sweep, settings, lines, jobs):
       done = all(state.status == "finished" for state in sweep.states().values())
       return None if done and jobs else sweep
   return None
 
 
-def _same(sweep: SweepDirectory, lines: Sequence[str], jobs: Sequence[Job]) -> bool:
-  ours = [job.overrides for job in jobs]
-  return sweep.lines == list(lines) and (not jobs or [job.overrides for job in sweep.jobs] == ours)
+def _same(sweep: SweepDirectory, settings: Sequence[str], lines: Sequence[str], jobs: Sequence[Job]) -> bool:
+  """Returns whether a sweep has the same search, lines and jobs, the jobs in any order (`shuffle`)."""
+  search = lambda texts: [text for text in texts if text.startswith("search=") and text != "search=grid"]
+  ours, theirs = (sorted(job.overrides for job in side) for side in (jobs, sweep.jobs))
+  return search(sweep.settings) == search(settings) and sweep.lines == list(lines) and (not jobs or theirs == ours)
 
 
 def settings_of(sweep: SweepDirectory, extra: Sequence[str] = ()) -> SweepSettings:

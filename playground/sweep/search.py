@@ -88,7 +88,8 @@ class Search:
     trial = self._study.ask(self._drawn)
     overrides = [*self._fixed, *(f"{key}={value}" for key, value in trial.params.items())]
     try:
-      (config,) = configs.compose_all([overrides])
+      with self._sweep.in_cwd():
+        (config,) = configs.compose_all([overrides])
     except PlaygroundError as error:
       self._refused += 1
       self._study.tell(trial, state=TrialState.FAIL)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from playground.config import compose
 from playground.config.sweep_options import LocalConfig, TogetherConfig
-from playground.errors import ConfigError
+from playground.errors import ConfigError, PlaygroundError
 from playground.runs.population import population_of
 from playground.runs.programs import program_of
 from playground.sweep.folder import Job, SweepDirectory
@@ -49,8 +49,13 @@ class TogetherLauncher(LocalLauncher):
     for job in jobs:
       folder = self._sweep.folder(job)
       if folder.state().status != "finished" and not folder.locked():
-        config = compose([f"resume={quoted(folder.path)}"] if folder.begun else job.overrides)
-        programs.setdefault(program_of(config) or job.name, []).append(job)
+        lines = [f"resume={quoted(folder.path.absolute())}"] if folder.begun else job.overrides
+        try:
+          with self._sweep.in_cwd():
+            program = program_of(compose(lines))
+        except PlaygroundError:  # the job fails alone, and its log says why
+          program = None
+        programs.setdefault(program or job.name, []).append(job)
     share = math.ceil(sum(map(len, programs.values())) / len(self.slots))  # with it no slot stays empty
     for same in programs.values():
       size = min(self._max_agents, share)

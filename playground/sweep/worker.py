@@ -164,7 +164,7 @@ class Worker:
   def _outcome(self, folder: JobFolder, code: int, why: str) -> tuple[str, str]:
     """Returns a job's status and its reason, in words."""
     run = folder.run.status if folder.run.status != self._before[folder] else {}  # else of an earlier start
-    if code == 0 or (len(self._records) > 1 and run.get("status") == "finished"):
+    if run.get("status") == "finished" or (code == 0 and len(self._records) == 1):
       return "finished", ""
     if why == "timeout":
       return "timeout", f"took longer than launcher.timeout={self._timeout:g} s"

@@ -44,7 +44,9 @@ def test_candidates(command: Command, capsys: pytest.CaptureFixture[str], line: 
   assert all(word.startswith(line.split()[-1]) for word in found) or line.endswith(" ")
 
 
-@pytest.mark.parametrize("line", ["", "playground-bench ", "playground-run 'env=", "playground nothing ", "ls "])
+@pytest.mark.parametrize(
+  "line", ["", "playground", "'\"", "playground-bench ", "playground-run 'env=", "playground nothing ", "ls "]
+)
 def test_nothing_to_complete(command: Command, capsys: pytest.CaptureFixture[str], line: str):
   assert command("completion", "query", line) == 0
   assert not capsys.readouterr().out.strip()

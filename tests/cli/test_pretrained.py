@@ -43,8 +43,10 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
 
   header, *rows = (metrics := run / "metrics.csv").read_text().splitlines(keepends=True)
   metrics.write_text("".join([header, *(row for row in rows if row.startswith("0,"))]))  # stopped before the next one
-  assert add_policy(str(run)) == 0
+  with pytest.raises(ConfigError, match=rf"There is a policy of {folder.name} already: ppo, .* --replace replaces it"):
+    add_policy(str(run))
+  assert add_policy(str(run), replace=True) == 0
   assert yaml.safe_load((folder / "card.yaml").read_text())["training"]["steps"] == 0
   metrics.write_text(header)
   with pytest.raises(ConfigError, match="was not evaluated before its newest checkpoint"):
-    add_policy(str(run))
+    add_policy(str(run), replace=True)

@@ -50,6 +50,15 @@ def test_the_learning_rate_has_limits() -> None:
   assert float(adapted_rate(jnp.float32(1e-3), jnp.float32(1e-3), config)) == pytest.approx(1.1e-3)
 
 
+@pytest.mark.parametrize("rates", [(0.1, 1e-3, 0.01), (1e-5, 1.0, 1e-2), (1e-2, 1e-3, 1e-1)])
+def test_an_adapted_rate_begins_within_its_limits(rates: tuple[float, float, float]) -> None:
+  low, rate, high = rates
+  config = dataclasses.replace(SMALL_PPO, learning_rate=rate, min_learning_rate=low, max_learning_rate=high)
+  config.check(1)
+  with pytest.raises(ConfigError, match=r"agent\.learning_rate=.* must be from agent\.min_learning_rate="):
+    dataclasses.replace(config, desired_kl=0.01).check(1)
+
+
 def test_the_divergence_is_that_of_the_two_gaussians(networks: ActorCritic) -> None:
   raw = lambda mean, std: jnp.array([[mean, jnp.log(jnp.expm1(std - 0.001))]])  # as Brax's distribution reads them
   one = ActorCritic(2, 1, dataclasses.replace(SMALL_PPO.network, value_obs_key="state"))

@@ -287,5 +287,5 @@ def test_sizes_that_do_not_go_together_are_refused(change: dict[str, Any], words
 
 
 def test_a_budget_that_only_fills_the_buffer_is_refused() -> None:
-  with pytest.raises(ConfigError, match=r"agent.num_timesteps=64 is over before agent.min_replay_size=64"):
+  with pytest.raises(ConfigError, match=r"64 environment steps are over before agent.min_replay_size=64"):
     point_trainer(dataclasses.replace(SMALL_SAC, num_timesteps=64))

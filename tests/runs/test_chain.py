@@ -14,6 +14,7 @@ import jax
 import mujoco
 import pandas as pd
 import pytest
+import yaml
 
 from playground import registry
 from playground.config import RunConfig, compose, config_roots
@@ -24,6 +25,7 @@ from playground.physics.backend import PhysicsData
 from playground.runs import chain as chain_module
 from playground.runs import train as train_module
 from playground.runs.callbacks import RunCallbacks
+from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.dummy import Point
@@ -243,6 +245,17 @@ def test_a_stage_is_not_resumed_before_the_one_it_starts_from(whole: Path, tmp_p
     resume(path / "2_far")
 
 
+def test_a_chain_may_start_from_a_stage_of_another_of_its_kind(whole: Path, tmp_path: Path) -> None:
+  """Whose folder has the name of a later stage, or of its own first one."""
+  path = shutil.copytree(whole, tmp_path / "another")
+  config = yaml.safe_load((path / "1_near/config.yaml").read_text())
+  for stage in ("1_near", "2_far"):
+    (path / "1_near/config.yaml").write_text(yaml.safe_dump({**config, "init_from": str(whole / stage)}))
+    shutil.rmtree(path / "1_near/checkpoints", ignore_errors=True)
+    plan = RestorePlan.find(compose([f"resume={path / '1_near'}"]))
+    assert plan.weights is not None and plan.weights.path == find_checkpoints(whole / stage)[0]
+
+
 def test_a_finished_chain_is_not_resumed(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
   before = (whole / "status.json").read_bytes()
   assert resume(whole) == 0
@@ -314,7 +327,7 @@ def test_a_stage_whose_camera_is_not_there(
 
 def test_weights_that_do_not_fit(whole: Path, composed: Callable[..., RunConfig], tmp_path: Path) -> None:
   where = f"run_dir={tmp_path / 'chain'}"
-  with pytest.raises(ValueError, match=r"Stage near of the chain: .*2_far/checkpoints/.* does not fit this run"):
+  with pytest.raises(ValueError, match=r"Stage near of the chain: .*2_far/checkpoints/.* was trained with agent"):
     train(composed(f"init_from={whole}", "agent.network.policy_hidden_layer_sizes=[16,8]", where))
   assert not (tmp_path / "chain").exists()
 

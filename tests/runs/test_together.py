@@ -2,7 +2,9 @@
 
 import errno
 import itertools
+import os
 import shutil
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -16,8 +18,10 @@ import pytest
 from playground.config import RunConfig, compose
 from playground.learning.checkpoints import find_checkpoints
 from playground.learning.population import Population
+from playground.runs import together
 from playground.runs.callbacks import RunCallbacks
 from playground.runs.programs import program_of
+from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.together import Member, _groups, train_together  # pyright: ignore[reportPrivateUsage]
 from playground.runs.train import train
@@ -183,6 +187,17 @@ def test_a_population_goes_on_from_the_step_that_all_have(tmp_path: Path, monkey
     pd.testing.assert_frame_equal(theirs, table.filter(regex="^(?!time/)"), check_like=True)
 
 
+def test_a_stop_between_two_groups_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  groups = [saved(tmp_path / "a", [400], "preempted"), saved(tmp_path / "b", [500], "preempted")]
+
+  def end_with_a_signal(*_: Any) -> int:
+    os.kill(os.getpid(), signal.SIGTERM)
+    return 0
+
+  monkeypatch.setattr(together, "_train_group", end_with_a_signal)
+  assert train_together(groups) == 128 + signal.SIGTERM
+
+
 POPULATION = Population(1, {}, 0)
 
 
@@ -209,6 +224,18 @@ def test_a_run_that_is_behind_leaves_its_population(tmp_path: Path, lost: str) -
   assert _groups(still_near, POPULATION) == [(still_near, POPULATION)]
   at_first_save = [ahead[0], saved(tmp_path / "e", [], "running")]
   assert _groups(at_first_save, POPULATION) == [(at_first_save, POPULATION)]
+
+
+def test_a_population_that_starts_over_starts_from_the_same_weights(tmp_path: Path, group: Path) -> None:
+  """One was killed before its first checkpoint, the other after it."""
+  run = RunDirectory.create(tmp_path / "run", compose([*BUDGET, f"init_from={group / 'a'}"]).resolved)
+  (run.checkpoints / f"{400:012d}").mkdir(parents=True)
+  config = compose([f"resume={run.path}"])
+  plan = RestorePlan.find(config)
+  assert plan.checkpoints and plan.weights is None
+  plan.start_over(config)
+  assert plan.weights is not None and not plan.checkpoints
+  assert plan.weights.path == find_checkpoints(group / "a")[0]
 
 
 def test_a_run_from_weights_is_not_joined_with_one_without(tmp_path: Path, group: Path) -> None:

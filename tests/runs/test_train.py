@@ -31,7 +31,7 @@ from playground.learning.loop import schedule
 from playground.runs import train as train_module
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
-from playground.runs.train import cut_short, train
+from playground.runs.train import cut_short, say_where, train
 from tests.processes import WITHOUT_WARP
 from tests.runs.helpers import TASK, resume, truncate
 
@@ -275,6 +275,14 @@ def test_damaged_metrics_are_rebuilt(whole: Path, copy: Path, capsys: pytest.Cap
   assert_same_result(copy, whole)
 
 
+def test_a_best_policy_whose_metrics_are_gone_is_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  run = RunDirectory(copy)
+  run.write_summary({"status": "finished", "final_return": 1.0, "steps": 1, "best_step": None, "best_return": None})
+  (copy / "checkpoints/best").mkdir(exist_ok=True)
+  say_where(run)
+  assert f"best        {copy / 'checkpoints/best'}\n" in capsys.readouterr().out
+
+
 # What the system denies
 
 
@@ -428,6 +436,27 @@ def test_weights_of_another_task_are_refused(whole: Path, tmp_path: Path, refuse
   assert f"{find_checkpoints(whole)[0]} does not fit this run: .params.policy" in sentence
   assert "float32[5, 16] there and float32[48, 16] here" in sentence
   assert not (tmp_path / "run").exists(), "nothing was compiled or begun"
+
+
+@pytest.mark.parametrize(
+  ("override", "there"), [("agent.network.activation=relu", "swish"), ("agent.normalize_observations=false", "true")]
+)
+def test_weights_of_another_network_are_refused(
+  override: str, there: str, whole: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+  """Of the same shapes, which would compute something else."""
+  key, _, here = override.partition("=")
+  sentence = refused(*TASK, override, f"init_from={whole}", f"run_dir={tmp_path / 'run'}")
+  assert f"was trained with {key}={there}: a run with {key}={here} cannot start from it." in sentence
+
+
+def test_a_checkpoint_may_be_named_from_where_it_lies(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  newest, *_ = find_checkpoints(whole)
+  monkeypatch.chdir(newest.parent)
+  assert find_checkpoints(newest.name) == [newest] and find_checkpoints(".") == find_checkpoints(whole)
+  assert find_checkpoints("best") == find_checkpoints(whole / "checkpoints/best")
+  monkeypatch.chdir(newest)
+  assert find_checkpoints(".") == [newest]
 
 
 @pytest.mark.parametrize("source", ["run", "checkpoint", "best"])

@@ -63,6 +63,26 @@ def test_the_same_command_finds_its_sweep_again(here: Path) -> None:
     plan(["seed=4,5", f"sweep_dir={first.path}"])
 
 
+def test_a_search_does_not_take_a_grid_for_its_own(here: Path) -> None:
+  line = "agent.learning_rate=1e-3,1e-4"
+  first, _ = plan([line])
+  search = [line, "search=optuna", "search.trials=2"]
+  assert (begun := plan(search)[0]).path != first.path
+  assert plan(search)[0].path == begun.path
+
+
+def test_a_shuffled_sweep_goes_on(here: Path) -> None:
+  first, _ = plan(["seed=shuffle(range(6))"])
+  assert all(plan(["seed=shuffle(range(6))"])[0].path == first.path for _ in range(3))
+
+
+def test_a_damaged_sweep_does_not_stop_another(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  first, _ = plan(["seed=1,2"])
+  (first.path / "sweep.yaml").write_text("a: 1\n")
+  assert plan(["seed=1,2"])[0].path != first.path
+  assert f"{first.path / 'sweep.yaml'} is damaged: 'name'. It is passed over." in capsys.readouterr().err
+
+
 def test_what_a_job_needs(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setattr(local, "visible_gpus", list)  # with one, two are refused
   sweep, _ = plan(["hardware=cpu,gpu", "sweep_dir=a"])

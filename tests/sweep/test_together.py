@@ -10,8 +10,10 @@ import pandas as pd
 import pytest
 
 from playground.cli.run import main
+from playground.config import compose
 from playground.config.sweep_options import TogetherConfig
 from playground.errors import ConfigError
+from playground.runs.run_dir import RunDirectory
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import LocalLauncher, Slot
 from playground.sweep.together import TogetherLauncher
@@ -117,6 +119,28 @@ def test_one_process_does_the_jobs_of_a_group(tmp_path: Path) -> None:
   assert first.record["job_pid"] == second.record["job_pid"]
   assert "trained together with 000" in second.log.read_text()
   assert list(pd.read_csv(sweep.path / "sweep.csv")["final_return"]) == [2.0, 3.0]
+
+
+def test_a_process_that_trained_nothing_finished_nothing(tmp_path: Path) -> None:
+  sweep = make(tmp_path / "sweep", "seed=1", "seed=2")
+  assert run(sweep, "launcher=together", command=(sys.executable, "-c", "print('nothing')")) == 2
+  assert [state.status for state in sweep.states().values()] == ["failed"] * 2
+  assert {sweep.folder(job).record["reason"] for job in sweep.jobs} == {"exit code 0: nothing"}
+
+
+def test_jobs_are_composed_where_they_run(
+  tmp_path: Path, started: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+  monkeypatch.chdir(tmp_path)
+  store = RunDirectory.create(tmp_path / "mine", compose(TASK).resolved).checkpoints
+  (store / f"{400:012d}").mkdir(parents=True)
+  sweep = make(tmp_path / "sweep", "seed=1 init_from=mine", "seed=2 init_from=mine", "seed=3")
+  RunDirectory(sweep.folder(sweep.jobs[2]).path).path.mkdir(parents=True)
+  (sweep.folder(sweep.jobs[2]).path / "config.yaml").write_text("a: 1\n")  # of no run: the job fails alone
+  monkeypatch.chdir("/")
+  launcher = TogetherLauncher(sweep, TogetherConfig(cores_per_job=1000))
+  assert all(launcher.start(job) for job in sweep.jobs)
+  assert started == [["000", "001"], ["002"]]
 
 
 LOST = f"""
