@@ -28,7 +28,7 @@ from playground.runs.interrupts import Interrupts, exit_code
 from playground.runs.plots import plot_learning_curve
 from playground.runs.progress import format_return
 from playground.runs.provenance import process_age_s
-from playground.runs.restore_plan import RestorePlan, weights_of
+from playground.runs.restore_plan import RestorePlan, networks_of, weights_of
 from playground.runs.run_dir import RETURNS, RunDirectory
 from playground.settings import Plain, Section
 
@@ -108,6 +108,7 @@ def _check(config: RunConfig) -> None:
       size = env.observation_size
       sizes: dict[str, object] = {"agent.name": stage.agent_name, "size of the action": env.action_size}
       sizes |= {f"size of observation {k!r}": v for k, v in (size.items() if isinstance(size, dict) else [("", size)])}
+      sizes |= networks_of(stage.resolved["agent"])
       sizes |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(trainer.policy_shape())}
       if before is None and config.init_from is not None:
         plan = RestorePlan(weights=weights_of(config.init_from))

@@ -143,7 +143,13 @@ class RestorePlan:
         raise CheckpointError(
           f"{self.weights.path} was trained by {theirs.get('name')}: agent={name} cannot start from it."
         )
-      _check_networks(self.weights.path, theirs, dataclasses.asdict(trainer.config))
+      there, here = networks_of(theirs), networks_of(dataclasses.asdict(trainer.config))
+      for key in there.keys() & here.keys():  # an earlier version had fewer keys
+        if there[key] != here[key]:
+          raise CheckpointError(
+            f"{self.weights.path} was trained with {key}={there[key]}: "
+            f"a run with {key}={here[key]} cannot start from it."
+          )
       self.policy = self.weights.restore("policy", trainer.policy_shape())
       source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
       self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is fresh.")
@@ -171,16 +177,11 @@ class RestorePlan:
       return
 
 
-def _check_networks(path: Path, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> None:
-  """Raises CheckpointError where a checkpoint's weights would compute something else in these agents' networks."""
-  for key in ("normalize_observations", *(f"network.{name}" for name in ours["network"] if name not in _ONLY_AT_FIRST)):
-    *section, name = key.split(".")
-    there, here = (side.get(section[0], {}) if section else side for side in (theirs, ours))
-    if name in there and format_value(there[name]) != format_value(here[name]):
-      raise CheckpointError(
-        f"{path} was trained with agent.{key}={format_value(there[name])}: a run with agent.{key}="
-        f"{format_value(here[name])} cannot start from it."
-      )
+def networks_of(agent: Mapping[str, Any]) -> dict[str, str]:
+  """Returns the keys of an agent section, with their values, that say what its networks compute with given weights."""
+  found = {f"network.{name}": value for name, value in agent.get("network", {}).items() if name not in _ONLY_AT_FIRST}
+  found |= {"normalize_observations": agent["normalize_observations"]} if "normalize_observations" in agent else {}
+  return {f"agent.{key}": format_value(value) for key, value in found.items()}
 
 
 def _first_policy(run_dir: RunDirectory) -> str | None:

@@ -302,8 +302,9 @@ def test_a_chain_starts_at_a_stage_from_someones_weights(
   {
     "env=CartpoleSwingup": r"Stage far of the chain: env=CartpoleSwingup cannot start from the weights of stage near: "
     r"size of observation 'privileged_state' is \(8,\), and \(4,\) there\.",
-    "agent.network.policy_hidden_layer_sizes=[16,8]": r"Stage far of the chain: .* of stage near: \.params\.policy"
-    r".* is float32\[\d+.*\], and float32\[\d+.*\] there\.",
+    "agent.network.policy_hidden_layer_sizes=[16,8]": r"Stage far of the chain: .* of stage near: agent\.network\."
+    r"policy_hidden_layer_sizes is \[16, 8\], and \[\d+.*\] there\.",
+    "agent.network.activation=relu": r"Stage far .*: agent\.network\.activation is relu, and swish there\.",
     "randomization=g1": r"Stage far of the chain: env\.events\.\w+\.params\.field 'pair_friction' is no field",
     "agent=sac": r"Stage far of the chain: .* of stage near: agent\.name is sac, and ppo there\.",
   }.items(),
