@@ -364,6 +364,7 @@ ERRORS = {
   "run_dir=3": ["run_dir=3", "must be text (put quotes around a number)."],
   "agent=[1": ["'agent=[1' is not an override: write key=value, such as env=CartpoleBalance"],
   "agent.num_envs": ["'agent.num_envs' is not an override"],
+  "hardware.xla_flags=--a=b": ["quote its value, in a shell 'hardware.xla_flags=\"--a=b\"'."],
   "Go1JoystickFlatTerrain": ["is not an override: write env=Go1JoystickFlatTerrain."],
   "algo=sac": ["algo does not exist", "Did you mean 'agent'?"],
   "agent.lr=1": ["agent.lr does not exist", "Did you mean 'agent.learning_rate'?"],

@@ -22,7 +22,7 @@ from playground.config.overrides import Override, parse
 from playground.config.run_options import CurriculumConfig
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
 from playground.settings import Section, defaults
-from playground.text import wrong_type
+from playground.text import format_value, wrong_type
 
 _FIELDS = ("num_timesteps", "overrides")
 _SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # groups and sections that a stage may set
@@ -143,7 +143,9 @@ def _check_stage(key: str, name: str, stage: object) -> None:
   for field in _FIELDS:
     if field not in stage:
       raise ConfigError(f"{key}.{field} is missing.")
-  overrides = stage["overrides"]
+  steps, overrides = stage["num_timesteps"], stage["overrides"]
+  if isinstance(steps, float) and not steps.is_integer():
+    raise ConfigError(f"{key}.num_timesteps={format_value(steps)} must be a whole number, or null.")
   if not isinstance(overrides, list) or not all(isinstance(text, str) for text in overrides):
     raise wrong_type(f"{key}.overrides", overrides, "a list of key=value, as on the command line")
 

@@ -84,7 +84,9 @@ def parse_with_hydra(text: str) -> HydraOverride:
   except HydraException:
     if group := next((group for group in ("env", "experiment") if text in options(group)), None):
       raise ConfigError(f"{text!r} is not an override: write {group}={text}.") from None
-    example = "such as env=CartpoleBalance or agent.num_envs=1024 (quote a value with special characters)"
+    if re.fullmatch(r"[\w.@/+~]+", key) and value and not set(value) & set("[]{}()'\""):
+      raise ConfigError(f"{text!r} is not an override: quote its value, in a shell '{key}=\"{value}\"'.") from None
+    example = "such as env=CartpoleBalance or agent.num_envs=1024"
     raise ConfigError(f"{text!r} is not an override: write key=value, {example}.") from None
 
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypedDict
 
-from playground.limits import SHARE, at_least_0, count
+from playground.limits import SHARE, at_least_0, count, positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,7 @@ class ProfileConfig:
 class StageConfig(TypedDict):
   """A stage of a chain."""
 
-  num_timesteps: Annotated[int | None, count(1, 1e12), "environment steps of the stage; null: the task's own budget"]
+  num_timesteps: Annotated[int | None, positive(1e12), "environment steps of the stage; null: the task's own budget"]
   overrides: Annotated[Sequence[Any], "what this stage and the later ones change, as on the command line"]
 
 

@@ -1,10 +1,11 @@
 """Policies that come with the package: `pretrained:<task>` wherever a run or a checkpoint is named.
 
-Each is a run directory in `policies/<task>/` without what only resuming needs: configuration, metrics, the newest
+Each is a run directory in `policies/<task>/` without what only resuming needs: configuration, evaluations, the newest
 checkpoint's policy, the ONNX file with its contract, and `card.yaml`: how it was trained, what it reaches, and the
 SHA-256 of every file. `playground pretrained` lists them; `add` makes one from a run.
 """
 
+import csv
 import hashlib
 import json
 import re
@@ -16,7 +17,7 @@ from pathlib import Path
 import yaml
 
 from playground.errors import CheckpointError, UnknownNameError, nearest
-from playground.files import numbered
+from playground.files import numbered, read_csv
 from playground.settings import Plain, Section
 
 PREFIX = "pretrained:"
@@ -143,6 +144,16 @@ def _forget_machine(folder: Path) -> None:
   (folder / "manifest.json").write_text(json.dumps(kept, indent=2) + "\n")
 
 
+def _keep_evaluations(metrics: Path) -> None:
+  """Removes the rows of a metrics.csv between the evaluations, and the columns that are empty then."""
+  rows = [row for row in read_csv(metrics) if row.get("eval/episode_reward")]
+  columns = [name for name in rows[0] if any(row[name] for row in rows)]
+  with metrics.open("w", encoding="utf-8", newline="") as file:
+    writer = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+
+
 def add(run: Path, task: str, entries: Section) -> Path:
   """Copies a run's policy into the package and writes its card.
 
@@ -171,6 +182,7 @@ def _build(run: Path, folder: Path, entries: Section) -> Path:
   for checkpoint in (folder / "checkpoints").iterdir():
     round_policy(checkpoint, CRITIC_BITS, _is_critic)
   _forget_machine(folder)
+  _keep_evaluations(folder / "metrics.csv")
   (folder / "export").mkdir()
   for name in ("policy.onnx", "policy.yaml"):
     shutil.copyfile(run / "export" / name, folder / "export" / name)
