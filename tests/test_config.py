@@ -89,6 +89,14 @@ def test_a_variant_keeps_the_agent_that_is_measured_on_it():
   assert [compose([f"env=AcrobotSwingup{kind}"]).agent_name for kind in ("", "Sparse")] == ["reppo", "ppo"]
 
 
+@pytest.mark.parametrize(("task", "tuned"), [("joystick", "ppo/joystick"), ("biped_joystick", "reppo/biped_joystick")])
+def test_a_new_robot_trains_with_the_set_of_robots_like_it(configs: Path, task: str, tuned: str):
+  assert compose([f"env={task}", "robot=h1"]).choices["tuned"] == tuned
+  (configs / "env/Mine.yaml").write_text(f"defaults: [{task}, override /robot@_global_.robot: h1, _self_]\n")
+  mine = compose(["env=Mine"], configs)
+  assert (mine.choices["tuned"], mine.agent.network.value_obs_key) == (tuned, "privileged_state")
+
+
 def test_a_task_without_a_tuned_set_has_the_agents_defaults(configs: Path):
   shutil.copy(configs / "env/CartpoleBalance.yaml", configs / "env/Untuned.yaml")
   run = compose(["env=Untuned"], configs)
