@@ -46,6 +46,7 @@ _LINKED: dict[str, tuple[tuple[str, int | None, float], ...]] = {
   "body_density": (("body_mass", None, 1.0), *(("body_inertia", axis, 1.0) for axis in range(3))),
 }
 _SCALED_ONLY = ("body_density",)
+_TURNS = ("quat", "_axis", "_dir", "_pos")  # ends of the names of fields of directions, quaternions and places
 
 _OPERATIONS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
   "set": lambda nominal, draw: jnp.broadcast_to(draw, nominal.shape),
@@ -184,6 +185,8 @@ def _bind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> _Draw:
       raise ConfigError(f"{shown}: field {term.field!r} has no columns, leave the key out.")
     if term.field in _SCALED_ONLY and term.operation != "scale":
       raise ConfigError(f"{key}.operation={term.operation!r}: field {term.field!r} can only be scaled.")
+    if term.field == "actuator_kp" and (mj_model.actuator_biasprm[rows, 1] >= 0).any():
+      raise ConfigError(f"{key}.field 'actuator_kp' is of position servos, which not all of these actuators are.")
     index = lambda column: (rows,) if column is None else (rows, np.array(column))
     slots = tuple(_Slot(field, index(column), sign) for field, column, sign in _LINKED[term.field])
     return _Draw(term, slots, (len(rows),))
@@ -205,7 +208,7 @@ def _check_kind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> None:
   if is_switch != (term.distribution == "bernoulli") or (is_switch and term.operation != "set"):
     needs = "is a switch: it needs operation set, distribution bernoulli" if is_switch else "is no switch"
     raise ConfigError(f"{key}: field {term.field!r} {needs}, not {term.operation} and {term.distribution}.")
-  turns = values is not None and values.ndim == 2 and values.shape[1] in (3, 4) and term.column is None
+  turns = values is not None and term.field.endswith(_TURNS) and values.ndim == 2 and term.column is None
   if term.operation == "rotate" and not turns:
     raise ConfigError(f"{key}.operation='rotate' needs a whole field of directions or quaternions, not {term.field!r}.")
 

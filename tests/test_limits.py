@@ -62,7 +62,8 @@ def test_every_setting_of_a_class_has_limits_and_help(name: str) -> None:
       continue  # a nested class
     text = setting.choices is not None or setting.text_depth is not None
     assert text or setting.limit or not takes_a_number(setting.default), f"{setting.name} has no limit"
-    assert setting.limit is None or setting.default is None or setting.limit.allows(setting.default), setting.name
+    unset = setting.default is None or setting.default is dataclasses.MISSING
+    assert setting.limit is None or unset or setting.limit.allows(setting.default), setting.name
     assert setting.choices is None or setting.default in setting.choices, setting.name
     assert setting.help and len(setting.help) <= 110, f"{setting.name} has no line of help"
 

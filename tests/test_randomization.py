@@ -364,6 +364,13 @@ def test_errors_say_what_is_wrong_in_one_sentence(
   assert str(error.value).startswith("env.events.term_1.params") and "\n" not in str(error.value)
 
 
+def test_a_servos_gain_is_not_a_motors() -> None:
+  mjcf = '<mujoco><worldbody><body><joint name="hinge"/><geom size="0.1"/></body></worldbody>{}</mujoco>'
+  model = mujoco.MjModel.from_xml_string(mjcf.format('<actuator><motor joint="hinge"/></actuator>'))
+  with pytest.raises(ConfigError, match="field 'actuator_kp' is of position servos"):
+    Randomizer(model, events({"field": "actuator_kp", "target": "all", "operation": "scale", "range": [1, 2]}))
+
+
 @pytest.mark.parametrize("missing", ["field", "target", "operation"])
 def test_missing_keys(small: mujoco.MjModel, missing: str) -> None:
   with pytest.raises(ConfigError, match=f"{missing} is missing"):

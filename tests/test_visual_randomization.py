@@ -85,6 +85,7 @@ def test_shadows_are_switched(batch: dict[str, np.ndarray]) -> None:
     ({"field": "light_diffuse", "distribution": "bernoulli", "mean": 0.5}, "'light_diffuse' is no switch"),
     ({"field": "light_castshadow", "distribution": "bernoulli", "mean": 1.5}, "mean=1.5 is no probability"),
     ({"field": "cam_fovy", "target": "front", "operation": "rotate", "range": [0, 1]}, "directions or quaternions"),
+    ({"field": "light_diffuse", "operation": "rotate", "range": [0, 1]}, "directions or quaternions"),
     ({"field": "light_dir", "range": [0, 1], "axis": [[0, 1]] * 3}, "operation 'set' has no key 'axis'"),
     *(
       ({"field": "light_dir", "operation": "rotate", "range": [0, 1], "axis": axis}, "not three pairs")

@@ -305,7 +305,7 @@ COMMANDS: dict[str, type[Measuring]] = {
 def run(command: Measuring) -> int:
   """Runs a command's measurements and returns the exit code of `run_jobs`."""
   command.check()
-  table = Table(Path(command.out) if command.out else RESULTS / f"{command.name}.csv")
+  table = Table(Path(command.out).expanduser() if command.out else RESULTS / f"{command.name}.csv")
   hardware = [text for text in command.overrides if text.startswith("hardware")]
   devices, machine = probe(hardware, command.gpus)
   jobs = command.jobs(devices)  # raises for invalid options, before any output

@@ -60,11 +60,11 @@ def run(options: Options) -> int:
     PlaygroundError: an option is invalid, or the file holds no sets of runs.
   """
   check_limits(options)
-  path = Path(options.table) if options.table else shipped("benchmarks") / "golden.yaml"
+  path = Path(options.table).expanduser() if options.table else shipped("benchmarks") / "golden.yaml"
   runs = lookup(read(path), options.set, "set")
   chosen = [lookup(runs, name, "only") for name in options.only] or list(runs.values())
   jobs = [measurement(each, options) for each in chosen]
-  table = Table(Path(options.out or "results/benchmarks/golden.csv"))
+  table = Table(Path(options.out or "results/benchmarks/golden.csv").expanduser())
   devices, machine = probe([text for text in options.overrides if text.startswith("hardware")], options.gpus)
   print(f"{devices} x {machine['device']}; {machine['versions']}")
   earlier = len(table.rows())
@@ -132,7 +132,7 @@ def read(path: Path) -> dict[str, dict[str, Golden]]:
   ):
     raise ConfigError(f"table={path} must hold sets of runs, as benchmarks/golden.yaml does.")
   return {
-    name: {run: _golden(f"{path}: {name}.{run}", run, entry) for run, entry in runs.items()}
+    str(name): {str(run): _golden(f"{path}: {name}.{run}", str(run), entry) for run, entry in runs.items()}
     for name, runs in content.items()
   }
 

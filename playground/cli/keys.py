@@ -67,7 +67,8 @@ def _at(prefix: str, values: Section) -> Plain:
   for part in prefix.split("."):
     if not isinstance(node, Mapping) or part not in node:
       check_key(prefix, values)
-      raise UnknownNameError(f"{prefix} does not exist in this configuration: its term is not one of the task's.")
+      why = "its term is not one of the task's" if isinstance(node, Mapping) else f"a key before {part} holds a value"
+      raise UnknownNameError(f"{prefix} does not exist in this configuration: {why}.")
     node = node[part]
   return node
 

@@ -12,6 +12,7 @@ import mujoco
 from flax import struct
 
 from playground.envs.base import Env, State
+from playground.errors import ConfigError
 from playground.mdp.context import Robot, StepContext
 from playground.mdp.managers import (
   CommandManager,
@@ -22,6 +23,7 @@ from playground.mdp.managers import (
 )
 from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
 from playground.randomization import Randomizer
+from playground.text import first_line
 
 _MODEL_FIELDS = "model_fields"  # entry of `info`: fields of the model that events of mode reset draw
 
@@ -65,7 +67,10 @@ class Task(Env):
     `config` is that of `Env`, `observations` and `playground.envs.options.TermsConfig`.
     """
     self.spec = spec
-    mj_model = spec.compile()
+    try:
+      mj_model = spec.compile()
+    except ValueError as error:  # MuJoCo's: a mesh that is missing, a name that is there twice
+      raise ConfigError(f"MuJoCo cannot compile the task's scene: {first_line(error)}.") from None
     self.prepare_model(mj_model, config)
     self.rewards = RewardManager(config.rewards)
     self.terminations = TerminationManager(config.terminations)

@@ -48,6 +48,11 @@ class LeggedRobot(Robot):
     joints = [mj_model.joint(i).name for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
       raise ConfigError(f"env.robot.joints must name the model's joints in their order: {', '.join(joints)}.")
+    on_joints = (mj_model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT).all()
+    driven = [mj_model.joint(i).name for i in mj_model.actuator_trnid[:, 0]] if on_joints else ["other parts"]
+    if driven != joints:
+      shown = ", ".join(driven)
+      raise ConfigError(f"env.robot.mjcf needs a servo for each joint, in the order of the joints: its drive {shown}.")
     _check_lengths(config)
     super().__init__(mj_model, joints, config.sensors)
     self.init_qpos = self.keyframe(config.keyframe)

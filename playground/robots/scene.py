@@ -153,7 +153,8 @@ def _set_keyframes(spec: mujoco.MjSpec, peak: float) -> None:
       spec.key(name).qpos, lift[name] = key.qpos, max(0.0, peak - _ROUGH)
     spec.delete(key)
   for key in spec.keys:
-    key.qpos[2] += lift[key.name]
+    if len(key.qpos):  # a keyframe may have none
+      key.qpos[2] += lift[key.name]
 
 
 def load(part: str) -> mujoco.MjSpec:

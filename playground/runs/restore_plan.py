@@ -2,9 +2,9 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ from playground.learning.trainer import Settings, Trainer, TrainState
 from playground.pretrained import check_task, is_pretrained, locate
 from playground.pytree import PyTree
 from playground.runs.run_dir import RunDirectory
+from playground.settings import Section
 from playground.text import format_value
 
 _ONLY_AT_FIRST = ("value_dtype", "policy_output_scale")  # keys of networks that their weights do not depend on
@@ -177,7 +178,7 @@ class RestorePlan:
       return
 
 
-def networks_of(agent: Mapping[str, Any]) -> dict[str, str]:
+def networks_of(agent: Section) -> dict[str, str]:
   """Returns the keys of an agent section, with their values, that say what its networks compute with given weights."""
   found = {f"network.{name}": value for name, value in agent.get("network", {}).items() if name not in _ONLY_AT_FIRST}
   found |= {"normalize_observations": agent["normalize_observations"]} if "normalize_observations" in agent else {}

@@ -30,6 +30,11 @@ def write(folder: Path, text: str = ONE) -> str:
   return str(folder / "golden.yaml")
 
 
+def test_names_may_be_numbers(tmp_path: Path) -> None:
+  path = write(tmp_path, ONE.replace("pole:", "1:"))
+  assert list(read(Path(path))["cpu"]) == ["1"]
+
+
 def test_the_committed_sets() -> None:
   sets = read(shipped("benchmarks") / "golden.yaml")
   assert set(sets) == {"cpu", "gpu"}

@@ -59,6 +59,11 @@ def test_a_gpu_counts_before_a_cpu_and_new_before_old(tmp_path: Path):
   assert line_of(found, "CheetahRun")[2] == "1,000,000"
 
 
+def test_other_versions_are_another_experiment(tmp_path: Path):
+  found = evidence(tmp_path, {"seed": 1, "value": 1e6}, {"seed": 2, "value": 2e6, "versions": "JAX 9"})
+  assert line_of(found, "CheetahRun")[2] in ("1,000,000", "2,000,000")
+
+
 def test_measured_again_replaces(tmp_path: Path):
   found = evidence(tmp_path, {"seed": 1, "value": 1e6}, {"seed": 1, "value": 2e6})
   assert line_of(found, "CheetahRun")[2] == "2,000,000"

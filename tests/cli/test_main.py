@@ -114,7 +114,7 @@ def test_list_needs_no_jax():
       ["randomization=go1"],
       ["randomization: go1", "body_mass trunk: add uniform(-1, 1)", "geom_friction[:, 0] floor: set"],
     ),
-    (["joystick", "robot=go1"], ["joystick", "robot go1", "ppo (defaults, not tuned for this task)"]),
+    (["joystick", "robot=go1"], ["joystick", "robot go1", "ppo (tuned/ppo/joystick.yaml)"]),
   ],
 )
 def test_show(command: Command, capsys: pytest.CaptureFixture[str], args: list[str], shown: list[str]):
@@ -184,6 +184,8 @@ def test_keys_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   assert "Did you mean 'agent'?" in capsys.readouterr().err
   assert command("keys", "env.rewards.foo") == 2
   assert "env.rewards.foo does not exist" in capsys.readouterr().err
+  assert command("keys", "env.vision.brightness.0") == 2
+  assert "a key before 0 holds a value" in capsys.readouterr().err
 
 
 def test_doctor(command: Command, monkeypatch: pytest.MonkeyPatch):

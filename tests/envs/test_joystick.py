@@ -281,6 +281,32 @@ def test_a_robot_without_a_free_joint_or_servos(ours: str, theirs: str, message:
     load_task(TASK, {"robot.mjcf": str(robot), "robot.pd": None})
 
 
+@pytest.mark.parametrize(
+  ("ours", "theirs", "message"),
+  [
+    (
+      'joint="FR_hip_joint"/>',
+      'joint="FL_hip_joint"/>',
+      "in the order of the joints: its drive FL_hip_joint",
+    ),
+    ("<worldbody>", '<asset><mesh name="m" file="no.stl"/></asset><worldbody>', "MuJoCo cannot compile the task's"),
+  ],
+)
+def test_servos_in_another_order_or_a_mesh_that_is_not_there(
+  ours: str, theirs: str, message: str, tmp_path: Path
+) -> None:
+  robot, text = tmp_path / "robot.xml", find_mjcf("go1").read_text()
+  robot.write_text(text.replace(ours, theirs, 1))
+  with pytest.raises(ConfigError, match=re.escape(message)):
+    load_task(TASK, {"robot.mjcf": str(robot)})
+
+
+def test_a_keyframe_may_be_empty(tmp_path: Path) -> None:
+  robot, text = tmp_path / "robot.xml", find_mjcf("go1").read_text()
+  robot.write_text(text.replace("<keyframe>", '<keyframe><key name="zero"/>', 1))
+  load_task(TASK, {"robot.mjcf": str(robot)})
+
+
 def test_soft_limits_lie_within_the_hard_ones(pushed: Any) -> None:
   knee = pushed.robot.joint_range[1, 2]  # at its upper hard limit, -0.888
   after = evaluate(pushed, recorded(TASK), qpos=pushed.robot.init_qpos.at[9].set(knee))

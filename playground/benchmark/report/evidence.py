@@ -68,7 +68,10 @@ class Evidence:
     return next(iter(self.find(**wanted)), None)
 
 
-SAME = ("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "devices", "device", "commit", "note")
+SAME = (
+  *("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "devices", "device"),
+  *("precision", "versions", "commit", "note"),
+)
 
 
 def _read(path: Path) -> list[dict[str, str]]:

@@ -61,6 +61,8 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
       _rewrite(pages / GALLERY, GRID_BEGIN.format(suite), GRID_END, _grid(suite))
   except FileNotFoundError as error:
     raise ConfigError(f"pages={pages}: {error.filename} does not exist.") from None
+  except UnicodeDecodeError as error:
+    raise ConfigError(f"pages={pages} has a page that is no text: {error.reason}.") from None
   return [*written, pages / GALLERY]
 
 
