@@ -170,7 +170,9 @@ def run_jobs(measurements: Sequence[Measurement], table: Table, machine: Mapping
   def add(measurement: Measurement, row: Row) -> None:
     conditions = "; ".join(part for part in (row.get("conditions", ""), *remarks) if part)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    table.add({**measurement.columns, **shared, **row, "conditions": conditions, "date": now})
+    full = {**measurement.columns, **shared, **row, "conditions": conditions}
+    if plan.rerun or not table.has(full):  # every start reads a chain that another machine finished
+      table.add({**full, "date": now})
     where = [row["setting"]] if "setting" in row else []
     where += [f"seed {row['seed']}"] if "seed" in row else []
     print(f"{measurement}: {row['quantity']} {row['value']:,} {row['unit']} {' '.join(where)}".rstrip(), flush=True)

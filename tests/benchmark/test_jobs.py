@@ -37,6 +37,7 @@ elif measure in ("lock", "caches"):
   worker.importlib.import_module = lambda name: type("Module", (), {"measure": told})
   worker.main()
 elif measure == "read": row(seed=1, value=1.0, commit="earlier")
+elif measure == "other": row(seed=1, value=1.0, device="another device")
 elif measure == "user":
   (Path(job["folder"]) / "status.json").write_text('{"status": "failed", "reason": "that cannot be."}')
   sys.exit(2)
@@ -77,6 +78,13 @@ def test_what_was_run_earlier_keeps_its_commit(tmp_path: Path):
   table = Table(tmp_path / "rows.csv")
   assert run_jobs([job("read")], table, FACTS, PLAN) == 0
   assert table.has({"seed": 1, "commit": "earlier"})
+
+
+def test_what_another_machine_ran_is_in_the_table_once(tmp_path: Path):
+  path = tmp_path / "rows.csv"
+  for _ in range(2):
+    assert run_jobs([job("other")], Table(path), FACTS, PLAN) == 0
+  assert path.read_text().count("another device") == 1
 
 
 def test_caches_are_empty_ones_unless_the_users_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

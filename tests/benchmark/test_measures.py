@@ -77,13 +77,15 @@ def test_rate_counts_all_of_the_time():
 def write_chain(run: Path, final_return: float = 4.0) -> None:
   """A finished chain of two stages."""
   manifest = {"impl": "jax", "num_devices": 1, "matmul_precision": "highest", "network_precision": "highest"}
+  manifest |= {"platform": "gpu", "device": "another GPU", "versions": {"python": "3.12", "jax": "0.1", "torch": "2"}}
   manifest["git"] = {"commit": "0123456789", "dirty": True}
   one = {"name": "walk", "folder": "1_walk", "env": "A", "final_return": 3.0, "steps": 100, "wall_clock_s": 5.0}
   two = {"name": "run", "folder": "2_run", "env": "B", "final_return": 4.0, "steps": 50, "wall_clock_s": 2.0}
   whole = {"env": "B", "final_return": final_return, "steps": 150, "wall_clock_s": 7.0, "stages": [one, two]}
-  for folder in ("", "1_walk", "2_run"):
+  for folder in ("1_walk", "2_run"):
     (run / folder).mkdir(parents=True, exist_ok=True)
     write_json(run / folder / "manifest.json", manifest)
+    write_json(run / folder / "status.json", {"status": "finished"})
   write_json(run / "summary.json", whole)
   write_json(run / "status.json", {"status": "finished"})
 
@@ -95,7 +97,21 @@ def test_a_finished_chain_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[
   found = {(row["setting"], row["quantity"]): row["value"] for row in given}
   assert found["stage=walk", "final_return"] == 3.0 and found["stage=run", "wall_clock_s"] == 2.0
   assert found["stage=all", "wall_clock_s"] == 7.0 and found["stage=all", "steps"] == 150
-  assert {row["commit"] for row in given} == {"0123456+"}, "that of the run, whatever reads it"
+  of_the_run = {"commit": "0123456+", "device": "another GPU", "devices": 1, "versions": "Python 3.12; JAX 0.1"}
+  assert all(row.items() >= of_the_run.items() for row in given), "whatever reads it"
+
+
+def test_rows_of_a_resumed_chain_name_the_machine_of_each_stage(
+  monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+  run = tmp_path / "some_chain_seed_2"
+  write_chain(run)
+  for path in (run / "status.json", run / "2_run" / "status.json"):
+    write_json(path, {"status": "preempted"})
+  monkeypatch.setattr(runs, "run_training", lambda overrides: write_chain(run))
+  runs.chain(Rows(), "some_chain", [], str(tmp_path), again=False, seeds=[2])
+  devices = {row["setting"]: row.get("device") for row in rows(capsys)}
+  assert devices == {"stage=walk": "another GPU", "stage=run": None, "stage=all": None}, "None is this machine"
 
 
 def test_a_chain_of_other_overrides_or_again_is_another_run(

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jax
@@ -13,6 +13,7 @@ from playground.config import compose
 from playground.hardware.gpus import query_gpus
 from playground.hardware.setup import setup
 from playground.runs.provenance import package_versions
+from playground.settings import Section
 
 _NAMES = {"python": "Python", "jax": "JAX", "mujoco": "MuJoCo", "mujoco-mjx": "MJX", "warp-lang": "Warp"}
 
@@ -37,10 +38,18 @@ def device_name() -> str:
 
 def versions() -> str:
   """Returns the versions of packages that affect speed, in one line."""
-  found = package_versions()
-  parts = [f"{name} {found[key]}" for key, name in _NAMES.items() if found.get(key)]
   driver = _query_gpu("driver_version")
-  return "; ".join([*parts, f"driver {driver}"] if driver else parts)
+  return "; ".join([_versions_of(package_versions()), *([f"driver {driver}"] if driver else [])])
+
+
+def machine_of(manifest: Section) -> dict[str, str]:
+  """Returns the columns `device` and `versions` of the machine that a run's manifest describes, without the driver."""
+  device = "CPU" if manifest["platform"] == "cpu" else manifest["device"]
+  return {"device": device, "versions": _versions_of(manifest["versions"])}
+
+
+def _versions_of(packages: Mapping[str, str | None]) -> str:
+  return "; ".join(f"{name} {packages[key]}" for key, name in _NAMES.items() if packages.get(key))
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from playground.benchmark.measures.machine import machine_of
 from playground.benchmark.measures.subject import alone
 from playground.benchmark.schema import commit_of
 from playground.benchmark.worker import Rows
@@ -75,18 +76,21 @@ def chain(rows: Rows, experiment: str, overrides: list[str], runs: str, again: b
   """Emits rows for each stage of a curriculum, `stage=<name>`, and for the whole, `stage=all`.
 
   An unfinished run of the same experiment, overrides and seed is resumed; its times are sums over its starts. The rows
-  of a finished run have that run's commit; `again` starts a new run instead.
+  of stages that were finished before have the commit, device and versions of their manifest, as another machine may
+  have trained them; `again` starts a new run instead.
   """
   (seed,) = seeds
   run = _chain_run(Path(runs), experiment, overrides, seed, again)
+  finished = {path.name for path in run.path.glob("*/") if _finished(RunDirectory(path))}
   if not _finished(run):
     begun = run.config_path.is_file()
     new = [f"experiment={experiment}", f"seed={seed}", "video.enable=false", *overrides, f"run_dir={run.path}"]
     run_training([f"resume={run.path}"] if begun else new)
-  for stage in [*run.summary["stages"], {**run.summary, "name": "all"}]:
-    manifest = (run if stage["name"] == "all" else RunDirectory(run.path / stage["folder"])).manifest
+  stages = run.summary["stages"]
+  for stage in [*stages, {**run.summary, "name": "all", "folder": stages[-1]["folder"]}]:
+    manifest = RunDirectory(run.path / stage["folder"]).manifest  # a chain itself has none
     columns: dict[str, object] = {"seed": seed, "setting": " ".join((*overrides, f"stage={stage['name']}"))}
-    columns |= columns_of(manifest) if manifest else {}
+    columns |= columns_of(manifest) | (machine_of(manifest) if stage["folder"] in finished else {})
     if git := manifest.get("git"):
       columns["commit"] = commit_of(git)
     columns["conditions"] = f"task {stage['env']}, evaluations included, compiling not"
