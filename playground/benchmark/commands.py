@@ -71,6 +71,7 @@ class Startup(OfTasks):
 
   def jobs(self, devices: int) -> list[Measurement]:
     last = {"quantity": "start_to_first_update_s", "setting": " ".join((*self.overrides, "warm"))}
+    last |= {"devices": str(devices)}
     jobs = [self.job("runs:startup", task) for task in self.chosen()]
     return [dataclasses.replace(job, last=last) for job in jobs]
 
@@ -202,9 +203,9 @@ class Chain(Measuring):
   def jobs(self, devices: int) -> list[Measurement]:
     agent = compose([f"experiment={self.experiment}", *self.overrides]).agent_name
     arguments = {"experiment": self.experiment, "overrides": list(self.overrides)}
-    arguments |= {"runs": self.runs, "again": self.rerun}
+    arguments |= {"runs": self.runs, "again": self.rerun, "devices": devices}
     columns = self.columns(self.experiment, agent)
-    last = {"quantity": "wall_clock_s", "setting": " ".join((*self.overrides, "stage=all"))}
+    last = {"quantity": "wall_clock_s", "setting": " ".join((*self.overrides, "stage=all")), "devices": str(devices)}
     return [
       Measurement("runs:chain", {**arguments, "seeds": [seed]}, columns, last) for seed in range(1, self.seeds + 1)
     ]

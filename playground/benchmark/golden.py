@@ -67,12 +67,12 @@ def run(options: Options) -> int:
   table = Table(Path(options.out or "results/benchmarks/golden.csv").expanduser())
   devices, machine = probe([text for text in options.overrides if text.startswith("hardware")], options.gpus)
   print(f"{devices} x {machine['device']}; {machine['versions']}")
+  here = {"device": machine["device"], "devices": str(devices)}
+  jobs = [dataclasses.replace(job, columns={**job.columns, **here}) for job in jobs]
   earlier = len(table.rows())
   code = run_jobs(jobs, table, machine, options)
   rows = table.rows(earlier if options.rerun else 0)
-  outside = [
-    name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job, machine["device"]))
-  ]
+  outside = [name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job))]
   if outside:
     print(f"error: outside of their windows: {', '.join(each.name for each in outside)}.", file=sys.stderr)
   return code or (1 if outside else 0)
@@ -106,10 +106,10 @@ def setting(overrides: Sequence[str], metric: str) -> str:
   return " ".join((*overrides, f"metric={metric}"))
 
 
-def values(rows: Sequence[Mapping[str, str]], job: Measurement, device: str) -> dict[str, float]:
-  """Returns the newest value of each metric of a run on this device."""
+def values(rows: Sequence[Mapping[str, str]], job: Measurement) -> dict[str, float]:
+  """Returns the newest value of each metric of a run on these devices."""
   metrics = dict(zip(job.arguments["settings"], job.arguments["metrics"], strict=True))
-  same = {"benchmark": "golden", "task": job.columns["task"], "quantity": QUANTITY, "device": device}
+  same = {name: job.columns[name] for name in ("benchmark", "task", "device", "devices")} | {"quantity": QUANTITY}
   own = [row for row in rows if row["setting"] in metrics and all(row[key] == text for key, text in same.items())]
   return {metrics[row["setting"]]: float(row["value"]) for row in own}
 

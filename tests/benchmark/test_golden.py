@@ -69,7 +69,7 @@ def test_exit_codes(
 ) -> None:
   def measure(jobs: Sequence[Measurement], table: Table, facts: Mapping[str, Any], plan: Options) -> int:
     (job,) = jobs
-    shared: dict[str, Any] = {**job.columns, "device": facts["device"], "quantity": "golden_metric"}
+    shared: dict[str, Any] = {**job.columns, "quantity": "golden_metric"}
     for text in job.arguments["settings"] if value is not None else ():
       table.add({**shared, "setting": text, "value": 20 if "length" in text else value})
     return ended
@@ -80,6 +80,30 @@ def test_exit_codes(
   assert run(options) == code
   monkeypatch.setattr(golden, "run_jobs", lambda *_: 0)
   assert run(options) == 0, "rows of an earlier start are not judged, where all is trained again"
+
+
+def left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str = ONE, devices: int = 1, code: int = 0) -> bool:
+  """Runs the set with `rerun=false` and returns whether it was trained, which writes a row for each metric."""
+  trained = False
+
+  def measure(jobs: Sequence[Measurement], table: Table, machine: Mapping[str, Any], plan: Options) -> int:
+    nonlocal trained
+    (job,) = jobs
+    trained = job.left(table, machine["device"]) is not None
+    for setting in job.arguments["settings"] if trained else ():
+      table.add({**job.columns, "quantity": "golden_metric", "setting": setting, "value": 20})
+    return 0
+
+  monkeypatch.setattr(golden, "probe", lambda *_: (devices, FACTS))
+  monkeypatch.setattr(golden, "run_jobs", measure)
+  assert run(Options(table=write(tmp_path, text), out=str(tmp_path / "rows.csv"), rerun=False)) == code
+  return trained
+
+
+def test_rows_of_another_number_of_devices_are_of_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  assert [left(tmp_path, monkeypatch, devices=devices) for devices in (1, 1, 4, 4, 1)] == [
+    True, False, True, False, False,
+  ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import pytest
 from playground import registry
 from playground.benchmark import commands
 from playground.benchmark import peer as peers
-from playground.benchmark.commands import Compare, Learning, Topology
+from playground.benchmark.commands import Chain, Compare, Learning, Startup, Topology
 from playground.benchmark.measures import peer as peer_measures
 from playground.benchmark.measures import runs
 from playground.benchmark.schema import Table
@@ -92,7 +92,7 @@ def write_chain(run: Path, final_return: float = 4.0) -> None:
 
 def test_a_finished_chain_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
   write_chain(tmp_path / "some_chain_seed_2")
-  runs.chain(Rows(), "some_chain", [], str(tmp_path), again=False, seeds=[2])
+  runs.chain(Rows(), "some_chain", [], str(tmp_path), again=False, devices=1, seeds=[2])
   given = rows(capsys)
   found = {(row["setting"], row["quantity"]): row["value"] for row in given}
   assert found["stage=walk", "final_return"] == 3.0 and found["stage=run", "wall_clock_s"] == 2.0
@@ -109,7 +109,7 @@ def test_rows_of_a_resumed_chain_name_the_machine_of_each_stage(
   for path in (run / "status.json", run / "2_run" / "status.json"):
     write_json(path, {"status": "preempted"})
   monkeypatch.setattr(runs, "run_training", lambda overrides: write_chain(run))
-  runs.chain(Rows(), "some_chain", [], str(tmp_path), again=False, seeds=[2])
+  runs.chain(Rows(), "some_chain", [], str(tmp_path), again=False, devices=1, seeds=[2])
   devices = {row["setting"]: row.get("device") for row in rows(capsys)}
   assert devices == {"stage=walk": "another GPU", "stage=run": None, "stage=all": None}, "None is this machine"
 
@@ -123,19 +123,20 @@ def test_a_chain_of_other_overrides_or_again_is_another_run(
     begun.append(overrides[-1])
     write_chain(Path(overrides[-1].partition("=")[2]), final_return=10.0 * len(begun))
 
-  def measured(overrides: list[str], again: bool = False) -> float:
-    runs.chain(Rows(), "some_chain", overrides, str(tmp_path), again=again, seeds=[2])
+  def measured(overrides: list[str], again: bool = False, devices: int = 1) -> float:
+    runs.chain(Rows(), "some_chain", overrides, str(tmp_path), again, devices, seeds=[2])
     return next(r["value"] for r in rows(capsys) if r["quantity"] == "final_return" and "stage=all" in r["setting"])
 
   monkeypatch.setattr(runs, "run_training", train)
   assert [measured(["a=1"]), measured(["a=2"]), measured([]), measured(["a=1"])] == [10.0, 20.0, 30.0, 10.0]
   assert [measured(["a=1"], again=True), measured([], again=True)] == [40.0, 50.0]
   assert len(set(begun)) == 5, "nothing is overwritten"
+  assert [measured([], devices=4), measured([], devices=4)] == [60.0, 60.0]
 
   stopped = tmp_path / "some_chain_seed_2_2"
   (stopped / "status.json").write_text('{"status": "preempted"}')
   (stopped / "config.yaml").touch()
-  assert measured([], again=True) == 60.0 and begun[-1] == f"resume={stopped}"
+  assert measured([], again=True) == 70.0 and begun[-1] == f"resume={stopped}"
 
 
 def test_a_peer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -275,6 +276,16 @@ def test_sac_is_compared_in_learning_alone(monkeypatch: pytest.MonkeyPatch):
     Compare(tasks=("CheetahRun",), agent="sac").check()
   with pytest.raises(ConfigError, match=r"SAC on DM Control alone, not PandaPickCube"):
     Learning(tasks=("CheetahRun", "PandaPickCube"), agent="sac").check()
+
+
+def test_rows_of_another_number_of_devices_are_not_those_of_all(tmp_path: Path):
+  table = Table(tmp_path / "rows.csv")
+  for command in (Startup(tasks=("CheetahRun",)), Chain()):
+    (job,) = command.jobs(1)
+    table.add({**job.columns, **job.last, "seed": 1, "device": "a GPU", "value": 1.0})
+    assert job.left(table, "a GPU") is None
+    (on_four,) = command.jobs(4)
+    assert on_four.left(table, "a GPU") == on_four
 
 
 def test_topology_has_all_devices_and_may_have_several_workers():

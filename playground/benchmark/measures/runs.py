@@ -72,15 +72,17 @@ def whole(rows: Rows, task: str, agent: str, overrides: list[str], setting: list
     emit_result(rows, result, RESULT, seed=seed)
 
 
-def chain(rows: Rows, experiment: str, overrides: list[str], runs: str, again: bool, seeds: list[int]) -> None:
+def chain(
+  rows: Rows, experiment: str, overrides: list[str], runs: str, again: bool, devices: int, seeds: list[int]
+) -> None:
   """Emits rows for each stage of a curriculum, `stage=<name>`, and for the whole, `stage=all`.
 
-  An unfinished run of the same experiment, overrides and seed is resumed; its times are sums over its starts. The rows
-  of stages that were finished before have the commit, device and versions of their manifest, as another machine may
-  have trained them; `again` starts a new run instead.
+  An unfinished run of the same experiment, overrides, number of devices and seed is resumed; its times are sums over
+  its starts. The rows of stages that were finished before have the commit, device and versions of their manifest, as
+  another machine may have trained them; `again` starts a new run instead.
   """
   (seed,) = seeds
-  run = _chain_run(Path(runs), experiment, overrides, seed, again)
+  run = _chain_run(Path(runs), experiment, overrides, devices, seed, again)
   finished = {path.name for path in run.path.glob("*/") if _finished(RunDirectory(path))}
   if not _finished(run):
     begun = run.config_path.is_file()
@@ -157,10 +159,11 @@ def _one_update(config: RunConfig) -> int:
   return (settings.prefill_updates + 1) * settings.steps_per_update * config.env.action_repeat
 
 
-def _chain_run(runs: Path, experiment: str, overrides: list[str], seed: int, again: bool) -> RunDirectory:
-  """Returns the run directory of an experiment, overrides and seed; with `again`, the first unfinished numbered one."""
+def _chain_run(runs: Path, experiment: str, overrides: list[str], devices: int, seed: int, again: bool) -> RunDirectory:
+  """Returns the run directory of these arguments; with `again`, the first unfinished numbered one."""
   digest = [hashlib.sha256(" ".join(overrides).encode()).hexdigest()[:8]] if overrides else []
-  name = "_".join([experiment, *digest, f"seed_{seed}"])
+  several = [f"{devices}_devices"] if devices > 1 else []
+  name = "_".join([experiment, *digest, *several, f"seed_{seed}"])
   numbered = (name if number == 1 else f"{name}_{number}" for number in itertools.count(1))
   return next(run for path in numbered if not _finished(run := RunDirectory(runs / path)) or not again)
 
