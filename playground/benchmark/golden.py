@@ -50,11 +50,19 @@ class Golden:
   source: str
 
 
+class GoldenRun(Measurement):
+  """The measurement of a run, which is in the table if all of its metrics are."""
+
+  def left(self, table: Table, device: str) -> Measurement | None:
+    del device  # in `columns`
+    return None if len(values(table.rows(), self)) == len(self.arguments["metrics"]) else self
+
+
 def run(options: Options) -> int:
   """Trains the runs and checks their values.
 
   Returns:
-    The exit code: 0 if all are inside, 1 for a failed run or a value outside, 3 if the time was up.
+    The exit code: 0 if all are inside, 1 for a failed run or a value outside or missing, 3 if the time was up.
 
   Raises:
     PlaygroundError: an option is invalid, or the file holds no sets of runs.
@@ -72,38 +80,32 @@ def run(options: Options) -> int:
   earlier = len(table.rows())
   code = run_jobs(jobs, table, machine, options)
   rows = table.rows(earlier if options.rerun else 0)
-  outside = [name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job))]
-  if outside:
-    print(f"error: outside of their windows: {', '.join(each.name for each in outside)}.", file=sys.stderr)
-  return code or (1 if outside else 0)
+  bad = [name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job))]
+  if bad:
+    print(f"error: outside of their windows or not measured: {', '.join(each.name for each in bad)}.", file=sys.stderr)
+  return code or (1 if bad else 0)
 
 
 def judge(golden: Golden, found: Mapping[str, float]) -> bool:
-  """Prints a line for each measured metric; returns whether all are inside their windows."""
+  """Prints a line for each metric; returns whether all were measured and are inside their windows."""
   good = True
   for metric, (least, most) in golden.windows.items():
-    if metric in found:
-      inside = least <= found[metric] <= most  # NaN is outside
-      verdict = "ok" if inside else f"OUTSIDE (window from {golden.source})"
-      print(f"{golden.name}: {metric} {found[metric]:.4g}, window {least:g} to {most:g}: {verdict}", flush=True)
-      good &= inside
+    inside = metric in found and least <= found[metric] <= most  # NaN is outside
+    verdict = "ok" if inside else f"OUTSIDE (window from {golden.source})"
+    measured = f"{found[metric]:.4g}, window {least:g} to {most:g}: {verdict}" if metric in found else "not measured"
+    print(f"{golden.name}: {metric} {measured}", flush=True)
+    good &= inside
   return good
 
 
-def measurement(golden: Golden, options: Options) -> Measurement:
+def measurement(golden: Golden, options: Options) -> GoldenRun:
   """Makes a measurement of the run; raises ConfigError for overrides that are invalid."""
   overrides = [*golden.overrides, *options.overrides]
   agent = compose(overrides).agent_name
   columns = {"benchmark": "golden", "task": golden.name, "agent": agent, "who": "ours", "setting": ""}
-  metrics = list(golden.windows)
-  last = {"quantity": QUANTITY, "setting": setting(options.overrides, metrics[-1])}
-  arguments = {"overrides": overrides, "metrics": metrics, "settings": [setting(options.overrides, m) for m in metrics]}
-  return Measurement("runs:golden", arguments, columns, last)
-
-
-def setting(overrides: Sequence[str], metric: str) -> str:
-  """Returns the column `setting` of a metric's row."""
-  return " ".join((*overrides, f"metric={metric}"))
+  settings = [" ".join((*overrides, f"metric={metric}")) for metric in golden.windows]
+  arguments = {"overrides": overrides, "metrics": list(golden.windows), "settings": settings}
+  return GoldenRun("runs:golden", arguments, columns, {"quantity": QUANTITY})
 
 
 def values(rows: Sequence[Mapping[str, str]], job: Measurement) -> dict[str, float]:

@@ -58,9 +58,9 @@ def test_the_ends_of_a_window_are_in_it(found: Mapping[str, float], good: bool) 
   assert judge(Golden("x", (), {"a": (1.0, 2.0)}, "here"), found) is good
 
 
-def test_what_was_not_measured_is_not_judged(capsys: pytest.CaptureFixture[str]) -> None:
-  assert judge(Golden("x", (), {"a": (1.0, 2.0)}, "here"), {})
-  assert capsys.readouterr().out == ""
+def test_what_was_not_measured_is_not_good(capsys: pytest.CaptureFixture[str]) -> None:
+  assert not judge(Golden("x", (), {"a": (1.0, 2.0)}, "here"), {})
+  assert capsys.readouterr().out == "x: a not measured\n"
 
 
 @pytest.mark.parametrize(("value", "ended", "code"), [(10.0, 0, 0), (30.0, 0, 1), (10.0, 3, 3), (None, 1, 1)])
@@ -79,7 +79,7 @@ def test_exit_codes(
   options = Options(table=write(tmp_path), out=str(tmp_path / "rows.csv"))
   assert run(options) == code
   monkeypatch.setattr(golden, "run_jobs", lambda *_: 0)
-  assert run(options) == 0, "rows of an earlier start are not judged, where all is trained again"
+  assert run(options) == 1, "rows of an earlier start are not judged, where all is trained again"
 
 
 def left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str = ONE, devices: int = 1, code: int = 0) -> bool:
@@ -104,6 +104,17 @@ def test_rows_of_another_number_of_devices_are_of_another_run(tmp_path: Path, mo
   assert [left(tmp_path, monkeypatch, devices=devices) for devices in (1, 1, 4, 4, 1)] == [
     True, False, True, False, False,
   ]  # fmt: skip
+
+
+def test_a_metric_that_the_table_lacks_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  assert left(tmp_path, monkeypatch) and not left(tmp_path, monkeypatch)
+  more = ONE.replace("metrics: {", "metrics: {eval/episode_fall: [0, 30], ")
+  assert left(tmp_path, monkeypatch, more) and not left(tmp_path, monkeypatch, more)
+
+
+def test_other_overrides_are_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  other = ONE.replace("tuned=null", "tuned=null, agent.learning_rate=1e-3")
+  assert [left(tmp_path, monkeypatch, text) for text in (ONE, other, ONE)] == [True, True, False]
 
 
 @pytest.mark.parametrize(
