@@ -33,7 +33,7 @@ def parse(command: str, options: type[T], arguments: Sequence[str]) -> T:
     key, equals, value = text.partition("=")
     if not equals:
       raise ConfigError(f"{text!r} is not an argument of `playground-bench {command}`: write key=value.")
-    if takes_overrides and ("." in key or key in GROUPS):
+    if takes_overrides and ("." in key or key.lstrip("+") in GROUPS):
       overrides.append(text)
     elif key not in known:
       what = f"{key} is no key of `playground-bench {command}`: it takes {', '.join(known)}"

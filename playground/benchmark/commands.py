@@ -1,6 +1,7 @@
 """Defines the commands: options and measurements of each."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -307,8 +308,8 @@ def run(command: Measuring) -> int:
   """Runs a command's measurements and returns the exit code of `run_jobs`."""
   command.check()
   table = Table(Path(command.out).expanduser() if command.out else RESULTS / f"{command.name}.csv")
-  hardware = [text for text in command.overrides if text.startswith("hardware")]
-  devices, machine = probe(hardware, command.gpus)
+  hardware = [text for text in command.overrides if re.match(r"\+*hardware[.=]", text)]
+  devices, machine = probe(["env=CartpoleBalance", *hardware], command.gpus)
   jobs = command.jobs(devices)  # raises for invalid options, before any output
   print(f"{devices} x {machine['device']}; {machine['versions']}")
   return run_jobs(jobs, table, machine, command)

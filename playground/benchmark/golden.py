@@ -15,6 +15,7 @@ from playground.benchmark.schema import Table
 from playground.config import compose
 from playground.config.files import shipped
 from playground.errors import ConfigError, lookup
+from playground.hardware.options import HardwareConfig
 
 QUANTITY = "golden_metric"
 _KEYS = ("run", "metrics", "from")
@@ -71,14 +72,18 @@ def run(options: Options) -> int:
   path = Path(options.table).expanduser() if options.table else shipped("benchmarks") / "golden.yaml"
   runs = lookup(read(path), options.set, "set")
   chosen = [lookup(runs, name, "only") for name in options.only] or list(runs.values())
-  jobs = [measurement(each, options) for each in chosen]
+  overrides = [[*each.overrides, *options.overrides] for each in chosen]
+  configs = [compose(each) for each in overrides]  # raises for invalid overrides, before anything runs
   table = Table(Path(options.out or "results/benchmarks/golden.csv").expanduser())
-  devices, machine = probe([text for text in options.overrides if text.startswith("hardware")], options.gpus)
-  print(f"{devices} x {machine['device']}; {machine['versions']}")
-  here = {"device": machine["device"], "devices": str(devices)}
-  jobs = [dataclasses.replace(job, columns={**job.columns, **here}) for job in jobs]
+  machines: dict[HardwareConfig, tuple[int, dict[str, str]]] = {}  # a run may choose its hardware
+  jobs = []
+  for each, texts, config in zip(chosen, overrides, configs, strict=True):
+    if config.hardware not in machines:
+      machines[config.hardware] = devices, machine = probe(texts, options.gpus)
+      print(f"{devices} x {machine['device']}; {machine['versions']}")
+    jobs.append(measurement(each, texts, config.agent_name, *machines[config.hardware]))
   earlier = len(table.rows())
-  code = run_jobs(jobs, table, machine, options)
+  code = run_jobs(jobs, table, machines[configs[0].hardware][1], options)
   rows = table.rows(earlier if options.rerun else 0)
   bad = [name for name, job in zip(chosen, jobs, strict=True) if not judge(name, values(rows, job))]
   if bad:
@@ -98,13 +103,14 @@ def judge(golden: Golden, found: Mapping[str, float]) -> bool:
   return good
 
 
-def measurement(golden: Golden, options: Options) -> GoldenRun:
-  """Makes a measurement of the run; raises ConfigError for overrides that are invalid."""
-  overrides = [*golden.overrides, *options.overrides]
-  agent = compose(overrides).agent_name
+def measurement(
+  golden: Golden, overrides: Sequence[str], agent: str, devices: int, machine: Mapping[str, str]
+) -> GoldenRun:
+  """Returns the measurement of a run with all of its overrides, on the devices that they choose."""
   columns = {"benchmark": "golden", "task": golden.name, "agent": agent, "who": "ours", "setting": ""}
+  columns |= {"device": machine["device"], "devices": str(devices)}
   settings = [" ".join((*overrides, f"metric={metric}")) for metric in golden.windows]
-  arguments = {"overrides": overrides, "metrics": list(golden.windows), "settings": settings}
+  arguments = {"overrides": list(overrides), "metrics": list(golden.windows), "settings": settings}
   return GoldenRun("runs:golden", arguments, columns, {"quantity": QUANTITY})
 
 

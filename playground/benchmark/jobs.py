@@ -134,7 +134,7 @@ def _run(measurements: Sequence[Measurement], add: Add, plan: Plan) -> tuple[int
 
 
 def probe(overrides: Sequence[str], gpus: Sequence[int]) -> tuple[int, dict[str, str]]:
-  """Returns the number of devices of measurements, and their columns `device` and `versions`.
+  """Returns the number of devices of a run with these overrides, and its columns `device` and `versions`.
 
   A child process queries the devices, so that this process holds none.
 
@@ -170,7 +170,7 @@ def run_jobs(measurements: Sequence[Measurement], table: Table, machine: Mapping
   def add(measurement: Measurement, row: Row) -> None:
     conditions = "; ".join(part for part in (row.get("conditions", ""), *remarks) if part)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    full = {**measurement.columns, **shared, **row, "conditions": conditions}
+    full = {**shared, **measurement.columns, **row, "conditions": conditions}
     if plan.rerun or not table.has(full):  # every start reads a chain that another machine finished
       table.add({**full, "date": now})
     where = [row["setting"]] if "setting" in row else []

@@ -31,9 +31,9 @@ class Plain:
 
 
 def test_types_and_lists():
-  given = ["tasks=A,B", "sizes=[4, 1e3]", "seconds=2", "rerun=true", "agent.num_envs=64", "hardware=cpu"]
+  given = ["tasks=A,B", "sizes=[4, 1e3]", "seconds=2", "rerun=true", "agent.num_envs=64", "++hardware=cpu"]
   assert parse("some", Some, given) == Some(
-    ("A", "B"), (4, 1000), 2.0, rerun=True, overrides=("agent.num_envs=64", "hardware=cpu")
+    ("A", "B"), (4, 1000), 2.0, rerun=True, overrides=("agent.num_envs=64", "++hardware=cpu")
   )
   assert parse("some", Some, ["out=null"]).out is None
   assert parse("some", Some, ["tasks=A,B,A", "sizes=2,2.0"]) == Some(("A", "B"), (2,)), "each once"

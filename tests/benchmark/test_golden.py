@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 from playground.benchmark import golden
-from playground.benchmark.golden import Golden, Options, judge, measurement, read, run
+from playground.benchmark.golden import Golden, Options, judge, read, run
 from playground.benchmark.jobs import Measurement
 from playground.benchmark.schema import Table
+from playground.config import compose
 from playground.config.files import shipped
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError
 
@@ -47,7 +48,7 @@ def test_the_committed_sets() -> None:
 def test_the_committed_runs_are_valid() -> None:
   for runs in read(shipped("benchmarks") / "golden.yaml").values():
     for each in runs.values():
-      assert measurement(each, Options()).columns["agent"]
+      assert compose(each.overrides).agent_name
 
 
 @pytest.mark.parametrize(
@@ -110,6 +111,27 @@ def test_a_metric_that_the_table_lacks_is_measured(tmp_path: Path, monkeypatch: 
   assert left(tmp_path, monkeypatch) and not left(tmp_path, monkeypatch)
   more = ONE.replace("metrics: {", "metrics: {eval/episode_fall: [0, 30], ")
   assert left(tmp_path, monkeypatch, more) and not left(tmp_path, monkeypatch, more)
+
+
+def test_each_run_is_on_its_own_hardware(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  def probe(overrides: Sequence[str], gpus: Sequence[int]) -> tuple[int, dict[str, str]]:
+    probed.append(compose(overrides).hardware.devices or 8)
+    return probed[-1], {**FACTS, "device": f"device {len(probed)}"}
+
+  def measure(jobs: Sequence[Measurement], table: Table, machine: Mapping[str, Any], plan: Options) -> int:
+    found.extend((job.columns["device"], job.columns["devices"]) for job in jobs)
+    return 1
+
+  probed: list[int] = []
+  found: list[tuple[str, str]] = []
+  monkeypatch.setattr(golden, "probe", probe)
+  monkeypatch.setattr(golden, "run_jobs", measure)
+  entry = ONE.partition("cpu:\n")[2]
+  others = entry.replace("pole:", "one:").replace("tuned=null", "tuned=null, ++hardware.devices=1")
+  text = ONE + others + others.replace("one:", "same:")
+  assert run(Options(table=write(tmp_path, text), out=str(tmp_path / "rows.csv"))) == 1
+  assert probed == [8, 1]
+  assert found == [("device 1", "8"), ("device 2", "1"), ("device 2", "1")]
 
 
 def test_other_overrides_are_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,6 +74,14 @@ def test_rows_have_their_columns(tmp_path: Path):
     )
 
 
+def test_the_device_of_a_measurement_is_not_that_of_all(tmp_path: Path):
+  table = Table(tmp_path / "rows.csv")
+  own = job("train")
+  own = dataclasses.replace(own, columns={**own.columns, "device": "its own"})
+  assert run_jobs([own, job("train", "B")], table, FACTS, PLAN) == 0
+  assert table.has({"task": "A", "device": "its own"}) and table.has({"task": "B", "device": "a device"})
+
+
 def test_what_was_run_earlier_keeps_its_commit(tmp_path: Path):
   table = Table(tmp_path / "rows.csv")
   assert run_jobs([job("read")], table, FACTS, PLAN) == 0

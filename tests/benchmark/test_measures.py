@@ -288,6 +288,21 @@ def test_rows_of_another_number_of_devices_are_not_those_of_all(tmp_path: Path):
     assert on_four.left(table, "a GPU") == on_four
 
 
+def test_the_machine_is_asked_about_the_hardware_of_the_overrides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+  probed: list[str] = []
+
+  def probe(overrides: list[str], gpus: list[int]) -> tuple[int, dict[str, str]]:
+    probed.extend(overrides)
+    return 1, {"device": "a GPU", "versions": ""}
+
+  monkeypatch.setattr(commands, "probe", probe)
+  monkeypatch.setattr(commands, "run_jobs", lambda *_: 0)
+  hardware = ["++hardware=cpu", "+hardware.devices=1", "hardware.kind=null"]
+  command = Startup(tasks=("CheetahRun",), out=str(tmp_path / "rows.csv"), overrides=("env.impl=jax", *hardware))
+  assert commands.run(command) == 0
+  assert probed == ["env=CartpoleBalance", *hardware]
+
+
 def test_topology_has_all_devices_and_may_have_several_workers():
   Topology(tasks=("CheetahRun",), workers=4).check()
   with pytest.raises(ConfigError, match=r"gpus=\[0, 1\]: topology uses the devices itself"):

@@ -21,8 +21,8 @@ INTERVAL_S = 0.5  # s between two queries of the driver
 
 
 def measure(rows: Rows, overrides: list[str]) -> None:
-  """Emits a row with the number of devices of a run with these overrides."""
-  hardware = setup(compose(["env=CartpoleBalance", *overrides]).hardware)
+  """Emits a row with the number of devices of the run that these overrides compose."""
+  hardware = setup(compose(overrides).hardware)
   rows.emit("devices", hardware.mesh.size, "", device=device_name(), versions=versions())
 
 
