@@ -70,7 +70,7 @@ def evaluate_run(
   report = {"checkpoint": str(checkpoint.path), "episodes": count, "seed": seed, "deterministic": deterministic}
   report |= {"scores": scores} | hardware.machine
   report |= {"hardware_in_paper": real} if real else {}
-  name = f"step_{checkpoint.step:012d}_seed_{seed}{'_deterministic' * deterministic}.json"
+  name = f"step_{checkpoint.step:012d}_seed_{seed}_episodes_{count}{'_deterministic' * deterministic}.json"
   save(trained.run_dir.path / "eval" / name, report, console)
   if film:
     render_video(

@@ -118,7 +118,7 @@ def play(
   origin = exported.contract["origin"]
   console.print(_table(exported.contract, episodes, scores))
   if opened.folder is not None:
-    out = opened.folder / f"play_step_{origin['steps']:012d}_seed_{seed}{'' if interval_events else '_no_events'}.json"
+    out = opened.folder / result_name(origin["steps"], seed, episodes, interval_events)
     played = {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "interval_events": interval_events}
     save(out, played | {"scores": scores, "origin": origin}, console)
   if film:
@@ -131,6 +131,11 @@ def play(
       **episodes_of(recording, 1),
     )
   return 0
+
+
+def result_name(steps: int, seed: int, episodes: int, interval_events: bool = True) -> str:
+  """Returns the file name of a result; results of other settings have other names, so that none replaces another."""
+  return f"play_step_{steps:012d}_seed_{seed}_episodes_{episodes}{'' if interval_events else '_no_events'}.json"
 
 
 @dataclasses.dataclass(frozen=True)

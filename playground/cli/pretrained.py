@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from playground import catalog
-from playground.cli.play import play
+from playground.cli.play import play, result_name
 from playground.deploy.export import export_run
 from playground.errors import ConfigError
 from playground.files import read_json
@@ -65,8 +65,8 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
       f"{old['c_mujoco']['return']:g} in C MuJoCo. --replace replaces it."
     )
   export_run(path)
-  result = run.path / f"export/play_step_{steps:012d}_seed_0.json"
-  if read_json(result).get("episodes") != _EPISODES:
+  result = run.path / "export" / result_name(steps, seed=0, episodes=_EPISODES)
+  if not result.is_file():
     play(path, episodes=_EPISODES)
   scores = read_json(result)["scores"]
   row = newest_evaluation(run.metrics_csv, steps)

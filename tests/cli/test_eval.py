@@ -45,8 +45,8 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
   return lambda *args: call("eval", *args)
 
 
-def report(run: Path, step: int, seed: int = 0, mode: str = "") -> dict[str, Any]:
-  return json.loads((run / "eval" / f"step_{step:012d}_seed_{seed}{mode}.json").read_text())
+def report(run: Path, step: int, seed: int = 0, mode: str = "", episodes: int = 4) -> dict[str, Any]:
+  return json.loads((run / "eval" / f"step_{step:012d}_seed_{seed}_episodes_{episodes}{mode}.json").read_text())
 
 
 def test_a_run_is_evaluated_at_its_newest_checkpoint(
@@ -60,14 +60,16 @@ def test_a_run_is_evaluated_at_its_newest_checkpoint(
   assert written["scores"]["episode_length"] == 20
   assert re.search(rf"reward\W+{written['scores']['episode_reward']:.4g}\b", out)
   assert "CartpoleBalance, 4 episodes, 4,000 steps trained" in " ".join(out.split())
-  assert f"written to {trained}/eval/step_000000004000_seed_0.json" in out
+  assert f"written to {trained}/eval/step_000000004000_seed_0_episodes_4.json" in out
 
 
 def test_one_checkpoint_with_more_episodes_and_another_seed(command: Command, trained: Path) -> None:
   older = find_checkpoints(trained)[1]
   assert command(str(older), "--episodes", "6", "--seed", "3") == 0
-  written = report(trained, 2000, seed=3)
+  written = report(trained, 2000, seed=3, episodes=6)
   assert (written["checkpoint"], written["episodes"], written["seed"]) == (str(older), 6, 3)
+  assert command(str(older), "--episodes", "2", "--seed", "3") == 0
+  assert report(trained, 2000, seed=3, episodes=6) == written, "fewer episodes do not replace more"
 
 
 def test_what_the_paper_measured_on_a_real_robot_stands_beside(

@@ -57,16 +57,19 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
   for policy in (run, run / "export" / "policy.onnx"):
     assert command("play", str(policy), "--episodes", "3", "--seed", "4") == 0
     shown = " ".join(capsys.readouterr().out.split())
-    report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4.json").read_text())
+    report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_episodes_3.json").read_text())
     assert (report["simulator"], report["episodes"]) == ("C MuJoCo", 3)
     scores.append(report["scores"])
     assert "MJX-Warp in training" in shown
     assert re.search(rf"reward\W+{scores[-1]['episode_reward']:.4g}\W+12.5\b", shown)
   assert scores[0] == scores[1]
   assert command("play", str(run), "--episodes", "3", "--seed", "4", "--no-events") == 0
-  report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_no_events.json").read_text())
+  report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_episodes_3_no_events.json").read_text())
   assert not report["interval_events"] and report["scores"] == scores[0], "Cartpole has no interval events"
   assert 0 < scores[0]["episode_reward"] < 40 == scores[0]["episode_length"]
+  assert command("play", str(run), "--episodes", "1", "--seed", "4") == 0
+  report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_episodes_3.json").read_text())
+  assert report["episodes"] == 3, "fewer episodes do not replace more"
 
 
 @pytest.mark.slow
@@ -86,7 +89,7 @@ def test_a_policy_that_sees(command: Command, tmp_path: Path, capsys: pytest.Cap
   dark, bright = ExportedPolicy.load(tmp_path / "policy.onnx").actions(obs)
   assert np.abs(dark - bright) > 0.01
   assert command("play", str(tmp_path / "policy.onnx"), "--episodes", "2") == 0
-  scores = json.loads((tmp_path / f"play_step_{STEPS:012d}_seed_0.json").read_text())["scores"]
+  scores = json.loads((tmp_path / f"play_step_{STEPS:012d}_seed_0_episodes_2.json").read_text())["scores"]
   assert 0 < scores["episode_reward"] < 10 == scores["episode_length"]
 
 
