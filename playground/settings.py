@@ -38,6 +38,7 @@ class Setting:
     limit: of the numbers, None if there is none.
     choices: the allowed texts, None if any is allowed.
     text_depth: 0 for text, 1 for a list of texts, 2 for a list of such lists; None if it is no text.
+    mapping: whether only a mapping is allowed, as for a nested class.
     nullable: whether null is allowed.
     help: one line.
   """
@@ -47,6 +48,7 @@ class Setting:
   limit: Limit | None
   choices: tuple[str, ...] | None
   text_depth: int | None
+  mapping: bool
   nullable: bool
   help: str
 
@@ -83,13 +85,18 @@ def build(cls: type[T], values: Section, key: str = "") -> T:
     key: where they are, such as agent; without it, unknown fields are ignored.
 
   Raises:
+    ConfigError: a field without default is missing.
     UnknownNameError: the class, whose values are at `key`, has no such field.
   """
   hints = _hints(cls)
-  known = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+  all_fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+  known = [field.name for field in all_fields]
   if key and (unknown := [name for name in values if name not in known]):
     raise UnknownNameError(f"{key}.{unknown[0]} does not exist.{nearest(unknown[0], known)}")
   fields = {name: values[name] for name in known if name in values}
+  needed = [field.name for field in all_fields if field.default is field.default_factory is dataclasses.MISSING]
+  if missing := [name for name in needed if name not in fields]:
+    raise ConfigError(f"{join(key, missing[0])} is missing.")
   for name, value in fields.items():
     if (inner := nested(hints[name])) and isinstance(value, Mapping):
       fields[name] = build(inner, value, key and f"{key}.{name}")
@@ -213,6 +220,7 @@ def _setting(name: str, hint: Any, default: object) -> Iterator[Setting]:
   options = members(get_args(hint)[0] if metadata else hint)
   depths = [_text_depth(option) for option in options]
   mappings = [option for option in options if get_origin(option) is Mapping]
+  classes = [option for option in options if dataclasses.is_dataclass(option) and isinstance(option, type)]
   limit = next((entry for entry in metadata if isinstance(entry, Limit)), None)
   text = next((entry for entry in metadata if isinstance(entry, str)), "")
   yield Setting(
@@ -221,17 +229,17 @@ def _setting(name: str, hint: Any, default: object) -> Iterator[Setting]:
     limit=None if mappings else limit,
     choices=next((get_args(option) for option in options if get_origin(option) is Literal), None),
     text_depth=next((depth for depth in depths if depth is not None), None),
+    mapping=all(option in (*mappings, *classes, type(None)) for option in options),
     nullable=type(None) in options,
     help=text,
   )
-  for option in options:
-    if dataclasses.is_dataclass(option) and isinstance(option, type):
-      yield from _settings(option, f"{name}.")
+  for option in classes:
+    yield from _settings(option, f"{name}.")
   for _, value in map(get_args, mappings):
     if is_typeddict(value):
       yield from _settings(value, f"{name}.*.")
     else:
-      yield Setting(f"{name}.*", dataclasses.MISSING, limit, None, _text_depth(value), False, text)
+      yield Setting(f"{name}.*", dataclasses.MISSING, limit, None, _text_depth(value), False, False, text)
 
 
 def _default(field: "dataclasses.Field[object]", hint: object) -> object:

@@ -428,6 +428,47 @@ def test_errors_are_one_sentence(line: str):
   assert isinstance(caught.value, UnknownNameError) == ("does not exist" in message and "=/nowhere" not in line)
 
 
+ROBOT_FILES = {  # a line of a robot's file: the error, or what begins it
+  "pd: {kd: 1}": "env.robot.pd.kd does not exist. Did you mean 'kv'?",
+  "pd: 5": "env.robot.pd=5 has the wrong type: it must be a mapping, such as",
+  "floor_contacts: null": "env.robot.floor_contacts=null has the wrong type: it must be a list of texts.",
+  "mjcf: null": "env.robot.mjcf=null has the wrong type: it must be text",
+  "sensors: [gyro]": "env.robot.sensors=[gyro] has the wrong type: it must be a mapping",
+  "gaits: [1]": "env.robot.gaits=[1] has the wrong type: it must be a mapping",
+  "gaits: {trot: 3}": "env.robot.gaits.trot=3 must be a list of numbers from",
+  "target_range: [0, 1]": "env.robot.target_range=[0, 1] has the wrong type: it must be a mapping",
+  "target_range: {lower: [0]}": "env.robot.target_range.upper is missing.",
+  "mirror: [FL]": "env.robot.mirror=[FL] has the wrong type: it must be a mapping",
+  "mirror: {FL: null}": "env.robot.mirror.FL=null has the wrong type: it must be text",
+  "restricted_range: [1]": "env.robot.restricted_range=[1] has the wrong type: it must be a mapping",
+  "name: {a: b}": "env.robot.name={a: b} has the wrong type: it must be text",
+  "pose_weights: 1": "env.robot.pose_weights=1 must be a list of numbers from 0 to",
+  "hips: ${no.such}": "env.robot.hips: Interpolation key 'no.such' not found.",
+}
+
+
+@pytest.mark.parametrize("line", ROBOT_FILES)
+def test_a_robots_file_with_a_wrong_type_is_refused(configs: Path, line: str):
+  kept = re.sub(rf"(?m)^{line.partition(':')[0]}:.*\n(^ .*\n)*", "", (configs / "robot/go1.yaml").read_text())
+  (configs / "robot/mine.yaml").write_text(f"{kept}{line}\n")
+  with pytest.raises(ConfigError, match=re.escape(ROBOT_FILES[line])):
+    compose(["env=joystick", "robot=mine"], configs)
+
+
+def test_a_robots_file_must_be_a_mapping_in_its_package(configs: Path):
+  head, mine = "# @package env.robot\n", configs / "robot/mine.yaml"
+  go1 = (configs / "robot/go1.yaml").read_text()
+  for text, message in {
+    f"{head}- name\n- mjcf\n": "env.robot=[name, mjcf] has the wrong type: it must be a mapping",
+    f"{head}5\n": "The files of env=joystick robot=mine do not compose: Invalid loaded object type: int.",
+    go1.removeprefix(head): "robot=mine: the first line of its file must be `# @package env.robot`.",
+    f"# Mine.\n{go1}": "robot=mine: the first line of its file must be `# @package env.robot`.",
+  }.items():
+    mine.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(message)):
+      compose(["env=joystick", "robot=mine"], configs)
+
+
 MOVED = {
   "env.reward.scales.feet_slip=-1": "env.rewards.feet_slip_l2.weight",
   "env.reward.tracking_sigma=1": "env.rewards.<term>.params",

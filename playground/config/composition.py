@@ -228,6 +228,8 @@ def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
   if "robot" in changes.groups or not changes.is_known or any(text.startswith("robot=") for text in groups):
     _check_robot(choices, roots)
   if OmegaConf.is_missing(config.env, "robot"):
+    if robot := choices.get("robot"):
+      raise ConfigError(f"robot={robot}: the first line of its file must be `# @package env.robot`.")
     raise ConfigError(
       f"env={choices['env']} needs a robot: add robot=<name>, one of {', '.join(options('robot', roots))}."
     )
@@ -303,7 +305,7 @@ def _hydra(
       lines = [*overrides, *search_path_override(roots)]
       config = hydra.compose(name, overrides=lines, return_hydra_config=True)
       chosen = dict(config.hydra.runtime.choices)
-  except (HydraException, YAMLError, OmegaConfBaseException, ValueError, RecursionError) as error:
+  except (HydraException, YAMLError, OmegaConfBaseException, ValueError, OSError, RecursionError) as error:
     files = " ".join(o for o in overrides if not o.startswith("~"))
     raise ConfigError(f"The files of {files or f'{name}.yaml'} do not compose: {first_line(error)}.") from None
   finally:
@@ -338,8 +340,11 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Section) -
 
 
 def _plain(config: object) -> Plain:
-  """Returns plain dicts and lists, with the interpolations of our files resolved."""
-  return OmegaConf.to_container(config if isinstance(config, DictConfig) else _literal(config), resolve=True)
+  """Returns plain dicts and lists, with the interpolations of files resolved."""
+  try:
+    return OmegaConf.to_container(config if isinstance(config, DictConfig) else _literal(config), resolve=True)
+  except OmegaConfBaseException as error:
+    raise ConfigError(f"{error.full_key}: {first_line(error)}.") from None
 
 
 def _literal(values: object) -> DictConfig:

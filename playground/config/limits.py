@@ -6,28 +6,32 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from playground.config.definitions import chosen_names, definition
 from playground.config.schema import is_of_terms
-from playground.envs.options import uses_vision
+from playground.envs.options import CubeKeys, PdKeys, TargetRangeKeys, uses_vision
 from playground.errors import ConfigError
 from playground.limits import Limit
-from playground.settings import Plain, Section, check_value
-from playground.text import format_value, join
+from playground.settings import Plain, Section, build, check_value
+from playground.text import format_value, join, wrong_type
 
+_OF_A_ROBOT = {"pd": PdKeys, "target_range": TargetRangeKeys, "cube": CubeKeys}  # mappings that have no other keys
 _XLA_SWITCH = re.compile(r"--xla_\w+(=(true|false|-?\d+(\.\d+)?))?")
 _XLA_PLACES = ("dir", "path", "file", "dump", "load", "cache", "option", "override", "_to", "_from")  # in flags' names
 
 
 def check_limits(resolved: Section) -> None:
-  """Checks all values of a configuration, which may lack sections; null is not checked.
+  """Checks all values of a configuration, which may lack sections; null is checked in `env.robot` alone.
 
   Raises:
     ConfigError: the first invalid value.
   """
   names = chosen_names(resolved)
-  for key, value in _leaves(resolved):
-    if value is not None and not is_of_terms(key):
+  for key, value in _nodes(resolved):
+    is_leaf = value is not None and not (isinstance(value, Mapping) and value)
+    if is_leaf and not is_of_terms(key):
       _check(key, value, names)
   _check_xla_flags(resolved.get("hardware", {}).get("xla_flags"))
   env = resolved.get("env", {})
+  if "robot" in env:
+    _check_robot(env["robot"])
   _check_order(env, "env")
   contacts, convex = env.get("naconmax_per_env"), env.get("naccdmax_per_env")
   if contacts is not None and convex is not None and convex > contacts:
@@ -40,6 +44,19 @@ def _check(key: str, value: object, names: Mapping[str, object]) -> None:
     check_value(key, value, setting)
   if (setting is None or setting.limit is None) and _numbers(value) and not Limit().each.allows(value):
     raise ConfigError(f"{key}={format_value(value)} must be {Limit().each}.")
+
+
+def _check_robot(robot: Plain) -> None:
+  """Checks `env.robot`, all of which is of a robot's file: no default says which values are mappings, lists or null."""
+  for key, value in _nodes({"env.robot": robot}):
+    if (setting := definition(key, {})) is None or (value is None and setting.nullable):
+      continue
+    if setting.mapping and not isinstance(value, Mapping):
+      raise wrong_type(key, value, "a mapping, such as {name: value}")
+    check_value(key, value, setting)
+  for name, cls in _OF_A_ROBOT.items():
+    if robot.get(name):
+      build(cls, robot[name], f"env.robot.{name}")
 
 
 def _check_order(node: Section, key: str) -> None:
@@ -75,10 +92,9 @@ def _numbers(value: object) -> list[float]:
   return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
-def _leaves(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
-  """Yields dotted keys and values of everything that is no mapping, or an empty one."""
+def _nodes(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
+  """Yields all dotted keys with their values, a mapping before its own keys."""
   for name, value in node.items():
-    if isinstance(value, Mapping) and value:
-      yield from _leaves(value, join(prefix, name))
-    else:
-      yield join(prefix, name), value
+    yield join(prefix, name), value
+    if isinstance(value, Mapping):
+      yield from _nodes(value, join(prefix, name))

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from playground.limits import MOST, SHARE, VECTOR, Limit, at_least_0, count, positive, span
 
 TERMS = dict[str, Any]
+_NUMBERS = Limit(form="list")
 _DELAY = Limit(0, 1000, whole=True, form="list", length=2, rising=True)
 
 
@@ -65,9 +66,9 @@ class TermsConfig:
 class PdKeys:
   """Keys of `env.robot.pd`; null leaves the MJCF's own, which may differ between joints."""
 
-  kp: Annotated[float | None, at_least_0(), "position gain of every servo, N m/rad"]
-  kv: Annotated[float | None, at_least_0(), "velocity gain of every servo, N m s/rad"]
-  damping: Annotated[float | None, at_least_0(), "damping of every joint, N m s/rad"]
+  kp: Annotated[float | None, at_least_0(), "position gain of every servo, N m/rad"] = None
+  kv: Annotated[float | None, at_least_0(), "velocity gain of every servo, N m s/rad"] = None
+  damping: Annotated[float | None, at_least_0(), "damping of every joint, N m s/rad"] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,8 +101,8 @@ class SensorKeys:
 class TargetRangeKeys:
   """Keys of `env.robot.target_range`."""
 
-  lower: Annotated[Sequence[float], Limit().each, "lowest target of each joint, rad"]
-  upper: Annotated[Sequence[float], Limit().each, "highest target of each joint, rad"]
+  lower: Annotated[Sequence[float], _NUMBERS, "lowest target of each joint, rad"]
+  upper: Annotated[Sequence[float], _NUMBERS, "highest target of each joint, rad"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,8 +121,8 @@ class RobotKeys:
   hips: Annotated[Sequence[str], "hip joints that do not swing the leg, which terms keep near the default pose"]
   hip_rolls: Annotated[Sequence[str], "hip joints that move the leg sideways"]
   knees: Annotated[Sequence[str], "knee joints"]
-  pose_weights: Annotated[Sequence[float], at_least_0().each, "weight of each joint in rewards of the pose"]
-  gaits: Annotated[Mapping[str, Sequence[float]], Limit().each, "first phase of each foot, rad: -pi lifts off, 0 is up"]
+  pose_weights: Annotated[Sequence[float], Limit(0, form="list"), "weight of each joint in rewards of the pose"]
+  gaits: Annotated[Mapping[str, Sequence[float]], _NUMBERS, "first phase of each foot, rad: -pi lifts off, 0 is up"]
   restricted_range: Annotated[
     Mapping[str, Sequence[float]], span(-MOST), "with env.restricted_joint_range: limits, rad"
   ]

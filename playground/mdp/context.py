@@ -12,6 +12,8 @@ import numpy as np
 from playground.errors import ConfigError, UnknownNameError, lookup, nearest
 from playground.mdp.options import mirrors_as
 from playground.physics.backend import PhysicsData
+from playground.settings import is_text, plain
+from playground.text import format_value
 
 if TYPE_CHECKING:
   from playground.envs.task import Task
@@ -42,9 +44,9 @@ class Robot:
     starts, sizes = mj_model.sensor_adr, mj_model.sensor_dim
     self._rows = {mj_model.sensor(i).name: starts[i] + np.arange(sizes[i]) for i in range(mj_model.nsensor)}
     for name, parts in (sensors or {}).items():
-      if not parts:
-        raise ConfigError(f"env.robot.sensors.{name} must name one or more.")
       key = f"env.robot.sensors.{name}"
+      if not parts or not (isinstance(parts, str) or is_text(parts, 1)):
+        raise ConfigError(f"{key}={format_value(plain(parts))} must name a sensor, or be a list of names.")
       self._rows[name] = np.concatenate([self.rows(p, key) for p in ([parts] if isinstance(parts, str) else parts)])
 
   def find(self, kind: str, name: str, key: str = "env.robot") -> int:

@@ -40,7 +40,7 @@ def drawn_model(env: Env, visuals: str) -> mujoco.MjModel:
 
 
 def _with_meshes(env: Env) -> mujoco.MjModel:
-  robot = env.config.robot.name if env.spec is not None and "robot" in env.config else None
+  robot = env.config.robot.get("name") if env.spec is not None and "robot" in env.config else None
   if robot not in MENAGERIE or env.spec is None:
     known = ", ".join(MENAGERIE)
     raise ConfigError(f"video.visuals=menagerie: only {known} have meshes; set video.visuals=primitives.")

@@ -56,7 +56,7 @@ class LeggedTask(Task):
     spec = build_scene(robot.mjcf, **ground, collision=scene.collision, floor_contacts=tuple(robot.floor_contacts))
     if config.restricted_joint_range:
       if "restricted_range" not in config.robot:
-        raise ConfigError(f"env.restricted_joint_range: robot={config.robot.name} has no restricted_range.")
+        raise ConfigError(f"env.restricted_joint_range: robot={config.robot.get('name')} has no restricted_range.")
       joints = {joint.name: joint for joint in spec.joints}
       for name in config.robot.restricted_range:
         lookup(joints, name, "env.robot.restricted_range").range = config.robot.restricted_range[name]
