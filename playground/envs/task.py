@@ -70,7 +70,8 @@ class Task(Env):
     try:
       mj_model = spec.compile()
     except ValueError as error:  # MuJoCo's: a mesh that is missing, a name that is there twice
-      raise ConfigError(f"MuJoCo cannot compile the task's scene: {first_line(error)}.") from None
+      remedy = "; rename it in the robot's MJCF" * ("repeated name" in str(error))
+      raise ConfigError(f"MuJoCo cannot compile the task's scene: {first_line(error)}{remedy}.") from None
     self.prepare_model(mj_model, config)
     self.rewards = RewardManager(config.rewards)
     self.terminations = TerminationManager(config.terminations)

@@ -48,11 +48,13 @@ class LeggedRobot(Robot):
     joints = [mj_model.joint(i).name for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
       raise ConfigError(f"env.robot.joints must name the model's joints in their order: {', '.join(joints)}.")
-    on_joints = (mj_model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT).all()
-    driven = [mj_model.joint(i).name for i in mj_model.actuator_trnid[:, 0]] if on_joints else ["other parts"]
+    on_joint = mj_model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    parts = zip(on_joint, mj_model.actuator_trnid[:, 0], strict=True)
+    driven = [mj_model.joint(i).name if joint else "another part" for joint, i in parts]
     if driven != joints:
-      shown = ", ".join(driven)
-      raise ConfigError(f"env.robot.mjcf needs a servo for each joint, in the order of the joints: its drive {shown}.")
+      missing = [name for name in joints if name not in driven]
+      found = f"there is none for {', '.join(missing)}" if missing else f"its servos drive {', '.join(driven)}"
+      raise ConfigError(f"env.robot.mjcf needs a servo for each joint, in the order of the joints: {found}.")
     _check_lengths(config)
     super().__init__(mj_model, joints, config.sensors)
     self.init_qpos = self.keyframe(config.keyframe)

@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 
 from playground.errors import ConfigError, lookup
-from playground.robots.scene import add_studio_floor, attach, check_keys, read_mjcf
+from playground.robots.scene import add_studio_floor, added_to, attach, check_keys, read_mjcf
 
 # How the cube lies in the keyframe `home` (w x y z), and where the goal is then (m).
 _CUBE_ORIENTATION = (0.810966968, -0.0026289499, -0.585085977, -0.00025430299)
@@ -25,7 +25,8 @@ def build_in_hand_scene(robot: Any) -> mujoco.MjSpec:
       (position in the keyframe, m).
 
   Raises:
-    ConfigError: a key or the file is missing or invalid, it lacks keyframe or site, or `start` is not three numbers.
+    ConfigError: a key or the file is missing or invalid, it lacks keyframe or site or has a name of the scene, or
+      `start` is not three numbers.
   """
   check_keys(robot, ("mjcf", "cube", "sensors"), "hand")
   if len(robot.cube.start) != 3:
@@ -33,19 +34,20 @@ def build_in_hand_scene(robot: Any) -> mujoco.MjSpec:
   spec = read_mjcf(robot.mjcf)
   lookup({key.name: key for key in spec.keys}, "home", f"keyframes of env.robot.mjcf={robot.mjcf}")
   lookup({site.name: site for site in spec.sites}, "grasp_site", f"sites of env.robot.mjcf={robot.mjcf}")
-  add_studio_floor(spec, -0.25, contype=2, conaffinity=2)
-  attach(spec, "props/hand_cube")
-  collides = spec.geom("cube")
-  scale, collides.mass = robot.cube.half_size / collides.size[0], robot.cube.mass
-  for geom in spec.body("cube").geoms:
-    geom.size, geom.pos = scale * geom.size, scale * geom.pos
-  site, kind = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtSensor.mjSENS_FRAMEPOS
-  spec.add_sensor(name="palm_position", type=kind, objtype=site, objname="grasp_site")
-  tips = [each.name for each in spec.sites if each.name.endswith("_tip")]
-  for tip in sorted(tips, key=lambda name: name != "th_tip"):
-    palm = {"reftype": site, "refname": "grasp_site"}
-    spec.add_sensor(name=f"{tip}_position", type=kind, objtype=site, objname=tip, **palm)
-  attach(spec, "props/hand_goal")
+  with added_to(robot.mjcf):
+    add_studio_floor(spec, -0.25, contype=2, conaffinity=2)
+    attach(spec, "props/hand_cube")
+    collides = spec.geom("cube")
+    scale, collides.mass = robot.cube.half_size / collides.size[0], robot.cube.mass
+    for geom in spec.body("cube").geoms:
+      geom.size, geom.pos = scale * geom.size, scale * geom.pos
+    site, kind = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtSensor.mjSENS_FRAMEPOS
+    spec.add_sensor(name="palm_position", type=kind, objtype=site, objname="grasp_site")
+    tips = [each.name for each in spec.sites if each.name.endswith("_tip")]
+    for tip in sorted(tips, key=lambda name: name != "th_tip"):
+      palm = {"reftype": site, "refname": "grasp_site"}
+      spec.add_sensor(name=f"{tip}_position", type=kind, objtype=site, objname=tip, **palm)
+    attach(spec, "props/hand_goal")
   home = spec.key("home")
   home.qpos = [*home.qpos, *robot.cube.start, *_CUBE_ORIENTATION]
   home.mpos, home.mquat = _GOAL_IN_KEYFRAME, (1, 0, 0, 0)

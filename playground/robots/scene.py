@@ -11,7 +11,8 @@ the solver's options. A few conventions let this file work for all of them:
 """
 
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from playground.text import first_line
 
 ROBOTS = Path(__file__).parent
 Gains = float | Sequence[float] | None  # of all servos, or of each
+_POSITIONS = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of a joint in qpos, if not 1
 _OF_KEYFRAMES = ("qpos", "qvel", "act", "ctrl", "mpos", "mquat")
 GROUND = "studio/groundplane"  # material of the floor
 
@@ -46,7 +48,10 @@ def find_mjcf(mjcf: str) -> Path:
   if (path := Path(mjcf)).is_file():
     return path
   package, _, rest = mjcf.partition("/")
-  spec = importlib.util.find_spec(package) if package.isidentifier() else None
+  try:
+    spec = importlib.util.find_spec(package) if package.isidentifier() else None
+  except ValueError:  # of `__main__`, which is no package
+    spec = None
   for folder in (spec.submodule_search_locations or ()) if spec else ():
     if (path := Path(folder) / rest).is_file():
       return path
@@ -57,12 +62,29 @@ def find_mjcf(mjcf: str) -> Path:
 
 
 def read_mjcf(mjcf: str) -> mujoco.MjSpec:
-  """Reads a robot's MJCF, see `find_mjcf`; raises ConfigError where MuJoCo cannot."""
+  """Reads a robot's MJCF, see `find_mjcf`; raises ConfigError where MuJoCo cannot, or where it has no body."""
   path = find_mjcf(mjcf)
   try:
-    return mujoco.MjSpec.from_file(str(path))
+    spec = mujoco.MjSpec.from_file(str(path))
   except ValueError as error:
     raise ConfigError(f"env.robot.mjcf={mjcf} is not an MJCF that MuJoCo reads: {first_line(error)}.") from None
+  if spec.worldbody.first_body() is None:
+    raise ConfigError(f"env.robot.mjcf={mjcf} has no body: the robot must be the first body of its <worldbody>.")
+  return spec
+
+
+@contextmanager
+def added_to(mjcf: str) -> Iterator[None]:
+  """Raises ConfigError where MuJoCo refuses what a scene adds to a robot's MJCF, such as a name that is there twice."""
+  try:
+    yield
+  except ValueError as error:
+    if not str(error).startswith("Error: "):  # as MuJoCo's begin
+      raise
+    remedy = "; rename it in the MJCF" * ("repeated name" in str(error))
+    raise ConfigError(
+      f"env.robot.mjcf={mjcf} clashes with what the scene adds to it: {first_line(error)}{remedy}."
+    ) from None
 
 
 def check_keys(robot: Mapping[str, Any], keys: Sequence[str], what: str) -> None:
@@ -91,18 +113,20 @@ def build_scene(
       in this order, after the robot's own sensors, but before the first of contacts between its parts and what follows.
 
   Raises:
-    ConfigError: an invalid MJCF or parameter, a floor in the MJCF, an unknown name, or a collision variant that the
-      robot has no geoms for.
+    ConfigError: an invalid MJCF or parameter, a floor or another name of the scene in the MJCF, an unknown name, or a
+      collision variant that the robot has no geoms for.
   """
   activate = lookup(COLLISIONS, collision, "env.scene.collision")
   spec = read_mjcf(mjcf)
+  _check_qpos(spec, mjcf)
   if any(geom.name == "floor" for geom in spec.geoms):
     raise ConfigError(f"env.robot.mjcf={mjcf} has a geom named floor: remove it, the scene adds the ground.")
   if collision != "feet" and not _full_geoms(spec):
     raise ConfigError(f"collision={collision}: {Path(mjcf).stem} has geoms for the feet only, choose collision=feet.")
   activate(spec)
-  add_studio(spec)
-  _set_keyframes(spec, add_terrain(spec, terrain, parameters or {}))
+  with added_to(mjcf):
+    add_studio(spec)
+    _set_keyframes(spec, add_terrain(spec, terrain, parameters or {}))
   spec.geom("floor").material = GROUND
   if terrain != "flat":
     for geom in spec.geoms:  # MJX on JAX knows no contact of a cylinder with a height field: rounds off its ends
@@ -111,8 +135,21 @@ def build_scene(
   geoms = {geom.name: geom for geom in spec.geoms if geom.name}
   for name in floor_contacts:
     lookup(geoms, name, "env.robot.floor_contacts")
-  add_floor_contacts(spec, floor_contacts)
+  with added_to(mjcf):
+    add_floor_contacts(spec, floor_contacts)
   return spec
+
+
+def _check_qpos(spec: mujoco.MjSpec, mjcf: str) -> None:
+  """Raises ConfigError where the first joint is not free, or where a keyframe has another length than `qpos`."""
+  if not spec.joints or spec.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
+    body = spec.worldbody.first_body().name
+    raise ConfigError(f"env.robot.mjcf={mjcf} needs <freejoint/> as its first joint, in the body {body}.")
+  size = sum(_POSITIONS.get(joint.type, 1) for joint in spec.joints)
+  for key in spec.keys:
+    if len(key.qpos) not in (0, size):  # MuJoCo fills a short one with zeros
+      needed = f"qpos must have {size} numbers, 7 for the free joint and 1 for each hinge or slide"
+      raise ConfigError(f"env.robot.mjcf={mjcf}: {needed}, but the keyframe {key.name} has {len(key.qpos)}.")
 
 
 def _feet(spec: mujoco.MjSpec) -> None:
@@ -153,6 +190,8 @@ def _set_keyframes(spec: mujoco.MjSpec, peak: float) -> None:
       spec.key(name).qpos, lift[name] = key.qpos, max(0.0, peak - _ROUGH)
     spec.delete(key)
   for key in spec.keys:
+    if len(key.ctrl) != len(spec.actuators):
+      key.ctrl = []  # which nobody reads, and which would fail to compile before missing servos are named
     if len(key.qpos):  # a keyframe may have none
       key.qpos[2] += lift[key.name]
 

@@ -13,6 +13,7 @@ from playground import registry
 from playground.config import compose
 from playground.envs.base import State
 from playground.errors import ConfigError, UnknownNameError
+from playground.mdp.context import Robot
 from playground.robots.scene import find_mjcf
 from tests.envs.golden import BATCH, KEYS, compiled_task, load_task, recorded
 
@@ -240,6 +241,8 @@ def test_joints_are_found_by_group_or_expression() -> None:
   assert robot.find_joints(["FR_hip_joint", "FL_.*"]).tolist() == [0, 3, 4, 5]
   with pytest.raises(UnknownNameError, match=r"joints='FR_hip_jont' matches no joint .*Did you mean 'FR_hip_joint'"):
     robot.find_joints("FR_hip_jont")
+  with pytest.raises(ConfigError, match=r"env\.robot\.sensors\.mine=3 must name a sensor, or be a list of names"):
+    Robot(robot.mj_model, [], {"mine": 3})
   with pytest.raises(UnknownNameError, match="feet: 'FX' is unknown"):
     robot.find_feet(["FX"])
 
@@ -287,12 +290,27 @@ def test_a_robot_without_a_free_joint_or_servos(ours: str, theirs: str, message:
     (
       'joint="FR_hip_joint"/>',
       'joint="FL_hip_joint"/>',
-      "in the order of the joints: its drive FL_hip_joint",
+      "in the order of the joints: there is none for FR_hip_joint.",
+    ),
+    (
+      '<position name="FR_hip" class="hip" joint="FR_hip_joint"/>',
+      "",
+      "in the order of the joints: there is none for FR_hip_joint.",
+    ),
+    (
+      "<actuator>",
+      '<actuator><position name="more" class="hip" joint="RL_calf_joint"/>',
+      "in the order of the joints: its servos drive RL_calf_joint, FR_hip_joint, ",
+    ),
+    (
+      "<worldbody>",
+      '<worldbody><light name="studio/spotlight"/>',
+      "in light; rename it in the robot's MJCF.",
     ),
     ("<worldbody>", '<asset><mesh name="m" file="no.stl"/></asset><worldbody>', "MuJoCo cannot compile the task's"),
   ],
 )
-def test_servos_in_another_order_or_a_mesh_that_is_not_there(
+def test_servos_that_do_not_fit_the_joints_or_a_model_that_does_not_compile(
   ours: str, theirs: str, message: str, tmp_path: Path
 ) -> None:
   robot, text = tmp_path / "robot.xml", find_mjcf("go1").read_text()

@@ -53,6 +53,13 @@ def test_a_hand_of_a_users_file(tmp_path: Path) -> None:
   np.testing.assert_allclose(np.abs(drawn).max(), 0.99 * 0.03)
 
 
+def test_a_hand_with_a_name_of_the_scene(tmp_path: Path) -> None:
+  mine = tmp_path / "mine.xml"
+  mine.write_text(LEAP.read_text().replace("</mujoco>", '<sensor><clock name="palm_position"/></sensor></mujoco>'))
+  with pytest.raises(ConfigError, match=r"clashes with what the scene adds to it: .*repeated name 'palm_position'"):
+    in_hand_scene("leap_hand", mjcf=str(mine))
+
+
 @pytest.mark.parametrize(
   ("changes", "missing", "message"),
   [

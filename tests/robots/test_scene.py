@@ -107,6 +107,45 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
     build_scene(str(other))
 
 
+@pytest.mark.parametrize(
+  ("ours", "theirs", "message"),
+  [
+    ("<freejoint/>", "", "needs <freejoint/> as its first joint, in the body trunk."),
+    (
+      'qpos="0 0 0.278',
+      'qpos="0.278',
+      "qpos must have 19 numbers, 7 for the free joint and 1 for each hinge or slide, but",
+    ),
+    ("<sensor>", '<asset><material name="studio/groundplane"/></asset><sensor>', "repeated name 'studio/groundplane'"),
+    (
+      "<sensor>",
+      '<sensor><gyro name="FR_floor_found" site="imu"/>',
+      "repeated name 'FR_floor_found' in sensor; rename it",
+    ),
+    (
+      "<sensor>",
+      '<asset><hfield name="terrain" nrow="2" ncol="2" size="1 1 1 1"/></asset><sensor>',
+      "'terrain' in hfield",
+    ),
+  ],
+)
+def test_a_model_that_is_no_robot_or_has_names_of_the_scene(
+  ours: str, theirs: str, message: str, tmp_path: Path
+) -> None:
+  file, text = tmp_path / "mine.xml", find_mjcf("go1").read_text()
+  assert ours in text
+  file.write_text(text.replace(ours, theirs))
+  with pytest.raises(ConfigError, match=r"^env.robot.mjcf=.*mine\.xml") as caught:
+    build_scene(str(file), terrain="rough", floor_contacts=["FR"])
+  assert message in str(caught.value)
+
+
+def test_a_model_without_a_body(tmp_path: Path) -> None:
+  (tmp_path / "empty.xml").write_text("<mujoco/>")
+  with pytest.raises(ConfigError, match=r"empty\.xml has no body: the robot must be the first body of its <worldbody>"):
+    build_scene(str(tmp_path / "empty.xml"))
+
+
 def test_a_robot_may_have_a_ground_material_of_its_own(tmp_path: Path) -> None:
   """As those of MuJoCo Menagerie's scenes: texture, material, sky and light have the names that ours had."""
   file = tmp_path / "ball.xml"
@@ -130,6 +169,7 @@ def test_a_robot_may_have_a_ground_material_of_its_own(tmp_path: Path) -> None:
     ("go2", {}, "env.robot.mjcf=go2 does not exist: give the path of a file, or <package>/<path> of an installed"),
     ("playground/robots/go1/go2.xml", {}, "does not exist"),
     ("no_such_package/go1.xml", {}, "does not exist"),
+    ("__main__/go1.xml", {}, "does not exist"),
     ("go1", {"terrain": "flatt"}, "Did you mean 'flat'?"),
     ("go1", {"collision": "full_selv"}, "Did you mean 'full_self'?"),
     ("go1", {"floor_contacts": ["FX"]}, "env.robot.floor_contacts: 'FX' is unknown"),
