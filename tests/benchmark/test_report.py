@@ -279,12 +279,47 @@ def test_rows_that_are_being_written_and_damaged_ones(tmp_path: Path):
   path.write_text(whole + "throughput,CheetahRun,ppo,ours,,2,training_steps_per_s,9")
   assert [row["value"] for row in Evidence([tmp_path]).rows] == [1e6], "90000 may have been meant"
   for value, message in (
-    ("1000 or so", "has '1000 or so' where a number belongs"),
-    ("1,000", "has a line of too many columns"),
+    ("1000 or so", "rows.csv, line 2 has training_steps_per_s=1000 or so, which must be a number above 0"),
+    ("1,000", "rows.csv, line 2 has too many columns"),
   ):
     path.write_text(whole.replace("1000000.0", value))
     with pytest.raises(ConfigError, match=message):
       run(Options(out=str(tmp_path), rows=(str(tmp_path),)))
+
+
+@pytest.mark.parametrize(
+  ("row", "message"),
+  [
+    ({"benchmark": "topology", "devices": ""}, "has devices=, which must be a whole number from 1 for topology"),
+    ({"benchmark": "topology", "devices": "two"}, "has devices=two, which must be a whole number"),
+    ({"benchmark": "together", "setting": "env.impl=jax"}, "has num_agents=, which must be a whole number from 1"),
+    ({"benchmark": "pixels", "setting": "env.vision.width=a"}, "has env.vision.width=a, which must be"),
+    ({"quantity": "return", "setting": "step=abc"}, "has step=abc, which must be a number"),
+    (
+      {"benchmark": "breakdown", "quantity": "seconds_per_step", "setting": "part=update", "value": 0},
+      "has seconds_per_step=0, which must",
+    ),
+    ({"benchmark": "topology", "value": "nan"}, "has training_steps_per_s=nan, which must be a number"),
+  ],
+)
+def test_a_row_with_a_wrong_number_is_named(row: dict[str, Any], message: str, tmp_path: Path):
+  with pytest.raises(ConfigError, match=rf"^{tmp_path}/rows.csv, line 3 {message}.*: mend or remove that line\.$"):
+    evidence(tmp_path, {"seed": 1, "value": 1e6}, {"value": 1.0, **row})
+
+
+def test_rows_of_tasks_and_agents_that_are_not_installed_are_shown(tmp_path: Path):
+  rate = {"benchmark": "topology", "value": 100.0}
+  found = evidence(tmp_path, {**rate, "task": "TheirTask"}, {**rate, "agent": "theirs"}, {**rate, "agent": ""})
+  rows = table_with(page(found), "its budget takes (s)").rows
+  assert {(row[0], row[3], row[6]) for row in rows} == {
+    *(("CheetahRun theirs", "100.0", ""), ("CheetahRun", "100.0", ""), ("TheirTask", "100.0", ""))
+  }
+
+
+def test_memory_that_is_none_has_no_ratio(tmp_path: Path):
+  memory = {"benchmark": "compare", "quantity": "used_memory_gib", "seed": 1}
+  found = evidence(tmp_path, {**memory, "value": 0.0}, {**memory, "who": "playground 0.2.0", "value": 1.0})
+  assert [row[5] for row in table_with(page(found), "times better").rows] == [""]
 
 
 def test_a_folder_of_rows_that_is_not_there_is_named(tmp_path: Path):

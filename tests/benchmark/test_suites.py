@@ -41,3 +41,20 @@ def test_a_page_without_a_place_is_refused(tmp_path: Path):
     (tmp_path / page).write_text("# Results\n")
   with pytest.raises(ConfigError, match=re.escape(TASKS_BEGIN)):
     write_pages(tmp_path, REFERENCE)
+
+
+def test_rows_of_tasks_that_the_catalogue_lacks_and_rows_without_numbers(tmp_path: Path):
+  for page in (*PAGES, GALLERY):
+    shutil.copyfile(ROOT / "docs" / page, tmp_path / page)
+  reference = Path(shutil.copytree(REFERENCE, tmp_path / "reference", ignore=shutil.ignore_patterns("*.png")))
+  table = reference / "vision.csv"
+  lines = table.read_text().splitlines()
+  table.write_text("\n".join([*lines, re.sub("^[^,]+", "TheirTask", lines[1]), ""]))
+  write_pages(tmp_path, reference)
+  assert re.search(r"## Without a status\n[^#]*\| TheirTask \|", (tmp_path / "runs-manipulation.md").read_text())
+  steps = lines[0].split(",").index("steps")
+  cells = lines[1].split(",")
+  assert cells[steps].isdigit(), "no cell before it has a comma"
+  table.write_text("\n".join([*lines, ",".join([*cells[:steps], "abc", *cells[steps + 1 :]]), ""]))
+  with pytest.raises(ConfigError, match=rf"vision\.csv, line {len(lines) + 1} has steps=abc, which must be a number"):
+    write_pages(tmp_path, reference)

@@ -2,7 +2,8 @@
 
 import csv
 import dataclasses
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,14 @@ from playground.errors import ConfigError
 from playground.reporting.page import mean_and_ci95
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
 
+_POSITIVE = {  # quantities that the report divides by
+  *("training_steps_per_s", "env_steps_per_s", "start_to_first_update_s", "seconds_per_step", "wall_clock_s"),
+}
+_COUNTS = {  # benchmark -> the column, or the keys of its setting, that hold whole numbers
+  "topology": ("devices",),
+  "together": ("num_agents",),
+  "pixels": ("env.vision.width", "env.vision.height", "agent.num_envs"),
+}
 Row = dict[str, Any]  # the columns as text, `value` as a number, the file as `source`, and a run's `note`
 
 
@@ -41,11 +50,11 @@ class Evidence:
     self.curves: dict[str, list[tuple[float, float]]] = {}
     self.mode_curves: dict[str, list[tuple[float, float]]] = {}  # of the policy's mode, where `curves` is of samples
     for path in (path for folder in folders for path in sorted(folder.rglob("*.csv"))):
-      lines = _read(path)
-      rows, curves = list(_rows(path, lines)), _curves(path, lines, RETURN)
+      lines = read_lines(path)
+      rows, curves = list(_rows(lines, path)), _curves(lines, path, RETURN)
       self.rows += rows
       self.curves |= curves
-      self.mode_curves |= _curves(path, lines, OTHER_RETURNS["mode"])
+      self.mode_curves |= _curves(lines, path, OTHER_RETURNS["mode"])
       self.files += [path] * bool(rows or curves)
 
   def find(self, **wanted: str) -> list[Figure]:
@@ -74,45 +83,70 @@ SAME = (
 )
 
 
-def _read(path: Path) -> list[dict[str, str]]:
-  """Reads the rows of a CSV, without incomplete ones."""
+def read_lines(path: Path) -> dict[str, dict[str, str]]:
+  """Reads the rows of a CSV, without incomplete ones, by where each stands (`<path>, line <number>`)."""
   try:
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
-      return [line for line in csv.DictReader(file) if None not in line.values()]
+      reader = csv.DictReader(file)
+      return {f"{path}, line {reader.line_num}": line for line in reader if None not in line.values()}
   except (OSError, csv.Error) as error:
     raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from None
 
 
-def _number(path: Path, text: str) -> float:
+def number(where: str, name: str, text: str, positive: bool = False) -> float:
+  """Returns the number `name` of the row that stands at `where`; raises ConfigError for other text."""
   try:
-    return float(text)
+    value = float(text)
   except ValueError:
-    raise ConfigError(f"{path} has {text!r} where a number belongs: mend or remove that line.") from None
+    value = None
+  if value is None or (positive and not 0 < value < math.inf):
+    kind = "a number above 0" if positive else "a number"
+    raise ConfigError(f"{where} has {name}={text}, which must be {kind}: mend or remove that line.")
+  return value
 
 
-def _rows(path: Path, lines: Sequence[dict[str, str]]) -> Iterable[Row]:
+def value_of(setting: str, key: str) -> str:
+  """Returns the value of a key in the setting of a row, the last one if there are several; "" without it."""
+  return next((word.partition("=")[2] for word in reversed(setting.split()) if word.startswith(f"{key}=")), "")
+
+
+def _rows(lines: Mapping[str, dict[str, str]], path: Path) -> Iterable[Row]:
   """Yields rows of a table in the columns of the schema; a table of whole runs has a column for each quantity."""
-  if not lines or "task" not in lines[0]:
-    return
-  for line in lines:
+  for where, line in lines.items():
+    if "task" not in line:
+      return
     if None in line:
-      raise ConfigError(f"{path} has a line of too many columns, of {line['task']}: mend or remove it.")
+      raise ConfigError(f"{where} has too many columns: mend or remove it.")
     known = {name: line.get(name, "") for name in (*COLUMNS, "note")}
     values = {line["quantity"]: line["value"]} if {"quantity", "value"} <= set(line) else line
     for quantity in QUANTITIES:
       if value := values.get(quantity):
-        yield {**known, "source": path, "quantity": quantity, "value": _number(path, value)}
+        measured = number(where, quantity, value, quantity in _POSITIVE)
+        row = {**known, "source": path, "quantity": quantity, "value": measured}
+        _check(where, row)
+        yield row
 
 
-def _curves(path: Path, lines: Sequence[dict[str, str]], column: str) -> dict[str, list[tuple[float, float]]]:
+def _check(where: str, row: Row) -> None:
+  """Raises ConfigError for a row without the numbers, besides its value, that the section on its benchmark shows."""
+  setting = row["setting"]
+  for key in _COUNTS.get(row["benchmark"], ()):
+    text = row[key] if key in row else value_of(setting, key)
+    if not text.isdecimal() or int(text) < 1:
+      what = f"{key}={text}, which must be a whole number from 1 for {row['benchmark']}"
+      raise ConfigError(f"{where} has {what}: mend or remove that line.")
+  if row["quantity"] in ("return", "mode_return") and "step=" in setting:
+    number(where, "step", setting.rpartition("step=")[2])
+
+
+def _curves(lines: Mapping[str, dict[str, str]], path: Path, column: str) -> dict[str, list[tuple[float, float]]]:
   """Returns learning curves of a file, (steps, return in `column`) by name, one for each run."""
   curves: dict[str, list[tuple[float, float]]] = {}
   if (path.parent.parent / "config.yaml").is_file():  # a stage of a chain; the chain's curve includes it
     return curves
-  if lines and {"step", column} <= set(lines[0]):
-    name = path.parent.name if path.stem == "metrics" else path.stem.removeprefix("curve_")
-    for line in lines:
-      if line[column]:
-        point = _number(path, line["step"]), _number(path, line[column])
-        curves.setdefault(line.get("run") or name, []).append(point)
+  name = path.parent.name if path.stem == "metrics" else path.stem.removeprefix("curve_")
+  for where, line in lines.items():
+    if "step" in line and line.get(column):
+      point = number(where, "step", line["step"]), number(where, column, line[column])
+      curves.setdefault(line.get("run") or name, []).append(point)
   return curves

@@ -4,8 +4,8 @@ import functools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from playground.benchmark.report.evidence import Evidence, Figure
-from playground.config import compose
+from playground.benchmark.report.evidence import Evidence, Figure, value_of
+from playground.config import compose, options, task_names
 from playground.paper import SUITES, paper_table
 from playground.reporting import figures
 from playground.reporting.page import NOT_MEASURED, Block, Heading, Image, Table, Text, short
@@ -97,9 +97,10 @@ def compared(evidence: Evidence, notes: Notes) -> Iterable[Block]:
       for peer in evidence.find(benchmark="compare", quantity=quantity, **of_it):
         if peer["who"] != "ours" and _same_overrides(ours, peer):
           mine, its = (pick(row["value"] for row in figure.rows) for figure in (ours, peer))
-          better = mine / its if quantity == SPEED else its / mine
+          more, less = (mine, its) if quantity == SPEED else (its, mine)
+          better = f"{more / less:.2f}" if less else ""  # a GPU's memory in use may be none
           task, who = f"{ours['task']} {ours['setting']}".strip(), f"{peer['who']} {peer['backend']}".strip()
-          found = [task, label, short(mine), who, short(its), f"{better:.2f}"]
+          found = [task, label, short(mine), who, short(its), better]
           rows.append([*found, notes.number(ours), notes.number(peer)])
   if rows:
     yield Table(["task", "", "ours", "peer", "its", "times better", "ours: note", "its: note"], sorted(rows))
@@ -151,7 +152,7 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
 def together(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   """Yields the steps a second of several agents in one program beside those of one run."""
   yield Heading(2, "Agents in one program")
-  agents = lambda figure: int(figure["setting"].rpartition("num_agents=")[2])
+  agents = lambda figure: int(value_of(figure["setting"], "num_agents"))
   found = evidence.find(benchmark="together", who="ours", quantity=SPEED)
   rows = []
   for figure in sorted(found, key=agents):
@@ -180,7 +181,8 @@ def topology(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     times = [f"{figure.mean / one:.2f}", f"{figure.mean / one / int(count):.2f}"] if one else ["", ""]
     task = _named(figure, *_TOPOLOGY)
     groups.setdefault(f"{task}, {count} x {device}", {}).setdefault(kind, figure.mean)  # the newest
-    seconds = f"{_budget(figure['task'], figure['agent']) / figure.mean:,.0f}"
+    budget = _budget(figure["task"], figure["agent"])
+    seconds = f"{budget / figure.mean:,.0f}" if budget else ""
     rows.append([task, count, kind, _with_ci(figure), *times, seconds, device, note])
   if rows:
     yield Image("topology", figures.bars("training steps/s", groups, "steps/s"), "Devices.")
@@ -242,8 +244,10 @@ def _of_topology(figure: Figure) -> tuple[str, ...]:
 
 
 @functools.cache
-def _budget(task: str, agent: str) -> int:
-  """Returns the default number of control steps of a task's training."""
+def _budget(task: str, agent: str) -> int | None:
+  """Returns the default number of control steps of a task's training; None if task or agent is not installed."""
+  if task not in task_names() or agent not in options("agent"):
+    return None
   return compose([f"env={task}", f"agent={agent}"]).agent.num_timesteps
 
 

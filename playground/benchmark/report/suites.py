@@ -9,9 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from playground.benchmark.report import tasks
+from playground.benchmark.report.evidence import number, read_lines
 from playground.catalog import Entry, entries
 from playground.errors import ConfigError
-from playground.files import read_csv, write_text
+from playground.files import write_text
 from playground.reporting.page import Block, Heading, Table, to_markdown
 from playground.text import millions
 
@@ -26,7 +27,12 @@ RUNS_BEGIN, RUNS_END = GENERATED.format("runs"), "<!-- end of runs -->"
 GALLERY = "gallery.md"
 GRID_BEGIN, GRID_END = GENERATED.format("grid {}"), "<!-- end of grid -->"
 _GRID_WIDTH = 4  # animations in a row
-_TITLES = {"open": "Open", "learning": "Learning", "solved": "Solved"}
+_TITLES = {"open": "Open", "learning": "Learning", "solved": "Solved", "": "Without a status"}
+_TEXTS = ("task", "agent", "who", "setting", "seed", "backend")  # columns that every table of runs has
+_NUMBERS = {  # columns of a table of runs -> whether each row has one
+  **dict.fromkeys(("steps", "final_return"), True),
+  **dict.fromkeys(("final_mode_return", "success", "turns", "falls_per_episode"), False),
+}
 # Settings that have columns of their own.
 _BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env=\w+| \(learning\)")
 _SHORT = {"agent.": "", "curriculum.": ""}
@@ -46,11 +52,11 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
     The paths of the pages.
 
   Raises:
-    ConfigError: a page or a table is missing, or a page lacks the comments around its table.
+    ConfigError: a page or a table is missing, a page lacks the comments around its table, or a row lacks a number.
   """
   try:
     rows = {
-      name: [row for table in tables for row in read_csv(reference / f"{table}.csv")] for name, tables in TABLES.items()
+      name: [row for table in tables for row in _read(reference / f"{table}.csv")] for name, tables in TABLES.items()
     }
     written = []
     for name in TABLES:
@@ -64,6 +70,18 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
   except UnicodeDecodeError as error:
     raise ConfigError(f"pages={pages} has a page that is no text: {error.reason}.") from None
   return [*written, pages / GALLERY]
+
+
+def _read(path: Path) -> list[Row]:
+  """Reads a table of runs and checks its columns and numbers."""
+  lines = read_lines(path)
+  for where, row in lines.items():
+    if missing := [column for column in _TEXTS if column not in row]:
+      raise ConfigError(f"{path} has no column {missing[0]}: add it.")
+    for column, needed in _NUMBERS.items():
+      if (text := row.get(column, "")) or needed:
+        number(where, column, text)
+  return list(lines.values())
 
 
 def _entries(name: str, rows: Mapping[str, Sequence[Row]]) -> list[Entry]:
@@ -97,12 +115,12 @@ def _grid(suite: str) -> str:
 
 
 def _blocks(rows: Sequence[Row]) -> Iterator[Block]:
-  """Yields a table for each status; runs that differ only in seed or repetition share a row."""
-  known = entries()
+  """Yields a table for each status and for tasks without one; runs that differ only in seed or repetition are a row."""
+  known = {task: entry.status for task, entry in entries().items() if entry.status in _TITLES}
   for status, title in _TITLES.items():
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
-      if known[row["task"]].status == status:
+      if known.get(row["task"], "") == status:
         groups.setdefault((row["task"], *_run(row)), []).append(row)
     if groups:
       cells = [_cells(key, runs) for key, runs in sorted(groups.items(), key=lambda group: group[0][0])]
