@@ -57,7 +57,9 @@ def dump_yaml(values: object) -> str:
 
 
 def first_line(error: Exception) -> str:
-  """Returns the first line of an error, to be put into a sentence."""
+  """Returns the first line of an error, to be put into a sentence; of YAML's the problem and its place."""
+  if isinstance(error, yaml.MarkedYAMLError) and (mark := error.problem_mark):
+    return f"{error.problem} in {mark.name}, line {mark.line + 1}"
   return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
