@@ -154,7 +154,11 @@ def test_every_chain_has_an_experiment():
       ("env.torque_limits", "env.pose_noise.injection", "agent.num_timesteps", "agent.learning_rate"),
       [(False, 0.0, 200_000_000, 3e-4), (True, 0.1, 100_000_000, 1e-4)],
     ),
-    ("g1_rough_chain", ("choices.env",), [("G1JoystickFlatTerrain",), ("G1JoystickRoughTerrain",)]),
+    (
+      "g1_rough_chain",
+      ("choices.env", "agent.name"),
+      [("G1JoystickFlatTerrain", "reppo"), ("G1JoystickRoughTerrain", "reppo")],
+    ),
   ],
 )
 def test_chains_are_the_papers(experiment: str, keys: tuple[str, ...], expected: list[Any]):
