@@ -342,7 +342,7 @@ ERRORS = {
   "agent.network.activatio=relu": ["agent.network has policy_hidden_layer_sizes, ", "'agent.network.activation'?"],
   "agent.network={activatio: relu}": ["agent.network.activatio", "does not exist.", "'agent.network.activation'?"],
   "env=Go1JoystickFlatTerrain env.rewards.joint_power_l1.wieght=1": ["joint_power_l1.wieght does not", "'weight'?"],
-  "env=G1JoystickFlatTerrain agent.clipping_epsilon=0.2": [
+  "env=T1JoystickFlatTerrain agent.clipping_epsilon=0.2": [
     "agent.clipping_epsilon does not exist for agent=reppo, only for agent=ppo."
   ],
   "agent.name.x=1": ["agent.name.x does not exist: agent.name is a single value."],
