@@ -1,18 +1,20 @@
 """Which code a configuration may name: a task's class, `module:name`.
 
 A configuration of a run, a policy or a sweep may come from another user. Importing a module runs it, so the module's
-name is checked first. Trusted are this package, installed packages that register tasks (entry points of the group
-`playground.tasks`), and packages that the user names on this command line (`trust=my_package`, `--trust my_package`)
-or in Python (`trust("my_package")`).
+name is checked first. Trusted are the tasks and terms of this package, installed packages that register tasks (entry
+points of the group `playground.tasks`), and packages that the user names on this command line (`trust=my_package`,
+`--trust my_package`) or in Python (`trust("my_package")`).
 """
 
 import importlib
 import importlib.metadata
-from collections.abc import Iterable
 
 from playground.errors import ConfigError, nearest
 
 ENTRY_POINTS = "playground.tasks"
+_THIS = "playground"
+# Tasks and terms. Other functions of this package start programs and write files, with arguments that `params` may set.
+_OWN = ("playground.envs", "playground.mdp")
 
 _named: set[str] = set()  # by the user of this process
 
@@ -63,7 +65,10 @@ def trusted_object(key: str, spec: object) -> object:
 
 def _untrusted(key: str, spec: object, module: str) -> ConfigError:
   package = module.partition(".")[0]
-  known = ", ".join(sorted(_trusted()))
+  if package == _THIS:
+    own = ", ".join(sorted(name for name in _trusted() if name.partition(".")[0] == _THIS))
+    return ConfigError(f"{key}={spec} is refused: of {_THIS}, a configuration may only name code of {own}.")
+  known = ", ".join(sorted({name if name in _named else name.partition(".")[0] for name in _trusted()}))
   return ConfigError(
     f"{key}={spec} is refused: a configuration may only name code of {known}, which {package} is not. If you trust it, "
     f"add trust={package} (--trust {package} for commands other than playground-run)."
@@ -74,9 +79,11 @@ def _is_trusted(module: str) -> bool:
   return any(f"{module}.".startswith(f"{package}.") for package in _trusted())
 
 
-def _trusted() -> Iterable[str]:
-  registered = {point.module.partition(".")[0] for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
-  return {"playground"} | registered | _named
+def _trusted() -> set[str]:
+  modules = [point.module for point in importlib.metadata.entry_points(group=ENTRY_POINTS)]
+  # Of this package, the module itself: another one is not a task because it lies beside it.
+  registered = {module if module.startswith(f"{_THIS}.") else module.partition(".")[0] for module in modules}
+  return {*_OWN} | registered | (_named - {_THIS})
 
 
 def _is_dotted_name(text: str) -> bool:

@@ -106,7 +106,7 @@ def test_load_refuses(name: str, overrides: dict[str, Any], message: str):
     (":Task", "not of the form module:name"),
     ("playground.envs.base:Env", "is no task"),  # which lacks most of one
     ("playground.envs.base:State", "is no task"),
-    ("playground.errors:nearest", "is no task"),
+    ("playground.envs.wrappers:where_done", "is no task"),
   ],
 )
 def test_a_task_that_cannot_be_imported(task: str, message: str):

@@ -16,6 +16,7 @@ from playground.cli.main import main
 from playground.cli.run import main as run_main
 from playground.config import compose, from_saved
 from playground.errors import ConfigError
+from playground.mdp.managers import CommandManager
 from tests.command import caller
 from tests.deploy.untrained import UntrainedRun
 
@@ -98,11 +99,25 @@ def test_a_module_that_is_not_trusted_is_not_imported(evil: Path):
     *("subprocess:Popen", "playground.rendering.gl:subprocess", "playground.sweep.mps:Path", "os:system"),
     *("playground_evil:Task", ".playground:Task", "playground..errors:nearest", "playground.rendering.gl:os.system"),
     *("playground.rendering.gl:__builtins__", "playground/envs:Task", "", ":", "playground:", None, 3),
+    # Of this package, and with arguments that `params` of a command could set:
+    *("playground.benchmark.measures.runs:run_training", "playground.benchmark.peer:check_peer"),
+    *("playground.files:write_text", "playground.cli.sweep:retry", "playground.trust:trust"),
   ],
 )
 def test_what_is_never_trusted(spec: Any):
   with pytest.raises(ConfigError, match=r"^key=.* (is refused|is not of the form)"):
     trust.trusted_object("key", spec)
+
+
+def test_a_command_calls_no_other_function_of_this_package(tmp_path: Path):
+  program = tmp_path / "program"
+  program.write_text(f"#!/bin/sh\ntouch {tmp_path / 'ran'}\n")
+  program.chmod(0o755)
+  params = {"peer": "playground020", "python": str(program), "path": "", "menagerie": ""}
+  trust.trust("playground")  # changes nothing: only tasks and terms may be named
+  with pytest.raises(ConfigError, match=r"commands\.x\.func=.* is refused: of playground, .* only name"):
+    CommandManager({"x": {"func": "playground.benchmark.peer:check_peer", "params": params}}, None)
+  assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a-b", "a:b", ".", None, 3])

@@ -44,6 +44,7 @@ CONTEXTS = {
 }
 # Number of leading arguments that are not parameters: the context; key, task and initial state of reset events.
 _LEADING = {"rewards": 1, "observations": 1, "terminations": 1, "commands": 0, "events": 3}
+_METHODS = ("bind", "reset", "step")  # of the classes of commands and interval events
 
 
 class Term(NamedTuple):
@@ -206,6 +207,10 @@ def find(kind: str, name: str, key: str) -> Callable[..., Any]:
   found = trusted_object(f"{key}.func", name)
   if not callable(found):
     raise ConfigError(f"{key}.func={name} is not a function.")
+  # Binding calls these with nothing but `params`, which may come from another user.
+  builds = kind == "commands" or (kind == "events" and isinstance(found, type))
+  if builds and not (isinstance(found, type) and all(hasattr(found, method) for method in _METHODS)):
+    raise ConfigError(f"{key}.func={name} must be a class with the methods {', '.join(_METHODS)}.")
   return found
 
 

@@ -128,6 +128,21 @@ def test_functions_of_other_packages_are_trusted_by_name_only(monkeypatch: pytes
     rewards({"x": {**entry, "func": "elsewhere:miine"}})
 
 
+@pytest.mark.parametrize("kind", ["commands", "events"])
+def test_a_class_without_the_methods_of_its_kind_is_not_called(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+  module: Any = ModuleType("elsewhere")
+  module.Mine = type("Mine", (), {"__module__": "elsewhere", "__init__": pytest.fail})
+  module.mine = lambda: pytest.fail("it was called")
+  module.mine.__module__ = "elsewhere"
+  monkeypatch.setitem(sys.modules, "elsewhere", module)
+  monkeypatch.setattr("playground.trust._named", {"elsewhere"})
+  for name in ("Mine", "mine") if kind == "commands" else ("Mine",):
+    entry = {"func": f"elsewhere:{name}"} | ({"mode": "interval"} if kind == "events" else {})
+    message = rf"env\.{kind}\.x\.func=elsewhere:{name} must be a class with the methods bind, reset, step"
+    with pytest.raises(ConfigError, match=message):
+      bind(kind, {"x": entry})
+
+
 # The shipped tasks. Their files are merged here without Hydra, which takes a second for each.
 
 ENVS = Path(playground.__file__).parents[1] / "configs/env"
