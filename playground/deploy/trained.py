@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import math
 from pathlib import Path
 
 import jax
@@ -92,12 +93,12 @@ def export_policy(trained: LoadedPolicy, state: State | None = None) -> Exported
 
 
 def _newest_evaluation(trained: LoadedPolicy) -> dict[str, float]:
-  """Returns `steps` and the scores of the last evaluation in training, {} without one."""
+  """Returns `steps` and the finite scores of the last evaluation in training, {} without one."""
   last = newest_evaluation(trained.run_dir.metrics_csv, trained.checkpoint.step)
   if last is None:
     return {}
   scores = {name.removeprefix("eval/"): float(last[name]) for name in last if name.startswith("eval/episode_")}
-  return {"steps": int(last["step"])} | scores
+  return {"steps": int(last["step"])} | {name: score for name, score in scores.items() if math.isfinite(score)}
 
 
 def switch_off_interval_events(config: TaskConfig) -> None:

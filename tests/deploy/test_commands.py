@@ -116,6 +116,14 @@ def test_a_run_that_cannot_be_written_to_is_said_before_anything_is_traced(
   assert f"not written: {copied / 'export'} is not a folder" in capsys.readouterr().out
 
 
+def test_a_score_that_is_no_number_is_left_out(run: Path, tmp_path: Path, command: Command) -> None:
+  copied = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("export"))
+  (copied / "metrics.csv").write_text("step,eval/episode_reward,eval/episode_success\n2000,12.5,nan\n")
+  assert command("export", str(copied)) == 0
+  origin = ExportedPolicy.load(copied / "export" / "policy.onnx").contract["origin"]
+  assert origin["evaluation"] == {"steps": 2000, "episode_reward": 12.5}
+
+
 def test_a_damaged_policy_and_one_of_another_task(
   command: Command, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
