@@ -89,12 +89,12 @@ def play(
     from playground.deploy.web.gate import need_port
 
     need_port(host, port)
+  model_seed = seed if randomize else None
   if agent is None:
     opened = open_policy(path, interval_events)
   else:
     _set_up_cpu()
     section = configs.compose([f"env={path}", *overrides]).env
-    model_seed = seed if randomize else None
     env = load_on_c_physics(path, section, interval_events=interval_events, model_seed=model_seed)
     opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
   exported, env = opened.exported, opened.env
@@ -110,7 +110,7 @@ def play(
     given = Path(path).expanduser().absolute()
     menu = _menu(given, opened.trained, console) if opened.trained else None
     following = None if given.parent.name == "checkpoints" else LATEST
-    watch(Session(env, exported, seed, menu, following), host, port, console)
+    watch(Session(env, exported, seed, menu, following, model_seed), host, port, console)
     return 0
   evaluate = make_evaluator(with_gait_metrics(env), exported.act, episodes, make_mesh(1), 1 if film else 0)
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {}, {})

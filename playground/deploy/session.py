@@ -37,10 +37,25 @@ class Session:
   """
 
   def __init__(
-    self, env: Env, exported: ActingPolicy, seed: int, menu: Menu | None = None, following: str | None = LATEST
+    self,
+    env: Env,
+    exported: ActingPolicy,
+    seed: int,
+    menu: Menu | None = None,
+    following: str | None = LATEST,
+    model_seed: int | None = None,
   ):
-    """Starts an episode of a policy; `menu` lists the checkpoints of its run, None without a run."""
-    self._seed = seed
+    """Starts an episode of a policy.
+
+    Args:
+      env: the task.
+      exported: the policy.
+      seed: of the first environment's episodes.
+      menu: lists the checkpoints of the policy's run; None without a run.
+      following: see the attribute.
+      model_seed: of the model on another terrain, as `load_on_c_physics` takes it.
+    """
+    self._seed, self._model_seed = seed, model_seed
     self.players = [Player(env, exported, seed)]
     self.selected = 0
     self._menu = menu
@@ -132,9 +147,9 @@ class Session:
     config.scene.terrain = name
     if config.scene.get("terrain_params"):
       config.scene.terrain_params = {}  # are of the other terrain
-    env = load_on_c_physics(old.exported.contract["task"], config)
+    env = load_on_c_physics(old.exported.contract["task"], config, model_seed=self._model_seed)
     number, self.players = len(self.players), [Player(env, old.exported, self._seed)]
-    self.players[0].command = old.command
+    self.players[0].command, self.players[0].manual_action = old.command, old.manual_action
     self.set_num_envs(number)
     self._show_present()
 

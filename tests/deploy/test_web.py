@@ -319,12 +319,26 @@ def test_a_checkpoint_that_is_gone(
 
 def test_terrain(watch: Watch, session: Session) -> None:
   watch.panel.command[0].value = 0.3
+  watch.panel.joints.by_hand.value = True
+  watch.frame()
   flat = session.player
   watch.panel.terrain.value = "stairs"
   watch.frame()
   assert session.terrain == "stairs" and session.player.env.mj_model.nhfield == 1 and flat.env.mj_model.nhfield == 0
   assert session.player.command is flat.command
+  assert session.player.manual_action is not None and session.player.manual_action is flat.manual_action
+  watch.panel.joints.by_hand.value = False
   watch.panel.leave.value = True
+  watch.frame()
+
+
+def test_a_randomized_model_stays_randomized_on_another_terrain(session: Session) -> None:
+  env, exported = session.player.env, session.player.exported
+  first, second = (Session(env, exported, 0, model_seed=seed) for seed in (None, 3))
+  for changed in (first, second):
+    changed.choose_terrain("flat")
+  friction = [changed.player.env.mj_model.geom_friction for changed in (first, second)]
+  assert not np.array_equal(*friction)
 
 
 def test_one_sentence_each(
