@@ -21,7 +21,7 @@ from gymnasium.vector.utils import batch_space
 from playground import registry
 from playground.adapters.episodes import Arrays, Episodes, load_task
 from playground.envs.base import PIXELS, Env, State
-from playground.envs.wrappers import where_done, wrap_for_evaluation
+from playground.envs.wrappers import PRESERVE_INFO, where_done, wrap_for_evaluation
 from playground.errors import ConfigError, PlaygroundError, lookup
 from playground.pytree import PyTree
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
@@ -135,6 +135,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
 
   It resets in the next step, which ignores its action, or (`AutoresetMode.SAME_STEP`) in the step that ends it: `info`
   then has the episode's last observation and metrics under `final_obs` and `final_info`, as gymnasium's own have them.
+  The level of a task's curriculum outlasts these resets, as in training; `reset` starts from the first one.
   """
 
   metadata = {"render_modes": []}  # noqa: RUF012
@@ -177,6 +178,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
       after = batch.step(state, action)
       ended = after.done if same_step else state.done
       begun = jax.lax.cond(ended.any(), lambda: where_done(ended, start(key), after), lambda: after)
+      kept = {name: after.info[name] for name in (PRESERVE_INFO,) if name in after.info}
+      begun = begun.replace(info=begun.info | kept)
       return begun, (after if same_step else begun).replace(data=None)
 
     self._start, self._advance, self._where = jax.jit(start), jax.jit(advance), jax.jit(where_done)

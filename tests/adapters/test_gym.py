@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from playground.adapters.gym import GymEnv, GymVectorEnv, observation_space
+from playground.envs.wrappers import PRESERVE_INFO
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError
 from playground.registry import names
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
@@ -135,6 +136,20 @@ def test_a_batch_can_begin_anew_in_the_step_that_ends() -> None:
   for i in range(5):
     *_, terminated, truncated, info = envs.step(right)
     assert truncated.all() == (i == 4) and not terminated.any()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_the_level_of_a_curriculum_outlasts_an_episode(mode: AutoresetMode) -> None:
+  envs: Any = GymVectorEnv(2, "PandaRobotiqPushCube", {"episode_length": 4}, "c", autoreset_mode=mode)
+  envs.reset(seed=0)
+  levels = {"curriculum_id": np.array([2, 1], np.int32)}
+  envs._state = envs._state.replace(info=envs._state.info | {PRESERVE_INFO: levels})
+  for _ in range(2):  # the first ends the episode: an action is repeated four times
+    envs.step(np.zeros((2, 7), np.float32))
+  assert envs._state.info[PRESERVE_INFO]["curriculum_id"].tolist() == [2, 1]
+  assert envs._state.info["steps"].tolist() == [0, 0]
+  envs.reset(seed=0)
+  assert envs._state.info[PRESERVE_INFO]["curriculum_id"].tolist() == [0, 0]
 
 
 def test_only_who_ended_has_a_last_observation() -> None:
