@@ -23,6 +23,7 @@ from playground.adapters.episodes import Arrays, Episodes, load_task
 from playground.envs.base import PIXELS, Env, State
 from playground.envs.wrappers import PRESERVE_INFO, where_done, wrap_for_evaluation
 from playground.errors import ConfigError, PlaygroundError, lookup
+from playground.mdp.managers import ACTOR
 from playground.pytree import PyTree
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.rendering.video import choose_camera
@@ -224,16 +225,20 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
 def observation_space(env: Env, entry: str | None = None) -> Space[PyTree]:
   """Returns the space of a task's observation, or of one group of it: unbounded numbers, images in bytes.
 
+  The only group of a flat observation is `state`.
+
   Raises:
     UnknownNameError: no such entry.
   """
   sizes = env.observation_size
-  if not isinstance(sizes, Mapping):
-    return Box(-np.inf, np.inf, (sizes,))
+  flat = not isinstance(sizes, Mapping)
   boxes: dict[str, Space[PyTree]] = {
-    k: Box(0, 255, v, np.uint8) if k.startswith(PIXELS) else Box(-np.inf, np.inf, v) for k, v in sizes.items()
+    k: Box(0, 255, v, np.uint8) if k.startswith(PIXELS) else Box(-np.inf, np.inf, v)
+    for k, v in ({ACTOR: (sizes,)} if flat else sizes).items()
   }
-  return Dict(boxes) if entry is None else lookup(boxes, entry, "entry")
+  if entry is not None:
+    return lookup(boxes, entry, "entry")
+  return boxes[ACTOR] if flat else Dict(boxes)
 
 
 def _entry(obs: Arrays, entry: str | None) -> Arrays:

@@ -191,6 +191,13 @@ def test_one_entry_of_a_dict_observation() -> None:
     observation_space(task, "stat")
 
 
+def test_the_only_entry_of_a_flat_observation(env: GymEnv) -> None:
+  task = env._episodes.env
+  assert observation_space(task) == observation_space(task, "state")
+  with pytest.raises(UnknownNameError, match=r"entry: 'privileged_state' is unknown; choose from state"):
+    gymnasium.make("playground/CartpoleBalance", entry="privileged_state")
+
+
 def test_a_wrong_name_is_one_sentence() -> None:
   with pytest.raises(UnknownNameError, match="physics: 'mj' is unknown"):
     gymnasium.make("playground/CartpoleBalance", physics="mj")
