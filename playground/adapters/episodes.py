@@ -55,9 +55,10 @@ class Episodes:
     return self._moment(state)
 
   def step(self, action: np.ndarray) -> Moment:
-    """Applies an action in [-1, 1], [action_size]."""
+    """Applies an action in [-1, 1], [action_size]; raises ConfigError if its shape is another."""
     assert self.state is not None, "reset before the first step"
-    state = self.state = self._step(self.state, np.asarray(action, np.float32)[None])
+    action = need_shape("action", np.asarray(action, np.float32), (self.env.action_size,))
+    state = self.state = self._step(self.state, action[None])
     return self._moment(state)
 
   def _moment(self, state: State) -> Moment:
@@ -66,6 +67,13 @@ class Episodes:
     ended = bool(state.done) and not truncated
     obs: PyTree = state.obs
     return Moment(obs, float(state.reward), ended, truncated, {k: float(v) for k, v in state.metrics.items()})
+
+
+def need_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+  """Returns an array; raises ConfigError if it has another shape, which JAX may broadcast."""
+  if array.shape != shape:
+    raise ConfigError(f"{name} has the shape {list(array.shape)}, and must have {list(shape)}.")
+  return array
 
 
 def load_task(task: str, overrides: Section | None = None, physics: str = "mjx") -> Env:

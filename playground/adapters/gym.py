@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from playground import registry
-from playground.adapters.episodes import Arrays, Episodes, load_task
+from playground.adapters.episodes import Arrays, Episodes, load_task, need_shape
 from playground.envs.base import PIXELS, Env, State
 from playground.envs.wrappers import PRESERVE_INFO, where_done, wrap_for_evaluation
 from playground.errors import ConfigError, PlaygroundError, lookup
@@ -191,13 +191,15 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
     super().reset(seed=seed)
     state, mask = self._start(self._key()), (options or {}).get("reset_mask")
     if mask is not None and self._state is not None:
-      state = self._where(np.asarray(mask, bool), state, self._state)
+      mask = need_shape("reset_mask", np.asarray(mask, bool), (self.num_envs,))
+      state = self._where(mask, state, self._state)
     self._state = state
     return self._seen(state)
 
   def step(self, actions: np.ndarray) -> tuple[PyTree, np.ndarray, np.ndarray, np.ndarray, Info]:
     assert self._state is not None, "reset before the first step"
-    state, last = self._advance(self._state, np.asarray(actions, np.float32), self._key())
+    actions = need_shape("actions", np.asarray(actions, np.float32), self.action_space.shape or ())
+    state, last = self._advance(self._state, actions, self._key())
     self._state, (obs, info) = state, self._seen(state)
     done, truncated = np.array(last.done) > 0, np.array(last.info["truncation"]) > 0
     if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP and done.any():

@@ -183,6 +183,18 @@ def test_a_mask_begins_some_episodes_anew() -> None:
   assert [np.array_equal(a, b) for a, b in zip(after, before, strict=True)] == [True, False, True]
 
 
+def test_arrays_of_another_shape_are_refused(env: GymEnv) -> None:
+  env.reset(seed=0)
+  with pytest.raises(ConfigError, match=r"action has the shape \[2\], and must have \[1\]"):
+    env.step(np.zeros(2, np.float32))
+  envs = GymVectorEnv(2, "BallInCup", SHORT, "c")
+  envs.reset(seed=0)
+  with pytest.raises(ConfigError, match=r"actions has the shape \[2, 1\], and must have \[2, 2\]"):
+    envs.step(np.zeros((2, 1), np.float32))  # which would move both motors of the cup
+  with pytest.raises(ConfigError, match=r"reset_mask has the shape \[1\], and must have \[2\]"):
+    envs.reset(options={"reset_mask": np.array([True])})
+
+
 def test_one_entry_of_a_dict_observation() -> None:
   task = Point()
   assert set(observation_space(task)) == {"state", "privileged_state"}  # pyright: ignore[reportArgumentType]
