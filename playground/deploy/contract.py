@@ -13,6 +13,7 @@ from playground.deploy.graph import OUTPUT, input_names
 from playground.envs.base import PIXELS, Env, State
 from playground.errors import CheckpointError
 from playground.mdp.commands import Gait, UniformVelocity, VelocityWalk
+from playground.mdp.managers import ACTOR
 from playground.mdp.options import OPTIONS, ObservationOptions
 from playground.settings import plain
 from playground.text import first_docstring_line
@@ -146,16 +147,21 @@ def _is_number(value: object) -> bool:
   return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _observation(env: Env, group: str) -> list[dict[str, object]]:
-  """Returns each term of an observation group in order: name, start, length, and its options.
+def _observation(env: Env, group: str, start: int = 0) -> list[dict[str, object]]:
+  """Returns each term of an observation group, which begins at `start`, in order: name, start, length, and its options.
 
   `scale` multiplies the term; `noise` (with the noise level in it), `delay` and `history` are present if the task has
-  them; `what` is the first line of the docstring of the term's function.
+  them; `what` is the first line of the docstring of the term's function. A term that stands for the group `state` gives
+  the rows of that group.
   """
   observations = getattr(env.unwrapped, "observations", None)
   bound = {term.name: term for term in observations.groups.get(group, ())} if observations else {}
-  rows, start = [], 0
+  rows = []
   for name, size in env.observation_parts.get(group, {}).items():
+    if name == ACTOR != group and bound:
+      rows += _observation(env, ACTOR, start)
+      start += size
+      continue
     row: dict[str, object] = {"name": name, "start": start, "size": size, "scale": 1.0}
     if name in bound:
       row |= _options(bound[name].options, env.config.noise_level)

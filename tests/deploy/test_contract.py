@@ -85,6 +85,20 @@ def test_frames_and_a_gait() -> None:
   assert (said["frames"], said["gait"]["modes"]) == (2, ["walk"])
 
 
+def test_a_policy_that_reads_everything() -> None:
+  overrides = {"observations.state.gyro": {"noise": {"uniform": 0.2}, "history": 3}}
+  env = registry.load("Go1JoystickFlatTerrain", overrides=overrides)
+  zero = jnp.zeros(())
+  state = State(env.physics.make(), {}, zero, zero, {}, {})
+  said = describe_policy(env, plain(env.config), "T", {}, {"privileged_state": (129,)}, state)
+  rows = [(row["name"], row["start"], row["size"]) for row in said["observation"]]
+  assert rows[:3] == [("linvel", 0, 3), ("gyro", 3, 9), ("gravity", 12, 3)]
+  assert rows[6:9] == [("command", 51, 3), ("gyro", 54, 3), ("accelerometer", 57, 3)]
+  assert all(row["what"] for row in said["observation"])
+  noisy, exact = (row for row in said["observation"] if row["name"] == "gyro")
+  assert (noisy["noise"], noisy["history"], "noise" in exact) == ({"uniform": 0.2}, 3, False)
+
+
 def test_a_command_by_another_name_and_repeated_actions() -> None:
   config = registry.config("Go1JoystickFlatTerrain").commands.velocity.to_dict()
   overrides = {"commands": {"velocity": None, "walk": {**config, "func": "uniform_velocity"}}, "action_repeat": 2}
