@@ -20,14 +20,19 @@ from playground.errors import CheckpointError, ConfigError
 from playground.settings import Plain, plain
 
 
-def need_folder(folder: Path, option: str) -> None:
-  """Raises ConfigError, which names the option that it is of, where no folder can be or be written to; makes none."""
-  if (reason := unwritable(folder)) is not None:
+def need_folder(folder: Path, option: str, within: Path | None = None) -> None:
+  """Raises ConfigError, which names the option that it is of, where `unwritable` has a reason; makes no folder."""
+  if (reason := unwritable(folder, within)) is not None:
     raise ConfigError(f"{option} cannot be written: {reason}.")
 
 
-def unwritable(folder: Path) -> str | None:
-  """Returns why no folder can be there or be written to, None where one can; makes none."""
+def unwritable(folder: Path, within: Path | None = None) -> str | None:
+  """Returns why no folder can be there or be written to, None where one can; makes none.
+
+  A folder `within` another one, such as a run of somebody else, must not be a link that leads out of it.
+  """
+  if within is not None and not folder.resolve().is_relative_to(within.resolve()):
+    return f"{folder} is a link that leads out of {within}"
   folder = folder.absolute()
   there = next(path for path in (folder, *folder.parents) if os.path.exists(path))
   try:

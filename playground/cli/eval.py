@@ -71,7 +71,7 @@ def evaluate_run(
   report |= {"scores": scores} | hardware.machine
   report |= {"hardware_in_paper": real} if real else {}
   name = f"step_{checkpoint.step:012d}_seed_{seed}_episodes_{count}{'_deterministic' * deterministic}.json"
-  save(trained.run_dir.path / "eval" / name, report, console)
+  save(trained.run_dir.path / "eval" / name, report, console, trained.run_dir.path)
   if film:
     render_video(
       drawn,
@@ -84,9 +84,9 @@ def evaluate_run(
   return 0
 
 
-def save(out: Path, report: Mapping[str, object], console: Console) -> None:
-  """Writes a report into a folder of a run and says where, or why it cannot."""
-  if (reason := unwritable(out.parent)) is None:
+def save(out: Path, report: Mapping[str, object], console: Console, run: Path | None = None) -> None:
+  """Writes a report into a folder, of `run` if given, and says where, or why it cannot."""
+  if (reason := unwritable(out.parent, run)) is None:
     out.parent.mkdir(exist_ok=True)
     write_json(out, report)
   console.print(f"not written: {reason}" if reason else f"written to {out}", soft_wrap=True, markup=False)

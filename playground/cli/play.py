@@ -120,7 +120,8 @@ def play(
   if opened.folder is not None:
     out = opened.folder / result_name(origin["steps"], seed, episodes, interval_events)
     played = {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "interval_events": interval_events}
-    save(out, played | {"scores": scores, "origin": origin}, console)
+    run = opened.trained.run_dir.path if opened.trained else None
+    save(out, played | {"scores": scores, "origin": origin}, console, run)
   if film:
     render_video(
       env.mj_model,

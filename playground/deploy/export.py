@@ -48,7 +48,7 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   trained = load_exact(path)
   if folder is None:
     folder = trained.run_dir.path / "export"
-    need_folder(folder, str(folder))
+    need_folder(folder, str(folder), trained.run_dir.path)
   obs, actions, state = record(trained, _ENVS, _DECISIONS)
   exported = export_policy(trained, state)
   error = check_parity(exported, obs, actions)

@@ -116,6 +116,26 @@ def test_a_run_that_cannot_be_written_to_is_said_before_anything_is_traced(
   assert f"not written: {copied / 'export'} is not a folder" in capsys.readouterr().out
 
 
+def test_a_link_out_of_a_run_is_not_followed(
+  run: Path, tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+  copied = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("export", "eval"))
+  (tmp_path / "outside").mkdir()
+  for name in ("export", "eval"):
+    (copied / name).symlink_to(tmp_path / "outside")
+  assert command("export", str(copied)) == 2
+  leads_out = f"is a link that leads out of {copied}"
+  assert f"{copied / 'export'} cannot be written: {copied / 'export'} {leads_out}" in capsys.readouterr().err
+  for name, folder in (("play", "export"), ("eval", "eval")):
+    assert command(name, str(copied), "--episodes", "1") == 0
+    assert f"not written: {copied / folder} {leads_out}" in capsys.readouterr().out
+  assert not any((tmp_path / "outside").iterdir())
+  (tmp_path / "link").symlink_to(copied)  # of the user, to the whole run
+  (copied / "export").unlink()
+  assert command("play", str(tmp_path / "link"), "--episodes", "1") == 0
+  assert "written to" in capsys.readouterr().out and any((copied / "export").iterdir())
+
+
 def test_a_score_that_is_no_number_is_left_out(run: Path, tmp_path: Path, command: Command) -> None:
   copied = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("export"))
   (copied / "metrics.csv").write_text("step,eval/episode_reward,eval/episode_success\n2000,12.5,nan\n")
