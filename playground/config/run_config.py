@@ -95,11 +95,12 @@ def config_dict(values: Section | ConfigDict) -> TaskConfig:
 
 
 def in_order_of(first: object, values: object) -> Plain:
-  """Returns `values`, and the mappings inside, with the keys of `first` first and in the order of `first`."""
-  if not isinstance(values, Mapping | ConfigDict) or not isinstance(first, Mapping | ConfigDict):
+  """Returns `values`, and the mappings inside as dicts, with the keys of `first` first and in the order of `first`."""
+  if not isinstance(values, Mapping | ConfigDict):
     return values
-  names = [*(name for name in first if name in values), *(name for name in values if name not in first)]
-  return {name: in_order_of(first.get(name), values[name]) for name in names}
+  known = first if isinstance(first, Mapping | ConfigDict) else {}
+  names = [*(name for name in known if name in values), *(name for name in values if name not in known)]
+  return {name: in_order_of(known.get(name), values[name]) for name in names}
 
 
 def from_dict(resolved: Section, overrides: Sequence[str] = ()) -> RunConfig:

@@ -27,6 +27,16 @@ def test_a_training_scripts_way_to_its_environment() -> None:
   assert (wrapped.action_size, wrapped.unwrapped) == (12, env)
 
 
+def test_a_copy_of_a_configuration_takes_another_term() -> None:
+  config = locomotion.get_default_config("Go1JoystickFlatTerrain").copy_and_resolve_references()
+  term = {"func": "joint_deviation_l1", "weight": -0.1, "params": {"joints": [".*_calf_joint"]}}
+  with config.unlocked():
+    config.update({"rewards": {"calves": term}})
+  env = locomotion.load("Go1JoystickFlatTerrain", config)
+  assert "calves" in env.config.rewards
+  assert list(env.config.observations.state)[:2] == ["linvel", "gyro"], "the copy has them in alphabetical order"
+
+
 def test_a_notebooks_rollout() -> None:
   env = dm_control_suite.load("CartpoleBalance", config_overrides={"ctrl_dt": 0.02})
   assert dm_control_suite.get_default_config("CartpoleBalance").ctrl_dt == 0.01
