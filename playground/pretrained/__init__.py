@@ -25,7 +25,9 @@ POLICIES = Path(__file__).parent / "policies"
 CARD = "card.yaml"
 CRITIC_BITS = 4
 _COPIES = Path("results/pretrained")
-_MEANING = ("observations", "observation_frames", "action_scale", "ctrl_dt")  # of an env section, for a policy
+# Keys of an env section on which the meaning of inputs and outputs depends; `action_repeat` may be an agent's own.
+_MEANING = ("observations", "observation_order", "observation_frames", "ctrl_dt")
+_MEANING += ("action_base", "action_scale", "clip_targets")
 
 
 def cards() -> dict[str, dict[str, Plain]]:
