@@ -21,7 +21,7 @@ _REWARDS = {  # several names where it depends on the task
   "energy": "joint_power_l1 joint_power_qfrc_l1",
   "action_rate": "action_rate_l2 action_smoothness_l2 action_rate_norm",
   "termination": "is_terminated",
-  "alive": "is_alive",
+  "alive": "constant",
   "collision": "self_contact",
   "feet_height": "feet_swing_height_l2",
   "feet_slip": "feet_slip_l2",

@@ -473,6 +473,7 @@ def test_a_robots_file_must_be_a_mapping_in_its_package(configs: Path):
 
 MOVED = {
   "env.reward.scales.feet_slip=-1": "env.rewards.feet_slip_l2.weight",
+  "env.reward.scales.alive=1": "env.rewards.constant.weight",
   "env.reward.tracking_sigma=1": "env.rewards.<term>.params",
   "env.reward.clip=null": "env.reward_clip",
   "env.noise.level=0": "env.noise_level",
