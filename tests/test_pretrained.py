@@ -10,11 +10,13 @@ import pytest
 import yaml
 
 from playground import pretrained, registry
+from playground.cli.main import main
 from playground.cli.play import play
 from playground.config import compose
 from playground.errors import CheckpointError, ConfigError, UnknownNameError
 from playground.pretrained import POLICIES, cards, check_task, locate, working_copy
 from playground.runs.restore_plan import weights_of
+from tests.command import caller
 
 TASK = "G1JoystickFlatTerrain"
 
@@ -94,6 +96,14 @@ def test_a_task_that_has_changed_is_refused(policies: Path) -> None:
   for key, value in changes.items():
     with pytest.raises(CheckpointError, match=rf"env.{key} has changed"):
       check_task(TASK, saved, {**noisier, key: value})
+
+
+@pytest.mark.parametrize("option", ["--note=early", "--replace"])
+def test_options_of_add_need_it(
+  option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  assert caller(monkeypatch, "playground", main)("pretrained", option) == 2
+  assert capsys.readouterr().err == f"error: {option.partition('=')[0]} needs --add=<run>.\n"
 
 
 def test_a_run_starts_from_one() -> None:

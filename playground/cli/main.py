@@ -237,6 +237,8 @@ def _view(args: argparse.Namespace) -> int:
 def _pretrained(args: argparse.Namespace) -> int:
   from playground.cli import pretrained
 
+  if not args.add and (args.note or args.replace):
+    raise ConfigError(f"{'--replace' if args.replace else '--note'} needs --add=<run>.")
   return pretrained.add_policy(args.add, args.note, args.replace) if args.add else pretrained.show_policies()
 
 
