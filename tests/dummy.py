@@ -79,6 +79,7 @@ class PointTask(Env):
     return action
 
   def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
+    state = self.pre_step(state)
     ctrl = self.action_to_ctrl(state, action)
     data = state.data.replace(qpos=state.data.qpos + 0.1 * ctrl, qvel=ctrl)
     return self.post_step(data, state.info, action)
