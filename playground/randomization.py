@@ -11,9 +11,10 @@ events:
 ```
 
 Those of mode `startup` are drawn once an environment and become model fields with a batch axis; those of mode `reset`
-are drawn in each episode (`playground.envs.task`). They apply in order, each to the result of those before. Lights,
-cameras, colours and materials are fields like any others (docs/vision.md). Derived quantities (`body_subtreemass`,
-`dof_invweight0`, `body_invweight0`, `dof_M0`) keep their nominal values, as in Playground 0.2.0.
+are drawn in each episode (`playground.envs.task`), on top of the environment's own model. They apply in order, each to
+the result of those before. Lights, cameras, colours and materials are fields like any others (docs/vision.md). Derived
+quantities (`body_subtreemass`, `dof_invweight0`, `body_invweight0`, `dof_M0`) keep their nominal values, as in
+Playground 0.2.0.
 """
 
 import dataclasses
@@ -114,9 +115,13 @@ class Randomizer:
     self.fields: tuple[str, ...] = tuple(dict.fromkeys(slot.field for draw in self._draws for slot in draw.slots))
     self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
 
-  def sample(self, key: jax.Array) -> dict[str, jax.Array]:
-    """Draws one environment's fields, each whole and in its model shape. Pure: jit and vmap freely."""
-    values = {field: jnp.asarray(nominal) for field, nominal in self._nominal.items()}
+  def sample(self, key: jax.Array, model: mjx.Model | None = None) -> dict[str, jax.Array]:
+    """Draws one environment's fields, each whole and in its model shape. Pure: jit and vmap freely.
+
+    The events change the fields of `model`, which may be randomised already; without it the nominal values.
+    """
+    start = self._nominal if model is None else {field: getattr(model, field) for field in self.fields}
+    values = {field: jnp.asarray(value) for field, value in start.items()}
     for draw in self._draws:
       key, draw_key = jax.random.split(key)
       drawn, operation = draw(draw_key), _OPERATIONS[draw.term.operation]

@@ -63,7 +63,7 @@ class Env(abc.ABC):
   managers: ClassVar[tuple[str, ...]] = ()
   # A class that annotates keys of the config with their limits (`reach: Positive`), which `registry.build` checks.
   keys: ClassVar[type] = object
-  # Whether `redraw(info, key)` draws entries of `info` for an episode that an auto-reset starts from a stored state.
+  # Whether `redraw(info, key, model)` draws entries of `info` where an auto-reset starts from a stored state.
   redraws: bool = False
 
   def __init__(self, config: Any, mj_model: mujoco.MjModel):

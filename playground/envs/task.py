@@ -133,13 +133,19 @@ class Task(Env):
     model = super().model_of(info, model)
     return model.tree_replace(info[_MODEL_FIELDS]) if self.redraws else model  # pyright: ignore[reportReturnType]
 
-  def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
-    """Returns `info` with the model fields that a new episode draws."""
-    return info | {_MODEL_FIELDS: self._episode_models.sample(key)} if self.redraws else info
+  def redraw(self, info: dict[str, Any], key: jax.Array, model: mjx.Model | None = None) -> dict[str, Any]:
+    """Returns `info` with the model fields that a new episode draws, and with what events know of the model.
+
+    `model` is that of the environment, which the draws change; None is the task's own.
+    """
+    if not self.redraws:
+      return info
+    fields = {_MODEL_FIELDS: self._episode_models.sample(key, super().model_of(info, model))}
+    return info | fields | self.events.of_model(self.model_of(fields, model))
 
   def reset(self, rng: jax.Array, model: mjx.Model | None = None) -> State:
     rng, state_key, event_key, command_key, push_key, own_key, obs_key, model_key = jax.random.split(rng, 8)
-    redrawn = self.redraw({}, model_key)
+    redrawn = self.redraw({}, model_key, model)
     model = self.model_of(redrawn, model)
     initial = self.events.start(event_key, self, self.initial_state(state_key, model))
     data = self.start_physics(model, initial)

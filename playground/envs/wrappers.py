@@ -16,6 +16,7 @@ from playground.envs.base import Env, State
 from playground.physics.backend import STATE_FIELDS, WORLDS, BufferUse, mjx
 
 ModelFields = Mapping[str, jax.Array]
+Info = dict[str, Any]
 # `info` keys that wrappers own; a fresh reset of a task never touches them.
 EPISODE_KEYS = ("steps", "truncation", "episode_done", "episode_metrics")
 PREFIX = "AutoResetWrapper_"
@@ -77,6 +78,14 @@ class Vectorize(Wrapper):
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
     step = jax.vmap(self._step_one, (0, 0, 0, None), axis_name=self._axis)
     return step(state, action, dict(model or self._fields), dict(self._settings))
+
+  def redraw(self, info: Info, keys: jax.Array, model: ModelFields | None = None) -> Info:
+    """Returns `info` with the task's `redraw` for every environment."""
+
+    def redraw(info: Info, key: jax.Array, fields: dict[str, jax.Array]) -> Info:
+      return self.env.redraw(info, key, self.env.mjx_model.tree_replace(fields) if fields else None)
+
+    return jax.vmap(redraw)(info, keys, dict(model or self._fields))
 
 
 class FiniteGuard(Wrapper):
@@ -215,7 +224,7 @@ class AutoReset(Wrapper):
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
     keys = jax.vmap(jax.random.split)(rng)
     state = self.env.reset(keys[:, 0], model)
-    own: dict[str, Any] = {PREFIX + "rng": keys[:, 1], PREFIX + "done_count": jnp.zeros(state.done.shape, jnp.int32)}
+    own: Info = {PREFIX + "rng": keys[:, 1], PREFIX + "done_count": jnp.zeros(state.done.shape, jnp.int32)}
     if not self.full_reset:
       own[PREFIX + "first_data"] = start_of(state)
       own[PREFIX + "first_obs"] = state.obs
@@ -245,7 +254,7 @@ class AutoReset(Wrapper):
       info = after.info | where_done(after.done, first, {name: after.info[name] for name in first})
       if self.env.unwrapped.redraws:
         keys = new_keys()
-        redraw = lambda info: where_done(after.done, jax.vmap(self.env.unwrapped.redraw)(info, keys), info)
+        redraw = lambda info: where_done(after.done, self.env.redraw(info, keys, model), info)
         info = jax.lax.cond(after.done.any(), redraw, lambda info: info, info)
       after = after.replace(data=data, obs=where_done(after.done, own[PREFIX + "first_obs"], after.obs), info=info)
     return after.replace(info=after.info | own)

@@ -3,7 +3,8 @@
 - mode `startup`, func `model_field`: a field of the model, drawn once an environment; in mode `reset` in each episode.
 - mode `reset`: a function `(key, env, initial, **params) -> initial` changes the state that an episode starts with.
 - mode `interval`: a class whose fields are the term's `params`. `bind(env)` looks names up once; `reset(key, model)`
-  returns the entries of `info` that an episode starts with, `step(data, info)` acts before the physics of a step.
+  returns the entries of `info` that an episode starts with, `step(data, info)` acts before the physics of a step. Where
+  entries follow from the model, `of_model(model)` returns them again for the model that an auto-reset draws.
 """
 
 import dataclasses
@@ -248,10 +249,13 @@ class PushByForce:
       "push_interval": interval,
       "push_duration": duration,
       "push_velocity": self.strength(strength_key),
-      "push_mass": self.mass(model),
       "push_direction": jnp.zeros_like(self.direction(key)),
       "pushing": jnp.zeros((), bool),
-    } | {name: jnp.zeros((), jnp.int32) for name in self.counters}
+    } | self.of_model(model) | {name: jnp.zeros((), jnp.int32) for name in self.counters}
+
+  def of_model(self, model: mjx.Model) -> Info:
+    """Returns the mass that is pushed, of a model that an episode may draw."""
+    return {"push_mass": self.mass(model)}
 
   def step(self, data: PhysicsData, info: Info) -> tuple[PhysicsData, Info]:
     pushing, dt = info["push_wait"] >= info["push_interval"], self.env.dt

@@ -14,7 +14,7 @@ from playground.mdp import delays
 from playground.mdp.context import StepContext
 from playground.mdp.options import ObservationOptions
 from playground.mdp.terms import Term, bind, bind_one, plain
-from playground.physics.backend import PhysicsData
+from playground.physics.backend import PhysicsData, mjx
 from playground.text import format_value
 
 ACTOR = "state"  # the observation group that the policy reads: noisy; the other groups are exact
@@ -280,6 +280,11 @@ class EventManager(_Manager):
   def reset(self, key: jax.Array, model: Any) -> Info:
     """Returns the entries of `info` of the interval events that an episode starts with."""
     return _union(term.run("reset", k, model) for term, k in _with_keys(self.groups["interval"], key))
+
+  def of_model(self, model: mjx.Model) -> Info:
+    """Returns the entries of `info` that interval events compute from the model, which an episode may change."""
+    terms = [term for term in self.groups["interval"] if hasattr(term.instance, "of_model")]
+    return _union(term.run("of_model", model) for term in terms)
 
   def step(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
     """Returns the physics after the interval events, and `info`."""

@@ -11,6 +11,7 @@ import pytest
 
 from playground import registry
 from playground.config import compose
+from playground.envs import wrappers
 from playground.envs.base import State
 from playground.errors import ConfigError, UnknownNameError
 from playground.mdp.context import Robot
@@ -111,9 +112,12 @@ def test_pushes_know_the_mass(monkeypatch: pytest.MonkeyPatch) -> None:
   np.testing.assert_allclose(mass, 2 * 12.743448, rtol=1e-6)
 
 
+TRUNK = {"field": "body_mass", "target": "trunk", "operation": "scale", "range": [1.5, 2.0]}
+HEAVY_TRUNK = {"events.trunk": {"mode": "reset", "func": "model_field", "params": TRUNK}}
+
+
 def test_fields_of_the_model_may_be_drawn_in_each_episode(monkeypatch: pytest.MonkeyPatch) -> None:
-  params = {"field": "body_mass", "target": "trunk", "operation": "scale", "range": [1.5, 2.0]}
-  env = load_task(TASK, {"events.trunk": {"mode": "reset", "func": "model_field", "params": params}})
+  env = load_task(TASK, HEAVY_TRUNK)
   trunk = env.mj_model.body("trunk").id
   seen = lambda model, data, *_: data.replace(time=model.body_mass[trunk])
   monkeypatch.setattr(env.physics, "forward", seen)
@@ -131,6 +135,23 @@ def test_fields_of_the_model_may_be_drawn_in_each_episode(monkeypatch: pytest.Mo
   np.testing.assert_array_equal(stepped, first)
   assert (redrawn != first).all() and (redrawn > 1.5 * nominal[trunk]).all()
   np.testing.assert_allclose(whole, 12.743448 - nominal[trunk] + first, rtol=1e-5)  # a push knows it
+
+
+def test_an_episode_changes_the_model_of_its_environment() -> None:
+  env, trunk = load_task(TASK, HEAVY_TRUNK), load_task(TASK).mj_model.body("trunk").id
+  masses = jnp.linspace(1.0, 2.0, BATCH)[:, None] * env.mjx_model.body_mass  # as a startup event drew them
+  batch = wrappers.Vectorize(env)
+
+  def seen(info: Any) -> tuple[np.ndarray, np.ndarray]:
+    model = jax.vmap(lambda info, mass: env.model_of(info, env.mjx_model.replace(body_mass=mass)))(info, masses)
+    return np.asarray(model.body_mass / masses), np.asarray(model.body_mass.sum(axis=1))
+
+  infos = [batch.redraw({}, keys, {"body_mass": masses}) for keys in (KEYS, KEYS[::-1])]
+  for info in infos:
+    scales, whole = seen(info)
+    assert (scales[:, trunk] > 1.5).all() and (scales[:, trunk] < 2.0).all() and len(set(scales[:, trunk])) == BATCH
+    np.testing.assert_allclose(np.delete(scales, [0, trunk], axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(info["push_mass"], whole, rtol=1e-5)  # a push knows it
 
 
 def test_settings_stand_for_a_tasks_own_numbers() -> None:

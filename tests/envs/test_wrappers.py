@@ -96,7 +96,7 @@ def test_an_auto_reset_redraws_where_a_task_asks_for_it() -> None:
   class Redrawing(Counting):
     redraws = True
 
-    def redraw(self, info: dict[str, Any], key: jax.Array) -> dict[str, Any]:
+    def redraw(self, info: dict[str, Any], key: jax.Array, model: Any) -> dict[str, Any]:
       return info | {"time": jax.random.uniform(key)}
 
   env = wrappers.wrap_for_training(Redrawing(episode_length=LENGTH))
