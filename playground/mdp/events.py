@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from mujoco.mjx._src.math import axis_angle_to_quat, normalize, quat_mul
 
 from playground.errors import ConfigError
-from playground.limits import MOST, AtLeast0, Share, Span, Vector, count, span
+from playground.limits import MOST, AtLeast0, Limit, Share, Span, Vector, count, span
 from playground.mdp.poses import uniform_quat
 from playground.physics.backend import PhysicsData, mjx
 from playground.text import format_value
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
   from playground.envs.task import InitialState, Task
 
 Info = dict[str, Any]
+_Duration = Annotated[Sequence[float], Limit(0, above=True, form="list", length=2, rising=True)]
 _MOMENTS = {"normal": ("mean", "std"), "bernoulli": ("mean",)}  # parameters of distributions that have no range
 
 
@@ -214,11 +215,11 @@ class PushByForce:
     velocity: range of the strength, m/s: the force's peak is 0.5 * mass * velocity / duration, so that the body gains
       velocity / pi (as in Playground 0.2.0, whose ranges these are).
     duration_s: range, s.
-    interval_s: range of the time between two pushes, s.
+    interval_s: range of the time between two pushes, s; it is a control step at least.
   """
 
   velocity: Span
-  duration_s: Span
+  duration_s: _Duration
   interval_s: Span
   counters: ClassVar[tuple[str, ...]] = ("push_wait", "push_time")
 
@@ -235,7 +236,7 @@ class PushByForce:
 
   def times(self, interval_key: jax.Array, duration_key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Draws an episode's interval, in control steps, and its pushes' duration, s."""
-    interval = jnp.round(_uniform(interval_key, self.interval_s) / self.env.dt).astype(jnp.int32)
+    interval = _steps(_uniform(interval_key, self.interval_s), self.env.dt)
     return interval, _uniform(duration_key, self.duration_s)
 
   def mass(self, model: mjx.Model) -> jax.Array:
@@ -289,7 +290,7 @@ class PushByForceRegularly(PushByForce):
 
   def times(self, interval_key: jax.Array, duration_key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Draws an episode's interval and its pushes' duration, both in control steps."""
-    steps = lambda key, reach: jax.random.randint(key, (), *jnp.round(jnp.array(reach) / self.env.dt).astype(jnp.int32))
+    steps = lambda key, reach: jax.random.randint(key, (), *_steps(jnp.array(reach), self.env.dt))
     return steps(interval_key, self.interval_s), steps(duration_key, self.duration_s)
 
   def step(self, data: PhysicsData, info: Info) -> tuple[PhysicsData, Info]:
@@ -342,7 +343,7 @@ class PushBySettingVelocity:
 
   Attributes:
     velocity: range of the change, m/s.
-    interval_s: range of the time between two pushes, s.
+    interval_s: range of the time between two pushes, s; it is a control step at least.
   """
 
   velocity: Span
@@ -357,7 +358,7 @@ class PushBySettingVelocity:
     return {
       "push": jnp.zeros(2),
       "push_step": jnp.zeros((), jnp.int32),
-      "push_interval_steps": jnp.round(_uniform(key, self.interval_s) / self.dt).astype(jnp.int32),
+      "push_interval_steps": _steps(_uniform(key, self.interval_s), self.dt),
       "pushing": jnp.zeros((), bool),
     }
 
@@ -373,6 +374,11 @@ class PushBySettingVelocity:
 def push_force(time: jax.Array, mass: jax.Array, velocity: jax.Array, duration: jax.Array) -> jax.Array:
   """Returns a push's force at `time` s after it began, N: a half sine, see `PushByForce`."""
   return 0.5 * jnp.sin(jnp.pi * time / duration) * mass * velocity / duration
+
+
+def _steps(seconds: jax.Array, dt: float) -> jax.Array:
+  """Returns the nearest number of control steps, 1 at least, int32."""
+  return jnp.maximum(jnp.round(seconds / dt), 1).astype(jnp.int32)
 
 
 def horizontal(key: jax.Array) -> jax.Array:

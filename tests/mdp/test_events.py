@@ -211,6 +211,21 @@ def test_an_object_is_pushed_by_forces_and_torques() -> None:
   np.testing.assert_allclose(np.linalg.norm(infos["push_direction"][22]), 1, rtol=1e-5)
 
 
+def test_pushes_are_a_control_step_apart_at_least() -> None:
+  """With an interval of 0 steps a push would never start, so it would have no direction."""
+  by_force = {"velocity": (1.0, 1.0), "duration_s": (0.1, 0.1), "interval_s": (0.0, 0.0)}
+  _, body, infos = roll(PushByForce(**by_force), 50)
+  assert (np.linalg.norm(body.xfrc_applied[:, 1], axis=1) > 1).sum() >= 25 and infos["pushing"].sum() == 42
+  assert roll(PushByForceRegularly(**by_force), 50)[2]["push_direction"][1:].any(axis=1).all()
+  assert roll(PushBySettingVelocity((1.0, 1.0), interval_s=(0.0, 0.0)), 50)[2]["pushing"].all()
+
+
+def test_a_push_takes_time() -> None:
+  push = {"func": "push_by_force", "mode": "interval", "params": {"velocity": [0, 1], "interval_s": [1, 2]}}
+  with pytest.raises(ConfigError, match=r"params.duration_s=\[0, 0.1\] must be 2 numbers above 0 "):
+    bind("events", {"push": push | {"params": push["params"] | {"duration_s": [0, 0.1]}}})
+
+
 def test_velocities_jump_in_time() -> None:
   info, body, infos = roll(PushBySettingVelocity(velocity=(0.5, 1.0), interval_s=(0.5, 0.9)), 100)
   interval, directions, gained = int(info["push_interval_steps"]), infos["push"], body.qvel
