@@ -246,11 +246,11 @@ class CommandManager(_Manager):
 
   def reset(self, key: jax.Array) -> Info:
     """Returns the entries of `info` that an episode starts with."""
-    return _union(term.run("reset", k) for term, k in _with_keys(self.terms, key))
+    return _union((term, term.run("reset", k)) for term, k in _with_keys(self.terms, key))
 
   def step(self, c: StepContext, key: jax.Array) -> Info:
     """Returns the entries of `info` for the next step."""
-    return _union(term.run("step", c, k) for term, k in _with_keys(self.terms, key))
+    return _union((term, term.run("step", c, k)) for term, k in _with_keys(self.terms, key))
 
 
 class EventManager(_Manager):
@@ -279,12 +279,12 @@ class EventManager(_Manager):
 
   def reset(self, key: jax.Array, model: Any) -> Info:
     """Returns the entries of `info` of the interval events that an episode starts with."""
-    return _union(term.run("reset", k, model) for term, k in _with_keys(self.groups["interval"], key))
+    return _union((term, term.run("reset", k, model)) for term, k in _with_keys(self.groups["interval"], key))
 
   def of_model(self, model: mjx.Model) -> Info:
     """Returns the entries of `info` that interval events compute from the model, which an episode may change."""
     terms = [term for term in self.groups["interval"] if hasattr(term.instance, "of_model")]
-    return _union(term.run("of_model", model) for term in terms)
+    return _union((term, term.run("of_model", model)) for term in terms)
 
   def step(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
     """Returns the physics after the interval events, and `info`."""
@@ -301,5 +301,23 @@ def _with_keys(terms: list[Term], key: jax.Array) -> Iterable[tuple[Term, jax.Ar
   return zip(terms, jax.random.split(key, len(terms)) if terms else (), strict=True)
 
 
-def _union(parts: Iterable[Info]) -> Info:
-  return {name: value for part in parts for name, value in part.items()}
+def _union(parts: Iterable[tuple[Term, Info]]) -> Info:
+  """Returns the entries of `info` of all terms; those of an event that is switched off yield to another's.
+
+  Raises ConfigError where two terms write the same entry: each would go on from the other's.
+  """
+  found: Info = {}
+  writers: dict[str, Term] = {}
+  for term, part in parts:
+    for name, value in part.items():
+      writer = writers.get(name)
+      if writer is not None and not _is_on(term):
+        continue
+      if writer is not None and _is_on(writer):
+        raise ConfigError(f"{writer.key} and {term.key} both write info[{name!r}]: keep one of them.")
+      found[name], writers[name] = value, term
+  return found
+
+
+def _is_on(term: Term) -> bool:
+  return getattr(term.options, "enabled", True)

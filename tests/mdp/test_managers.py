@@ -323,6 +323,18 @@ def test_an_interval_event_that_does_not_fit_the_task() -> None:
     EventManager({"jump": jump}, SimpleNamespace(dt=0.02, robot=SimpleNamespace()))
 
 
+def test_two_events_cannot_count_with_the_same_entries() -> None:
+  params = {"velocity": [1.0, 1.0], "duration_s": [0.1, 0.1], "interval_s": [1.0, 1.0]}
+  first = {"func": "push_by_force", "mode": "interval", "params": params}
+  second = {**first, "params": params | {"interval_s": [2.0, 2.0]}}
+  env = SimpleNamespace(dt=0.02, robot=SimpleNamespace(root=1, mass=lambda model: 1.0))
+  with pytest.raises(ConfigError, match=r"^env\.events\.a and env\.events\.b both write info\['push_interval'\]: "):
+    EventManager({"a": first, "b": second}, env).reset(KEY, None)
+  off = {"enabled": False}
+  for section in ({"a": first | off, "b": second}, {"b": second, "a": first | off}):
+    assert EventManager(section, env).reset(KEY, None)["push_interval"] == 100
+
+
 def test_events_that_are_switched_off_do_nothing_but_are_there() -> None:
   reset = {"func": "reset_root_xy", "mode": "reset", "enabled": False, "params": {"distance": 1.0}}
   jump = {"func": "push_by_setting_velocity", "params": {"velocity": [1.0, 1.0], "interval_s": [0.02, 0.02]}}
