@@ -131,6 +131,8 @@ class Gait:
   rest_when_still: bool = False
 
   def bind(self, env: Any) -> None:
+    if not self.modes:
+      raise ConfigError("params.modes=[] must name a gait.")
     phases = np.array([env.robot.gait(name) for name in self.modes])
     self._phases = jnp.array(np.where(phases > np.pi, phases - 2 * np.pi, phases))
     self._dt: float = env.dt

@@ -106,11 +106,11 @@ class LeggedRobot(Robot):
     if "keyframe" in params:
       self.find("key", params["keyframe"], f"{key}.keyframe")
 
-  def gait(self, name: str) -> list[float]:
+  def gait(self, name: str, key: str = "params.modes") -> list[float]:
     """Returns the feet's phases at the start of a gait, rad; raises ConfigError if there is not one for each foot."""
     if not self._gaits:
       raise ConfigError(f"env.robot.gaits is empty or missing, so that there is no gait {name!r}.")
-    phases = lookup(self._gaits, name, "params.modes")
+    phases = lookup(self._gaits, name, key)
     if len(phases) != len(self.feet):
       raise ConfigError(f"env.robot.gaits.{name} must hold {len(self.feet)} phases, one for each foot.")
     return list(phases)
@@ -124,8 +124,9 @@ class LeggedRobot(Robot):
     return data.sensordata[self._present(key, self._foot_rows[key])]
 
   def touching(self, data: PhysicsData, group: str) -> jax.Array:
-    """Returns which contacts of a group (`contact_groups`) there are, bool, shape [contacts]."""
-    return data.sensordata[self._present(group, self.contact_groups[group])] > 0
+    """Returns which contacts of a group (`contact_groups`) there are, bool [contacts]; raises ConfigError for none."""
+    found = lookup(self.contact_groups, group, "contacts of a robot on legs")
+    return data.sensordata[self._present(group, found)] > 0
 
   def _present(self, key: str, found: np.ndarray) -> np.ndarray:
     if not found.size:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from mujoco.mjx._src.math import normalize
 
+from playground.errors import ConfigError
 from playground.limits import AtLeast0, Positive, Share, Vector, positive
 from playground.mdp.commands import swing_height
 from playground.mdp.context import StepContext
@@ -143,7 +144,12 @@ def lin_vel_z_l2(c: LeggedContext, sensors: Sequence[str] = ("global_linvel",)) 
 
 def lin_vel_z_l2_in_gaits(c: LeggedContext, gaits: Sequence[str]) -> jax.Array:
   """v_z² in the world frame while the episode's gait is one of those; 0 in the others, in which the base flies."""
-  level = jnp.array([mode in gaits for mode in c.env.config.commands.gait.params.modes])
+  command = c.env.config.commands.get("gait")
+  if command is None:
+    raise ConfigError("it needs env.commands.gait, which draws the gait of an episode.")
+  for name in gaits:
+    c.robot.gait(name, "params.gaits")
+  level = jnp.array([mode in gaits for mode in command.params.modes])
   return lin_vel_z_l2(c) * level[c.info["gait"]]
 
 

@@ -250,6 +250,15 @@ def test_names_in_parameters_are_checked_when_the_task_is_built(term: dict[str, 
     load_task(TASK, {"rewards.mine": {"weight": 1.0, **term}})
 
 
+def test_legs_have_contacts_by_group_only() -> None:
+  floor = {"terminations.mine": {"func": "illegal_contact", "params": {"geoms": ["floor"]}}}
+  message = (
+    r"^env\.terminations\.mine: contacts of a robot on legs: 'floor' is unknown; choose from self_contact, fatal_"
+  )
+  with pytest.raises(UnknownNameError, match=message):
+    shapes(load_task(TASK, floor))
+
+
 def test_a_keyframe_is_checked_when_the_task_is_built() -> None:
   event = {"mode": "reset", "func": "reset_to_keyframe", "params": {"probability": 1.0, "keyframe": "hom"}}
   with pytest.raises(UnknownNameError, match=r"params\.keyframe names the key 'hom'.*Did you mean 'home'"):

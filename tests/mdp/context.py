@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from ml_collections import ConfigDict
 
+from playground.errors import lookup
 from playground.mdp.legged import LeggedContext
 
 SENSORS = {
@@ -57,6 +58,7 @@ def context(
     joint_range=jnp.array([[-1.0, -1.0], [1.0, -0.5]]),
     target_range=jnp.array([[-1.0, -0.9], [0.1, -0.5]]),
     pose_weights=jnp.array([1.0, 0.5]),
+    gait=lambda name, key: lookup({"bound": [0.0, 0.0], "trot": [0.0, 1.0], "walk": [1.0, 0.0]}, name, key),
     root=1,
     base_site=0,
     feet=np.array([1, 2]),

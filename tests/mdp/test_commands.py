@@ -142,6 +142,8 @@ def test_gaits_are_the_robots() -> None:
     gait("wlk")
   with pytest.raises(ConfigError, match=r"env\.robot\.gaits\.trot must hold 2 phases"):
     gait("trot")
+  with pytest.raises(ConfigError, match=r"^params\.modes=\[\] must name a gait"):
+    gait()
 
 
 def test_a_robot_without_gaits() -> None:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from playground.errors import ConfigError, UnknownNameError
 from playground.mdp import rewards, terminations
 from playground.mdp.manipulators import ArmContext, HandContext
 from playground.mdp.terms import registered
@@ -156,6 +157,17 @@ def test_the_phase_is_free_at_rest_only() -> None:
 def test_the_gaits_own_swing_height() -> None:
   c = context(foot_height=jnp.array(0.2))  # the feet should be at 0.2 and 0.1
   np.testing.assert_allclose(reward("feet_phase_exp", c, std=0.1), np.exp(-(0.05**2 + 0.08**2) / 0.01), rtol=1e-5)
+
+
+def test_gaits_that_a_robot_has_not() -> None:
+  c = context()
+  for gaits in (["trt"], ["bound", "trt"]):
+    with pytest.raises(UnknownNameError, match=r"^params\.gaits: 'trt' is unknown.* 'trot'"):
+      rewards.lin_vel_z_l2_in_gaits(c, gaits)
+  assert rewards.lin_vel_z_l2_in_gaits(c, ["walk"]) == 0  # one that the command does not draw
+  c.env.config.commands.gait = None
+  with pytest.raises(ConfigError, match=r"^it needs env\.commands\.gait"):
+    rewards.lin_vel_z_l2_in_gaits(c, ["trot"])
 
 
 def test_feet_far_apart_cost_nothing_and_crossed_ones_no_more_than_a_tenth() -> None:
