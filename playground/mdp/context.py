@@ -95,6 +95,19 @@ class Robot:
         self.find(kind, params[kind], f"{key}.{kind}")
 
 
+def need_free_root(env: "Task") -> None:
+  """Raises ConfigError where the model's first joint is not free: `qpos[:7]` and `qvel[:6]` are of other joints."""
+  model = env.mj_model
+  if not model.njnt or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+    raise ConfigError("it needs a free joint as the first of the model, which this task does not have.")
+
+
+def root_qpos(c: "StepContext") -> jax.Array:
+  """Returns the root's position, m, and orientation [7]; raises ConfigError where the first joint is not free."""
+  need_free_root(c.env)
+  return c.data.qpos[:7]
+
+
 class _Info(dict[str, Any]):
   """Entries of `info`, of which a missing one is an error of the configuration."""
 

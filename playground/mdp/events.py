@@ -17,6 +17,7 @@ from mujoco.mjx._src.math import axis_angle_to_quat, normalize, quat_mul
 
 from playground.errors import ConfigError
 from playground.limits import MOST, AtLeast0, Limit, Share, Span, Vector, count, span
+from playground.mdp.context import need_free_root
 from playground.mdp.poses import uniform_quat
 from playground.physics.backend import PhysicsData, mjx
 from playground.text import format_value
@@ -31,12 +32,14 @@ _MOMENTS = {"normal": ("mean", "std"), "bernoulli": ("mean",)}  # parameters of 
 
 def reset_root_xy(key: jax.Array, env: "Task", initial: "InitialState", distance: AtLeast0) -> "InitialState":
   """Moves the root by U[-distance, distance) along x and y, m."""
+  need_free_root(env)
   shift = jax.random.uniform(key, (2,), minval=-distance, maxval=distance)
   return initial.replace(qpos=initial.qpos.at[:2].add(shift))
 
 
 def reset_root_yaw(key: jax.Array, env: "Task", initial: "InitialState", angle: AtLeast0) -> "InitialState":
   """Turns the root about the vertical by U[-angle, angle), rad."""
+  need_free_root(env)
   yaw = jax.random.uniform(key, minval=-angle, maxval=angle)
   turn = axis_angle_to_quat(jnp.array([0.0, 0.0, 1.0]), yaw)
   return initial.replace(qpos=initial.qpos.at[3:7].set(quat_mul(turn, initial.qpos[3:7])))
@@ -44,6 +47,7 @@ def reset_root_yaw(key: jax.Array, env: "Task", initial: "InitialState", angle: 
 
 def reset_root_velocity(key: jax.Array, env: "Task", initial: "InitialState", speed: AtLeast0) -> "InitialState":
   """Draws the root's velocity: six numbers U[-speed, speed), m/s and rad/s."""
+  need_free_root(env)
   velocity = jax.random.uniform(key, (6,), minval=-speed, maxval=speed)
   return initial.replace(qvel=initial.qvel.at[:6].set(velocity))
 
@@ -76,6 +80,7 @@ def reset_fallen(
   key: jax.Array, env: "Task", initial: "InitialState", probability: Share, height: AtLeast0
 ) -> "InitialState":
   """Drops the robot, with this probability: from a height (m), in any orientation, at any joint angles."""
+  need_free_root(env)
   drop_key, turn_key, joints_key = jax.random.split(key, 3)
   quat = jax.random.normal(turn_key, (4,))
   quat = quat / (jnp.linalg.norm(quat) + 1e-6)
@@ -246,13 +251,17 @@ class PushByForce:
   def reset(self, key: jax.Array, model: mjx.Model) -> Info:
     interval_key, duration_key, strength_key = jax.random.split(key, 3)
     interval, duration = self.times(interval_key, duration_key)
-    return {
-      "push_interval": interval,
-      "push_duration": duration,
-      "push_velocity": self.strength(strength_key),
-      "push_direction": jnp.zeros_like(self.direction(key)),
-      "pushing": jnp.zeros((), bool),
-    } | self.of_model(model) | {name: jnp.zeros((), jnp.int32) for name in self.counters}
+    return (
+      {
+        "push_interval": interval,
+        "push_duration": duration,
+        "push_velocity": self.strength(strength_key),
+        "push_direction": jnp.zeros_like(self.direction(key)),
+        "pushing": jnp.zeros((), bool),
+      }
+      | self.of_model(model)
+      | {name: jnp.zeros((), jnp.int32) for name in self.counters}
+    )
 
   def of_model(self, model: mjx.Model) -> Info:
     """Returns the mass that is pushed, of a model that an episode may draw."""

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from mujoco.mjx._src.math import quat_inv, quat_mul, quat_to_mat
 
 from playground.limits import AtLeast0
-from playground.mdp.context import StepContext
+from playground.mdp.context import StepContext, root_qpos
 from playground.mdp.legged import LeggedContext
 from playground.mdp.manipulators import ArmContext, HandContext
 from playground.mdp.options import MirrorKind, mirrors_as
@@ -80,10 +80,10 @@ gait = _from_info("gait", "Index of the episode's gait in the modes of the gait 
 gait_frequency = _from_info("gait_freq", "Frequency of the gait's steps, Hz [1].", "same")
 foot_height = _from_info("foot_height", "Highest swing of the feet in this episode's gait, m [1].", "same")
 pushed = _from_info("pushing", "Whether a push is under way, 0 or 1 [1].", "same")
-root_height = _reads("World z of the root joint, m [1].", lambda c: c.data.qpos[2], "same")
-root_pos = _reads("World position of the root joint, m [3].", lambda c: c.data.qpos[:3], "polar")
+root_height = _reads("World z of the root joint, m [1].", lambda c: root_qpos(c)[2], "same")
+root_pos = _reads("World position of the root joint, m [3].", lambda c: root_qpos(c)[:3], "polar")
 root_quat = _reads(
-  "Orientation of the root joint, a quaternion w, x, y, z [4].", lambda c: c.data.qpos[3:7], "quaternion"
+  "Orientation of the root joint, a quaternion w, x, y, z [4].", lambda c: root_qpos(c)[3:], "quaternion"
 )
 
 

@@ -18,7 +18,7 @@ from mujoco.mjx._src.math import normalize
 from playground.errors import ConfigError
 from playground.limits import AtLeast0, Positive, Share, Vector, positive
 from playground.mdp.commands import swing_height
-from playground.mdp.context import StepContext
+from playground.mdp.context import StepContext, root_qpos
 from playground.mdp.legged import LeggedContext
 from playground.mdp.manipulators import ArmContext, HandContext
 from playground.mdp.tolerance import tolerance
@@ -190,7 +190,7 @@ def forward_alignment(c: LeggedContext, target: Vector) -> jax.Array:
 
 def base_height_l2(c: LeggedContext, target: float) -> jax.Array:
   """(z - target)², z of the root joint, m²."""
-  return jnp.square(c.data.qpos[2] - target)
+  return jnp.square(root_qpos(c)[2] - target)
 
 
 def base_height_exp(c: LeggedContext, target: float) -> jax.Array:
@@ -205,7 +205,7 @@ def base_height_expm1(c: LeggedContext, target: float) -> jax.Array:
 
 def root_height_ratio(c: LeggedContext, target: Positive) -> jax.Array:
   """z / target of the root joint, within 0 and 1."""
-  return jnp.clip(c.data.qpos[2] / target, 0.0, 1.0)
+  return jnp.clip(root_qpos(c)[2] / target, 0.0, 1.0)
 
 
 def self_contact(c: LeggedContext) -> jax.Array:
@@ -260,7 +260,7 @@ def action_exp_when_up(c: LeggedContext, tilt: Positive, height: float) -> jax.A
 
 def action_exp_when_root_up(c: LeggedContext, tilt: Positive, height: float) -> jax.Array:
   """As `action_exp_when_up`, of the height of the root joint."""
-  return _action_exp(c, c.data.qpos[2], tilt, height)
+  return _action_exp(c, root_qpos(c)[2], tilt, height)
 
 
 def _action_exp(c: LeggedContext, z: jax.Array, tilt: Positive, height: float) -> jax.Array:

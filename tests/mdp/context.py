@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from ml_collections import ConfigDict
 
@@ -87,6 +88,7 @@ def context(
   }
   env: Any = SimpleNamespace(
     robot=robot,
+    mj_model=SimpleNamespace(njnt=3, jnt_type=[mujoco.mjtJoint.mjJNT_FREE]),
     dt=0.02,
     terminations=SimpleNamespace(any=lambda c: jnp.array(terminated)),
     config=ConfigDict({"commands": {"gait": {"params": {"modes": ["bound", "trot"]}}}}),

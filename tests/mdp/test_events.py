@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from flax import struct
@@ -28,7 +29,7 @@ def env(dt: float = 0.02) -> Any:
     qpos=slice(7, None), joint_range=jnp.array([LOWER, UPPER]), root=1, mass=lambda model: jnp.array(MASS),
     keyframe=lambda name: {"crouch": KEYFRAME}[name], cube=1, cube_qpos=slice(0, 7),
   )  # fmt: skip
-  return SimpleNamespace(dt=dt, robot=robot)
+  return SimpleNamespace(dt=dt, robot=robot, mj_model=SimpleNamespace(njnt=3, jnt_type=[mujoco.mjtJoint.mjJNT_FREE]))
 
 
 # Starts
@@ -118,6 +119,24 @@ def test_bounds_of_a_start_that_cannot_be_name_their_event() -> None:
   message = r"^env\.events\.mine: low=\[0\.0, 0\.0, 2\.0\] and high=\[1\.0, 1\.0, 1\.0\] must be 3 numbers each"
   with pytest.raises(ConfigError, match=message):
     term(KEYS[0], env(), START)
+
+
+@pytest.mark.parametrize(
+  ("name", "params"),
+  [
+    ("reset_root_xy", {"distance": 1.0}),
+    ("reset_root_yaw", {"angle": 1.0}),
+    ("reset_root_velocity", {"speed": 1.0}),
+    ("reset_fallen", {"probability": 1.0, "height": 0.5}),
+  ],
+)
+def test_only_a_free_root_is_moved(name: str, params: dict[str, Any]) -> None:
+  """On an arm or a hand these would move its first joints."""
+  fixed = env()
+  fixed.mj_model.jnt_type = [mujoco.mjtJoint.mjJNT_HINGE]
+  (term,) = bind("events", {"mine": {"func": name, "mode": "reset", "params": params}})
+  with pytest.raises(ConfigError, match=r"^env\.events\.mine: it needs a free joint as the first of the model"):
+    term(KEYS[0], fixed, START)
 
 
 # Pushes

@@ -31,7 +31,7 @@ def arm() -> ArmContext:
   spec = build_tabletop("panda_single_cube")
   spec.body("mocap_target").geoms[0].name = "target"  # which no sensor watches
   model = spec.compile()
-  env: Any = SimpleNamespace(robot=ArmRobot(model, "home", r"joint\d"), dt=0.02)
+  env: Any = SimpleNamespace(robot=ArmRobot(model, "home", r"joint\d"), mj_model=model, dt=0.02)
   data: Any = mjx.make_data(model, impl="jax")
   return ArmContext(env, data, {}, jnp.zeros(8))
 
@@ -258,6 +258,12 @@ def test_sizes_that_do_not_fit_are_an_error_of_the_config_in_our_terms_only() ->
     ("rewards", {"func": "joint_power_l1", "weight": 1.0}, "does not fit this task: mul got incompatible shapes"),
     ("terminations", {"func": "power_above", "params": {"limit": 1.0}}, "does not fit this task: mul got"),
     ("observations", {"func": "target_error"}, "does not fit this task: sub got incompatible shapes"),
+    (
+      "rewards",
+      {"func": "base_height_l2", "weight": 1.0, "params": {"target": 1.0}},
+      "it needs a free joint as the first",
+    ),
+    ("observations", {"func": "root_quat"}, "it needs a free joint as the first of the model"),
     (
       "rewards",
       {"func": "joint_vel_within_limits", "weight": 1.0, "params": {"limits": [1.0, 2.0]}},
