@@ -150,7 +150,7 @@ def _of_term(term: Term, size: int, joints: np.ndarray, feet: np.ndarray) -> np.
 def _check_options(term: Term, whole: np.ndarray) -> None:
   """Raises ConfigError where a term's scale or clip treats left and right differently."""
   scale, clip = term.options.scale, term.options.clip
-  factors = np.abs(np.resize(np.atleast_1d(1.0 if scale is None else scale), len(whole)))
+  factors = np.resize(np.atleast_1d(1.0 if scale is None else scale), len(whole))
   uneven = clip is not None and clip[0] != -clip[1] and (whole < 0).any()
   if uneven or not np.array_equal(factors, np.abs(whole) @ factors):
     raise ConfigError(f"{term.key}: its scale or clip is not the same on the left and on the right.")

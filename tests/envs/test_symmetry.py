@@ -132,3 +132,15 @@ def test_what_has_no_mirror_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(env.robot, "left_to_right", pairs)
     with pytest.raises(ConfigError, match=sentence):
       joint_reflection(env.robot)
+
+
+@pytest.mark.parametrize(("scale", "even"), [(-2.0, True), ([1.0, 2.0] * 2, False), ([1.0, -1.0] * 2, False)], ids=str)
+def test_a_scale_is_the_same_on_both_sides(scale: Any, even: bool) -> None:
+  """Of the feet FR, FL, RR, RL."""
+  key = "observations.state"
+  env = registry.load("Go1JoystickFlatTerrain", overrides={key: None, f"{key}.last_contact": {"scale": scale}})
+  if even:
+    np.testing.assert_array_equal(mirror_of(env).obs["state"](np.arange(4.0)), [1, 0, 3, 2])  # pyright: ignore
+  else:
+    with pytest.raises(ConfigError, match=r"last_contact: its scale or clip is not the same on the left and"):
+      mirror_of(env)
