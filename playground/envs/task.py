@@ -153,7 +153,7 @@ class Task(Env):
     info: dict[str, Any] = {"rng": rng, "last_act": nothing, "last_last_act": nothing, **redrawn}
     info |= self.commands.reset(command_key) | self.events.reset(push_key, model)
     info |= self.first_info(data, own_key, model)
-    c = self.context(self, data, info, nothing, dt=0.0)
+    c = self.context(self, data, info | {"rng": obs_key}, nothing, dt=0.0)  # terms of the first step draw from `rng`
     obs, buffers = self.observations.compute(c, obs_key)
     info |= {"observation_buffers": buffers} if buffers else {}
     metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: self._metrics(c, {})))

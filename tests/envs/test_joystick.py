@@ -154,6 +154,18 @@ def test_an_episode_changes_the_model_of_its_environment() -> None:
     np.testing.assert_allclose(info["push_mass"], whole, rtol=1e-5)  # a push knows it
 
 
+def test_terms_draw_from_another_key_in_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+  """A term that draws by itself, such as `site_axes`, takes `c.info["rng"]`."""
+  env = load_task(TASK)
+  monkeypatch.setattr(env.physics, "forward", lambda model, data: data)
+  monkeypatch.setattr(env.physics, "step", lambda model, data, *_: data)
+  monkeypatch.setattr(env.observations, "compute", lambda c, *_: (c.info["rng"], {}))
+  state = env.reset(KEYS[0])
+  first = env.step(state, jnp.zeros(12))
+  second = env.step(first, jnp.zeros(12))
+  assert len({tuple(np.asarray(s.obs)) for s in (state, first, second)}) == 3
+
+
 def test_settings_stand_for_a_tasks_own_numbers() -> None:
   pushed = load_task(TASK, {"events.push.enabled": True})
   changes = {
