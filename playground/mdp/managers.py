@@ -149,6 +149,9 @@ class ObservationManager(_Manager):
     value, options = jnp.asarray(term(c), float).ravel(), term.options
     kind, size = next(iter(options.noise.items())) if options.noise else (None, 0.0)
     if kind == "same_as":
+      if drawn[str(size)].shape != value.shape:
+        sizes = f"{drawn[str(size)].size} elements, and this one has {value.size}"
+        raise ConfigError(f"{term.key}.noise.same_as={size}: that term has {sizes}.")
       value = value + drawn[str(size)]
     elif kind is not None:
       pattern = self._level * _per_element(f"{term.name}.noise.{kind}", size, value.size)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from playground.errors import ConfigError
-from playground.limits import AtLeast0, Share
+from playground.limits import AtLeast0, Limit, Share
 from playground.mdp.context import StepContext
 from playground.mdp.legged import LeggedContext
 from playground.mdp.manipulators import ArmContext, HandContext
@@ -91,10 +91,10 @@ def object_at_goal(c: ArmContext) -> jax.Array:
 
 
 def _outside(position: jax.Array, low: Bounds, high: Bounds) -> jax.Array:
-  if not len(low) == len(high) == 3:
-    raise ConfigError(
-      f"low={format_value(low)} and high={format_value(high)} must have an entry for each of x, y and z."
-    )
+  is_bound = lambda bound: bound is None or Limit().allows(bound)
+  if not all(isinstance(end, list | tuple) and len(end) == 3 and all(map(is_bound, end)) for end in (low, high)):
+    given = f"low={format_value(low)} and high={format_value(high)}"
+    raise ConfigError(f"{given} must have a number or null for each of x, y and z.")
   lower = np.array([-np.inf if bound is None else bound for bound in low])
   upper = np.array([np.inf if bound is None else bound for bound in high])
   return ((position < lower) | (position > upper)).any()

@@ -279,6 +279,13 @@ def test_observations_that_cannot_be(entry: Any, message: str) -> None:
     manager(joint_pos=entry)
 
 
+def test_noise_of_another_term_is_of_its_size() -> None:
+  of = manager(gyro={"noise": {"uniform": 0.1}}, joint_pos={"noise": {"same_as": "gyro"}})
+  message = r"^env\.observations\.state\.joint_pos\.noise\.same_as=gyro: that term has 3 elements, and this one has 2\."
+  with pytest.raises(ConfigError, match=message):
+    observe(of, context())
+
+
 @pytest.mark.parametrize(
   "section", [{"critic": {"joint_pos": {}}}, {"state": None}, {"state": {"joint_pos": None}}], ids=str
 )

@@ -272,7 +272,12 @@ def test_sizes_that_do_not_fit_are_an_error_of_the_config_in_our_terms_only() ->
     (
       "terminations",
       {"func": "body_out_of_bounds", "params": {"body": "box", "low": [0.0, None], "high": [1.0, 1.0]}},
-      r"low=\[0\.0, null\] and high=\[1\.0, 1\.0\] must have an entry for each of x, y and z",
+      r"low=\[0\.0, null\] and high=\[1\.0, 1\.0\] must have a number or null for each of x, y and z",
+    ),
+    (
+      "terminations",
+      {"func": "body_out_of_bounds", "params": {"body": "box", "low": 3, "high": ["a", None, None]}},
+      r"low=3\.0 and high=\[a, null, null\] must have a number or null for each",
     ),
     (
       "terminations",
