@@ -191,7 +191,7 @@ class TaskKeys:
   support: Annotated[Sequence[str], "feet to stand on"]
   torque_limits: Annotated[bool, "whether the hand's motors have the torque limits of the hardware"]
   ema_alpha: Annotated[float, positive(1), "share of the new target: target = ema_alpha * new + (1 - ema_alpha) * last"]
-  pose_noise: Annotated[PoseNoiseKeys, "noise of the tracked cube, which the terms sensed_cube_* read; {} is none"]
+  pose_noise: Annotated[PoseNoiseKeys, "noise of the tracked cube, which sensed_cube_* read; a file's {} is none"]
   goal: GoalKeys
   object: Annotated[str, "body to bring to the goal"]
   gripper: Annotated[str, "site at the tip of the gripper"]
