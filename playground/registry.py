@@ -33,7 +33,7 @@ from playground.config import (
 )
 from playground.envs.options import uses_vision
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.settings import Section, problem
+from playground.settings import Section, plain, problem
 from playground.text import format_value
 from playground.trust import trusted_object
 
@@ -80,7 +80,7 @@ def load(
   Args:
     name: one of `names()`.
     config: a whole configuration to use in place of the task's own; it is not changed.
-    overrides: values by dotted key, `{"rewards.joint_power_l1.weight": -0.002}`.
+    overrides: values by dotted key, `{"rewards.joint_power_l1.weight": -0.002}`; numbers may be NumPy's or JAX's.
     config_overrides: the same, under the name that Playground 0.2.0 had for it.
 
   Raises:
@@ -90,7 +90,7 @@ def load(
   default = _composed(name).env if config is None else config
   if isinstance(config, ConfigDict) and list(config) == sorted(config):  # a copy of a ConfigDict has its keys sorted
     default = in_order_of(_composed(name).env, config)
-  section = override_section("env", default, {**(overrides or {}), **(config_overrides or {})})
+  section = override_section("env", default, plain({**(overrides or {}), **(config_overrides or {})}))
   return build(config_dict(section))
 
 

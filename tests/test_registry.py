@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import yaml
 from ml_collections import ConfigDict
@@ -71,6 +72,13 @@ def test_load():
   env = playground.load("CartpoleBalance", overrides={"episode_length": 10, "sim_dt": 0.005})
   assert (env.episode_length, env.n_substeps, env.action_size) == (10, 2, 1)
   assert registry.load("CartpoleBalance", config_overrides={"episode_length": 11}).episode_length == 11
+
+
+def test_overrides_may_be_numbers_of_numpy_and_jax():
+  overrides = {"sim_dt": np.float32(0.005), "ctrl_dt": jnp.array(0.01), "vision": {"brightness": np.array([0.5, 1.0])}}
+  config = registry.load("CartpoleBalance", overrides={"episode_length": np.int64(10), **overrides}).config
+  np.testing.assert_allclose([config.sim_dt, config.ctrl_dt, *config.vision.brightness], [0.005, 0.01, 0.5, 1.0])
+  assert config.episode_length == 10
 
 
 def test_load_with_a_config_leaves_it_alone():
