@@ -131,6 +131,16 @@ class Env(abc.ABC):
       setattr(other, name, getattr(self, name).with_settings(values))
     return other
 
+  def __deepcopy__(self, memo: dict[int, object]) -> Self:
+    """Copies the task with its models; the spec copies itself, for Python cannot."""
+    other = copy.copy(self)
+    memo[id(self)] = other
+    if self.spec is not None:
+      memo[id(self.spec)] = self.spec.copy()
+    vars(other).pop("jitted", None)  # is of this task
+    vars(other).update(copy.deepcopy(vars(other), memo))
+    return other
+
   @property
   def mjx_model(self) -> mjx.Model:
     """The model on the device, before any randomisation."""

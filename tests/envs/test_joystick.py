@@ -1,5 +1,6 @@
 """The joystick task on the Go1: shapes, composition by config, pushes, starts, and what it keeps account of."""
 
+import copy
 import re
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,18 @@ def test_an_episode_changes_the_model_of_its_environment() -> None:
     assert (scales[:, trunk] > 1.5).all() and (scales[:, trunk] < 2.0).all() and len(set(scales[:, trunk])) == BATCH
     np.testing.assert_allclose(np.delete(scales, [0, trunk], axis=1), 1, rtol=1e-6)
     np.testing.assert_allclose(info["push_mass"], whole, rtol=1e-5)  # a push knows it
+
+
+def test_a_deep_copy_is_a_task_of_its_own() -> None:
+  env = load_task(TASK)
+  assert env.jitted
+  other = copy.deepcopy(env)
+  other.mj_model.body_mass[1] = 99.0
+  assert env.mj_model.body_mass[1] < 10 and other.spec is not env.spec and other.spec.bodies[1].name == "trunk"
+  assert other.events.groups["interval"][0].instance.env is other
+  assert other.jitted is not env.jitted and jax.tree.map(jnp.shape, shapes(other)) == jax.tree.map(
+    jnp.shape, shapes(env)
+  )
 
 
 def test_terms_draw_from_another_key_in_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
