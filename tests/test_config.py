@@ -430,6 +430,11 @@ def test_errors_are_one_sentence(line: str):
   assert isinstance(caught.value, UnknownNameError) == ("does not exist" in message and "=/nowhere" not in line)
 
 
+def test_a_key_of_an_empty_mapping_is_set_with_the_mapping():
+  with pytest.raises(UnknownNameError, match=r"is empty\. Set it whole: env\.observation_order=\{state: <value>\}\."):
+    compose(["env=Go1JoystickFlatTerrain", "env.observation_order.state=[gyro]"])
+
+
 ROBOT_FILES = {  # a line of a robot's file: the error, or what begins it
   "pd: {kd: 1}": "env.robot.pd.kd does not exist. Did you mean 'kv'?",
   "pd: 5": "env.robot.pd=5 has the wrong type: it must be a mapping, such as",

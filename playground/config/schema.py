@@ -151,6 +151,8 @@ def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section)
   if not isinstance(node, Mapping):
     what = f"a list of {len(node)}" if isinstance(node, list) else "a single value"
     return UnknownNameError(f"{key} does not exist: {parent} is {what}.")
+  if not node:
+    return UnknownNameError(f"{key} does not exist: {parent} is empty. Set it whole: {parent}={{{part}: <value>}}.")
   if parent == "agent" and (
     owners := [f"agent={name}" for name, cls in agents().items() if part in cls.__dataclass_fields__]
   ):
