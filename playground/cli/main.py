@@ -125,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
   export.add_argument("path", metavar="run", help=_RUN)
   export.add_argument("--out", metavar="FOLDER", help="folder to write to (default: <run>/export)")
   play = add("play", _play, "Run a policy in plain C MuJoCo: measure it, film it or watch it.")
-  play.add_argument("policy", help=f"{_RUN}, or a policy.onnx beside its policy.yaml")
+  play.add_argument("policy", help=f"{_RUN}, or a policy.onnx beside its policy.yaml, or their folder")
   play.add_argument(
     "--agent", choices=("zero", "random"), help="zero or random actions on a task, in place of a policy"
   )

@@ -52,8 +52,8 @@ def play(
   """Runs a policy with ONNX Runtime in C MuJoCo, with the task's rate, noise, pushes and delays, on the nominal model.
 
   Args:
-    path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it; with `agent` a
-      task.
+    path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it, or their folder;
+      with `agent` a task.
     agent: zero or random actions in place of a policy; None is the policy of `path`.
     overrides: with `agent`: as for playground-run.
     randomize: with `agent`: whether the task's startup events draw the model.
@@ -162,6 +162,8 @@ def open_policy(path: str, interval_events: bool = True) -> Opened:
   Raises:
     PlaygroundError: no such run or policy.
   """
+  if (exported_to := Path(path).expanduser() / "policy.onnx").is_file():
+    path = str(exported_to)
   if Path(path).suffix == ".onnx":
     exported = ExportedPolicy.load(path)
     _set_up_cpu()

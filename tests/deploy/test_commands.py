@@ -54,7 +54,7 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
   assert contract["origin"]["evaluation"] == {"steps": 2000, "episode_reward": 12.5, "episode_length": 40}
 
   scores = []
-  for policy in (run, run / "export" / "policy.onnx"):
+  for policy in (run, run / "export" / "policy.onnx", run / "export"):
     assert command("play", str(policy), "--episodes", "3", "--seed", "4") == 0
     shown = " ".join(capsys.readouterr().out.split())
     report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_episodes_3.json").read_text())
@@ -62,7 +62,7 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
     scores.append(report["scores"])
     assert "MJX-Warp in training" in shown
     assert re.search(rf"reward\W+{scores[-1]['episode_reward']:.4g}\W+12.5\b", shown)
-  assert scores[0] == scores[1]
+  assert scores[0] == scores[1] == scores[2]
   assert command("play", str(run), "--episodes", "3", "--seed", "4", "--no-events") == 0
   report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_episodes_3_no_events.json").read_text())
   assert not report["interval_events"] and report["scores"] == scores[0], "Cartpole has no interval events"
