@@ -129,20 +129,5 @@ class Player:
     info = state.info
     if self.takes_commands:
       info = info | {_COMMAND: jnp.where(driven, command, info[_COMMAND])}
-    data = state.data.replace(xfrc_applied=jnp.zeros_like(force))
-    return _with_force(self.env, force).step(state.replace(data=data, info=info), action)
-
-
-def _with_force(env: Env, force: jax.Array) -> Env:
-  """Returns the task with external forces and torques [nbody, 6] in its steps, added to those of its events."""
-  other = copy.copy(env)
-  if env.unwrapped is not env:  # a wrapper, such as that of images
-    vars(other)["env"] = _with_force(vars(env)["env"], force)
-    return other
-
-  def pre_step(state: State) -> State:
-    state = env.pre_step(state)
-    return state.replace(data=state.data.replace(xfrc_applied=state.data.xfrc_applied + force))
-
-  vars(other)["pre_step"] = pre_step
-  return other
+    data = state.data.replace(xfrc_applied=jnp.asarray(force))
+    return self.env.step(state.replace(data=data, info=info), action)

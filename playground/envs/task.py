@@ -173,6 +173,8 @@ class Task(Env):
     after |= self.commands.step(c, command_key) | self.next_info(c, own_key)
     after |= {"observation_buffers": buffers} if buffers else {}
     reward = self.clipped(self.total(rewards))
+    if self.events.groups["interval"]:  # whose forces, which add up, act in one step
+      data = data.replace(xfrc_applied=jnp.zeros_like(data.xfrc_applied))
     return State(data, obs, reward, c.terminated.astype(jnp.float32), self._metrics(c, rewards), after)
 
   def total(self, rewards: Mapping[str, jax.Array]) -> jax.Array:

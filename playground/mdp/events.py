@@ -284,8 +284,8 @@ class PushByForce:
     }
 
   def apply(self, data: PhysicsData, force: jax.Array) -> PhysicsData:
-    """Returns the physics with a force [3], or force and torque [6], on the body."""
-    return data.replace(xfrc_applied=data.xfrc_applied.at[self.body, : force.size].set(force))
+    """Returns the physics with a further force [3], or force and torque [6], on the body."""
+    return data.replace(xfrc_applied=data.xfrc_applied.at[self.body, : force.size].add(force))
 
 
 @dataclasses.dataclass

@@ -60,8 +60,14 @@ def test_endings_all_of_which_cost(barkour: Any) -> None:
 def test_it_is_pushed(barkour: Any) -> None:
   push = {"push_interval": jnp.array(50), "push_duration": jnp.array(4), "push_direction": jnp.array([0.0, 1.0, 0.0])}
   push |= {"push_velocity": jnp.array(1.0), "push_mass": jnp.array(14.5), "push_step": jnp.array(102)}
-  force = barkour.pre_step(recorded(TASK, **push)).data.xfrc_applied[barkour.robot.root, :3]
-  np.testing.assert_allclose(force, [0, 0.5 * 14.5 * 1.0 / 0.08, 0], rtol=1e-5)
+  state, peak = recorded(TASK, **push), 0.5 * 14.5 * 1.0 / 0.08
+  pushed = barkour.pre_step(state).data.xfrc_applied[barkour.robot.root, :3]
+  np.testing.assert_allclose(pushed, [0, peak, 0], rtol=1e-5)
+
+  mouse = state.data.xfrc_applied.at[barkour.robot.root, 2].set(7.0)
+  both = barkour.pre_step(state.replace(data=state.data.replace(xfrc_applied=mouse)))
+  np.testing.assert_allclose(both.data.xfrc_applied[barkour.robot.root, :3], [0, peak, 7], rtol=1e-5)
+  assert not evaluate(barkour, both).data.xfrc_applied.any(), "forces act in one step"
 
 
 def test_observations_never_mix_episodes(barkour: Any, monkeypatch: pytest.MonkeyPatch) -> None:

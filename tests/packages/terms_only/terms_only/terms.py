@@ -45,4 +45,4 @@ class Wind:
 
   def step(self, data: PhysicsData, info: dict[str, Any]) -> tuple[PhysicsData, dict[str, Any]]:
     """Returns the physics that the control step begins with, and the entries of `info` that change."""
-    return data.replace(xfrc_applied=data.xfrc_applied.at[self.body, :3].set(info["wind"])), {}
+    return data.replace(xfrc_applied=data.xfrc_applied.at[self.body, :3].add(info["wind"])), {}
