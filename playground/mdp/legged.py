@@ -40,11 +40,9 @@ class LeggedRobot(Robot):
     """Looks up the names of `env.robot`.
 
     Raises:
-      ConfigError: the model lacks one or the free joint, its joints come in another order, or a list does not have one
-        entry for each foot or joint.
+      ConfigError: the model lacks one, its joints come in another order, or a list does not have one entry for each
+        foot or joint.
     """
-    if not mj_model.njnt or mj_model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-      raise ConfigError(f"env.robot.mjcf needs <freejoint/> as its first joint, in the body {config.root}.")
     joints = [mj_model.joint(i).name for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
       raise ConfigError(f"env.robot.joints must name the model's joints in their order: {', '.join(joints)}.")
