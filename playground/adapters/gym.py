@@ -179,7 +179,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
       after = batch.step(state, action)
       ended = after.done if same_step else state.done
       begun = jax.lax.cond(ended.any(), lambda: where_done(ended, start(key), after), lambda: after)
-      kept = {name: after.info[name] for name in (PRESERVE_INFO,) if name in after.info}
+      kept = {name: value for name, value in after.info.items() if name == PRESERVE_INFO}
       begun = begun.replace(info=begun.info | kept)
       return begun, (after if same_step else begun).replace(data=None)
 
