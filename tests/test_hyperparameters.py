@@ -146,8 +146,10 @@ def test_defaults_that_are_not_the_papers():
     "BarkourJoystick",
     "H1JoystickGaitTracking",
     "BerkeleyHumanoidJoystickRoughTerrain",
+    "AlohaSinglePegInsertion",
+    "AlohaHandOver",
   )
-  assert [agent(task).num_resets_per_eval for task in whole] == [1, 1, 1, 1]
+  assert [agent(task).num_resets_per_eval for task in whole] == [1] * 6
   getup = [compose(["env=Go1Getup", f"agent={name}"]).agent for name in ("ppo", "ppo_paper")]
   assert [(each.num_timesteps, each.num_evals, each.num_resets_per_eval) for each in getup] == [
     (100_000_000, 6, 30),
