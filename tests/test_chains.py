@@ -156,8 +156,8 @@ def test_every_chain_has_an_experiment():
     ),
     (
       "g1_rough_chain",
-      ("choices.env", "agent.name"),
-      [("G1JoystickFlatTerrain", "reppo"), ("G1JoystickRoughTerrain", "reppo")],
+      ("choices.env", "agent.name", "agent.num_timesteps"),
+      [("G1JoystickFlatTerrain", "fast_sac", 20_000_000), ("G1JoystickRoughTerrain", "fast_sac", 20_000_000)],
     ),
   ],
 )

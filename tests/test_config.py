@@ -75,9 +75,8 @@ def test_env_and_agent_alone_pick_the_tuned_set():
   [
     ("env=HumanoidWalk", None),
     ("experiment=humanoid_run", None),
-    ("experiment=g1_joystick", "fast_sac/G1JoystickFlatTerrain"),
-    ("env=G1JoystickRoughTerrain", "reppo/G1JoystickRoughTerrain"),
-    ("env=T1JoystickRoughTerrain", "reppo/T1JoystickRoughTerrain"),
+    ("experiment=g1_joystick", "fast_sac/biped_joystick"),
+    ("env=T1JoystickRoughTerrain", "fast_sac/biped_joystick"),
   ],
 )
 def test_a_task_chooses_the_agent_that_learns_it_best(chosen: str, tuned: str | None):
@@ -91,7 +90,7 @@ def test_a_variant_keeps_the_agent_that_is_measured_on_it():
   assert [compose([f"env=AcrobotSwingup{kind}"]).agent_name for kind in ("", "Sparse")] == ["reppo", "ppo"]
 
 
-@pytest.mark.parametrize(("task", "tuned"), [("joystick", "ppo/joystick"), ("biped_joystick", "reppo/biped_joystick")])
+@pytest.mark.parametrize(("task", "tuned"), [("joystick", "ppo/joystick"), ("biped_joystick", "fast_sac/biped_joystick")])
 def test_a_new_robot_trains_with_the_set_of_robots_like_it(configs: Path, task: str, tuned: str):
   assert compose([f"env={task}", "robot=h1"]).choices["tuned"] == tuned
   (configs / "env/Mine.yaml").write_text(f"defaults: [{task}, override /robot@_global_.robot: h1, _self_]\n")
@@ -343,7 +342,7 @@ ERRORS = {
   "agent.network={activatio: relu}": ["agent.network.activatio", "does not exist.", "'agent.network.activation'?"],
   "env=Go1JoystickFlatTerrain env.rewards.joint_power_l1.wieght=1": ["joint_power_l1.wieght does not", "'weight'?"],
   "env=T1JoystickFlatTerrain agent.clipping_epsilon=0.2": [
-    "agent.clipping_epsilon does not exist for agent=reppo, only for agent=ppo."
+    "agent.clipping_epsilon does not exist for agent=fast_sac, only for agent=ppo."
   ],
   "agent.name.x=1": ["agent.name.x does not exist: agent.name is a single value."],
   "agent.network.policy_hidden_layer_sizes.9.x=1": ["agent.network.policy_hidden_layer_sizes is a list of 4."],
