@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from playground import catalog
-from playground.benchmark.report.suites import GALLERY, TABLES, TASKS_BEGIN, TASKS_END, write_pages
+from playground.benchmark.report.suites import AGENTS, GALLERY, TABLES, TASKS_BEGIN, TASKS_END, write_pages
 from playground.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
@@ -18,10 +18,10 @@ PAGES = [f"{kind}-{name}.md" for name in TABLES for kind in ("results", "runs")]
 
 
 def test_the_pages_have_the_runs_of_the_reference_tables(tmp_path: Path):
-  for page in (*PAGES, GALLERY):
+  for page in (*PAGES, AGENTS, GALLERY):
     shutil.copyfile(ROOT / "docs" / page, tmp_path / page)
-  assert write_pages(tmp_path, REFERENCE) == [tmp_path / page for page in (*PAGES, GALLERY)]
-  texts = {page: (tmp_path / page).read_text() for page in (*PAGES, GALLERY)}
+  assert write_pages(tmp_path, REFERENCE) == [tmp_path / page for page in (*PAGES, AGENTS, GALLERY)]
+  texts = {page: (tmp_path / page).read_text() for page in (*PAGES, AGENTS, GALLERY)}
   for page, text in texts.items():
     assert text == (ROOT / "docs" / page).read_text(), "write them: playground-bench report pages=docs"
   runs, results = ("".join(texts[page] for page in PAGES if page.startswith(kind)) for kind in ("runs", "results"))
@@ -44,7 +44,7 @@ def test_a_page_without_a_place_is_refused(tmp_path: Path):
 
 
 def test_rows_of_tasks_that_the_catalogue_lacks_and_rows_without_numbers(tmp_path: Path):
-  for page in (*PAGES, GALLERY):
+  for page in (*PAGES, AGENTS, GALLERY):
     shutil.copyfile(ROOT / "docs" / page, tmp_path / page)
   reference = Path(shutil.copytree(REFERENCE, tmp_path / "reference", ignore=shutil.ignore_patterns("*.png")))
   table = reference / "vision.csv"

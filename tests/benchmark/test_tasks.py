@@ -4,7 +4,7 @@ import pytest
 
 from playground.benchmark.report import tasks
 from playground.benchmark.report.public import Curve
-from playground.benchmark.report.tasks import Row, by_mode, table
+from playground.benchmark.report.tasks import Row, agents_table, by_mode, table
 from playground.catalog import best_runs, entries, run_name
 
 TASK = "CheetahRun"
@@ -74,3 +74,19 @@ def test_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch):
   assert row[5:] == ["1 (1)", "", "50", "1 after 10 (PPO, mode)", "1 after 10 (PPO, mode)"]
   (row,) = table([entry], []).rows
   assert row[2] == "not measured"
+
+
+def test_a_row_for_each_agent_of_a_task_that_several_trained():
+  rows = [
+    run(700, success="0.5"),
+    run(800, agent="ppo_v020", setting="env=CheetahRun", seed="2", success="0.75"),
+    run(600, agent="fast_sac", device="CPU", falls_per_episode="0.25", steps="1000000"),
+    run(640, agent="fast_sac", device="CPU", falls_per_episode="0.5", steps="1000000", seed="2"),
+    run(999, agent="sac", who="playground 0.2.0"),
+    run(5, task="WalkerRun"),
+  ]
+  entries_ = [entries()[TASK], entries()["WalkerRun"], entries()["HopperHop"]]
+  assert agents_table(entries_, rows).rows == [
+    [TASK, "ppo_v020", "60", "1 (1)", "800", "", "0.75 success", "GPU", ""],
+    [TASK, "fast_sac", "1", "2 (2)", "", "620 ± 254", "0.38 falls", "CPU", "yes"],
+  ]

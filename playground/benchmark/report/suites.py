@@ -1,7 +1,7 @@
 """Writes the tables of the result pages and the grids of the gallery from results/reference/ and the catalogue.
 
 A page is written by hand except for the text between two comments, which `playground-bench report pages=docs` replaces.
-Each suite has a page with a row for each task, and a page with every run, open tasks first.
+Each suite has a page with a row for each task, and a page with every run, open tasks first; one page compares the agents.
 """
 
 import re
@@ -24,6 +24,8 @@ TABLES = {  # name of the pages results-<name>.md and runs-<name>.md -> their ta
 GENERATED = "<!-- {}: written by `playground-bench report pages=docs` -->"
 TASKS_BEGIN, TASKS_END = GENERATED.format("tasks"), "<!-- end of tasks -->"
 RUNS_BEGIN, RUNS_END = GENERATED.format("runs"), "<!-- end of runs -->"
+AGENTS = "results-agents.md"
+AGENTS_BEGIN, AGENTS_END = GENERATED.format("agents"), "<!-- end of agents -->"
 GALLERY = "gallery.md"
 GRID_BEGIN, GRID_END = GENERATED.format("grid {}"), "<!-- end of grid -->"
 _GRID_WIDTH = 4  # animations in a row
@@ -63,6 +65,8 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
       found = tasks.table(_entries(name, rows), rows[name])
       written.append(_rewrite(pages / f"results-{name}.md", TASKS_BEGIN, TASKS_END, [found]))
       written.append(_rewrite(pages / f"runs-{name}.md", RUNS_BEGIN, RUNS_END, list(_blocks(rows[name]))))
+    every = [row for found in rows.values() for row in found]
+    written.append(_rewrite(pages / AGENTS, AGENTS_BEGIN, AGENTS_END, [tasks.agents_table([*entries().values()], every)]))
     for suite in dict.fromkeys(entry.suite for entry in entries().values()):
       _rewrite(pages / GALLERY, GRID_BEGIN.format(suite), GRID_END, _grid(suite))
   except FileNotFoundError as error:

@@ -1,15 +1,17 @@
-"""Builds a table of a suite's tasks: each task's best run, beside the best public ones at equal steps."""
+"""Builds tables of tasks: the best run of each beside the best public ones at equal steps, and the best of each agent."""
 
 import re
 from collections.abc import Sequence
+from statistics import fmean
 
 from playground.benchmark.report.public import at, is_ppo, public_curves
-from playground.catalog import Entry, best_runs, run_name
+from playground.catalog import Entry, best_runs, reached_return, run_name
 from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
 from playground.text import millions
 
 _HEADER = ("task", "status", "best run", "M steps", "default budget", "runs (seeds)", "sampled", "mode")
 _PUBLIC = ("best public PPO", "best public")  # at as many steps
+_AGENTS = ("task", "best run", "M steps", "runs (seeds)", "sampled", "mode", "falls or success", "trained on", "default")
 _BY_MODE = ("reppo", "fast_td3", "fast_sac")  # whose agent.deterministic_eval is true by default
 Row = dict[str, str]
 
@@ -33,15 +35,53 @@ def table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
     if not runs:
       cells.append([entry.task, entry.status, NOT_MEASURED, "", budget, "", "", "", "", ""])
       continue
-    steps = float(runs[0]["steps"])
-    count = f"{len(runs)} ({len({row['seed'] for row in runs})})"
-    sampled = "" if by_mode(runs[0]) else _with_ci(runs, "final_return")
-    mode = _with_ci(runs, "final_return" if by_mode(runs[0]) else "final_mode_return")
-    public = [_public(entry.task, steps, ppo_only) for ppo_only in (True, False)]
-    cells.append([entry.task, entry.status, run_name(runs[0]), millions(steps), budget, count, sampled, mode, *public])
+    name, steps, *returns = _cells(runs)
+    public = [_public(entry.task, float(runs[0]["steps"]), ppo_only) for ppo_only in (True, False)]
+    cells.append([entry.task, entry.status, name, steps, budget, *returns, *public])
   if not any(row[-1] for row in cells):
     return Table(_HEADER, [row[: -len(_PUBLIC)] for row in cells])
   return Table([*_HEADER, *_PUBLIC], cells)
+
+
+def agents_table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
+  """Builds a table of the tasks that several agents trained: the best runs of each agent, the best agent first.
+
+  Args:
+    entries: catalogue entries of the tasks.
+    rows: rows of the tasks' runs, from results/reference.
+  """
+  cells = []
+  for entry in entries:
+    by_agent: dict[str, list[Row]] = {}
+    for row in rows:
+      by_agent.setdefault(_agent(row), []).append(row)
+    found = [runs for of_agent in by_agent.values() if (runs := best_runs(of_agent, entry.task))]
+    for runs in sorted(found, key=lambda runs: -fmean(map(reached_return, runs))) if len(found) > 1 else []:
+      on = "CPU" if runs[0].get("device") == "CPU" else "GPU"
+      default = "yes" if _agent(runs[0]) == entry.agent else ""
+      cells.append([entry.task, *_cells(runs), _ended(runs), on, default])
+  return Table(_AGENTS, cells)
+
+
+def _agent(row: Row) -> str:
+  """Returns a run's algorithm, without the set of hyperparameters that some rows name with it."""
+  return re.split(r"[, ]|_v020|_paper", row["agent"])[0]
+
+
+def _cells(runs: Sequence[Row]) -> list[str]:
+  """Returns the name, M steps, number, and mean returns of runs, sampled and by the mode."""
+  count = f"{len(runs)} ({len({row['seed'] for row in runs})})"
+  sampled = "" if by_mode(runs[0]) else _with_ci(runs, "final_return")
+  mode = _with_ci(runs, "final_return" if by_mode(runs[0]) else "final_mode_return")
+  return [run_name(runs[0]), millions(float(runs[0]["steps"])), count, sampled, mode]
+
+
+def _ended(runs: Sequence[Row]) -> str:
+  """Returns the mean fraction of successes, else the mean number of falls an episode; "" if the runs logged neither."""
+  for column, name in (("success", "success"), ("falls_per_episode", "falls")):
+    if values := _returns(runs, column):
+      return f"{fmean(values):.2f} {name}"
+  return ""
 
 
 def _returns(runs: Sequence[Row], column: str) -> list[float]:
