@@ -63,11 +63,11 @@ def test_quickstart_never_leaks_onto_a_chosen_run(choice: str):
 
 
 def test_env_and_agent_alone_pick_the_tuned_set():
-  cartpole, go1 = compose(["env=CartpoleSwingup"]), compose(["agent=ppo", "env=Go1JoystickFlatTerrain"])
-  assert (cartpole.choices["tuned"], go1.choices["tuned"]) == ("ppo/CartpoleSwingup", "ppo/Go1JoystickFlatTerrain")
+  cartpole, go1 = compose(["env=CartpoleBalanceSparse"]), compose(["agent=ppo", "env=Go1JoystickFlatTerrain"])
+  assert (cartpole.choices["tuned"], go1.choices["tuned"]) == ("ppo/CartpoleBalanceSparse", "ppo/Go1JoystickFlatTerrain")
   assert (cartpole.agent.discounting, go1.agent.discounting) == (0.995, 0.97)
   assert go1.agent.network.value_obs_key == "privileged_state"
-  assert compose(["env=CartpoleSwingup", "tuned=null"]).agent.discounting == 0.99
+  assert compose(["env=CartpoleBalanceSparse", "tuned=null"]).agent.discounting == 0.99
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_later_layers_win(configs: Path):
   assert isinstance(agent.learning_rate, float)
   assert compose(["experiment=mine", "agent.num_envs=256"], configs).agent.num_envs == 256
   assert compose(["agent.num_envs=4", "debug=fast", "experiment=mine"], configs).agent.num_envs == 4
-  assert compose(["experiment=mine", "env=CartpoleSwingup"], configs).choices["tuned"] == "ppo/CartpoleSwingup"
+  assert compose(["experiment=mine", "env=PointMass"], configs).choices["tuned"] == "ppo/PointMass"
 
 
 def test_a_task_chooses_robot_and_randomization_which_the_command_line_overrides():

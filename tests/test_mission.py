@@ -40,7 +40,7 @@ defaults:
   - _self_
 stages:
   balance: {{num_timesteps: 400, overrides: [env.episode_length=10]}}
-  swing_up: {{num_timesteps: {STEPS}, overrides: [env=CartpoleSwingup]}}
+  swing_up: {{num_timesteps: {STEPS}, overrides: [env=CartpoleSwingup, agent=ppo]}}
 """
 
 

@@ -189,8 +189,8 @@ def test_every_job_is_checked_and_named(folder: Path):
   (folder / "typo.yaml").write_text("params: {env: CartpoleBalance, agent.learning_rat: [1, 2]}\n")
   with pytest.raises(UnknownNameError, match=r"Did you mean 'agent\.learning_rate'\?"):
     compose_all(combinations(expand(["sweep=typo"])))
-  with pytest.raises(ConfigError, match=r"^Job env=CartpoleSwingup agent\.num_envs=7: agent\.num_envs=7 does not"):
-    compose_all(combinations(["env=CartpoleBalance,CartpoleSwingup", "agent.num_envs=256,7"])[2:])
+  with pytest.raises(ConfigError, match=r"^Job env=PointMass agent\.num_envs=7: agent\.num_envs=7 does not"):
+    compose_all(combinations(["env=CartpoleBalance,PointMass", "agent.num_envs=256,7"])[2:])
 
 
 @pytest.mark.parametrize(

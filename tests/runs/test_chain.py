@@ -300,8 +300,8 @@ def test_a_chain_starts_at_a_stage_from_someones_weights(
 @pytest.mark.parametrize(
   ("stage", "message"),
   {
-    "env=CartpoleSwingup": r"Stage far of the chain: env=CartpoleSwingup cannot start from the weights of stage near: "
-    r"size of observation 'privileged_state' is \(8,\), and \(4,\) there\.",
+    "env=CartpoleSwingupSparse": r"Stage far of the chain: env=CartpoleSwingupSparse cannot start from the weights of "
+    r"stage near: size of observation 'privileged_state' is \(8,\), and \(4,\) there\.",
     "agent.network.policy_hidden_layer_sizes=[16,8]": r"Stage far of the chain: .* of stage near: agent\.network\."
     r"policy_hidden_layer_sizes is \[16, 8\], and \[\d+.*\] there\.",
     "agent.network.activation=relu": r"Stage far .*: agent\.network\.activation is relu, and swish there\.",

@@ -11,7 +11,7 @@ from playground.errors import ConfigError, PlaygroundError
 from playground.sweep import local
 from playground.sweep.plan import plan, settings_of
 
-LINE = ["env=CartpoleBalance,CartpoleSwingup", "seed=1,2", "agent.max_grad_norm=null,1.0", "debug=fast"]
+LINE = ["env=CartpoleBalance,PointMass", "seed=1,2", "agent.max_grad_norm=null,1.0", "debug=fast"]
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +26,7 @@ def test_jobs_are_named_after_what_they_differ_in(here: Path) -> None:
   assert [job.name for job in sweep.jobs][::3] == [
     "000_CartpoleBalance_seed=1_max_grad_norm=None",
     "003_CartpoleBalance_seed=2_max_grad_norm=1",
-    "006_CartpoleSwingup_seed=2_max_grad_norm=None",
+    "006_PointMass_seed=2_max_grad_norm=None",
   ]
   assert sweep.jobs[3].varies == {"env": "CartpoleBalance", "seed": 2, "agent.max_grad_norm": 1.0}
   assert sweep.jobs[3].overrides == ["env=CartpoleBalance", "seed=2", "agent.max_grad_norm=1.0", "debug=fast"]
