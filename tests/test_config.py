@@ -63,11 +63,11 @@ def test_quickstart_never_leaks_onto_a_chosen_run(choice: str):
 
 
 def test_env_and_agent_alone_pick_the_tuned_set():
-  cartpole, go1 = compose(["env=CartpoleBalanceSparse"]), compose(["agent=ppo", "env=Go1JoystickFlatTerrain"])
-  assert (cartpole.choices["tuned"], go1.choices["tuned"]) == ("ppo/CartpoleBalanceSparse", "ppo/Go1JoystickFlatTerrain")
+  cartpole, go1 = compose(["env=CartpoleBalance"]), compose(["agent=ppo", "env=Go1JoystickFlatTerrain"])
+  assert (cartpole.choices["tuned"], go1.choices["tuned"]) == ("ppo/CartpoleBalance", "ppo/Go1JoystickFlatTerrain")
   assert (cartpole.agent.discounting, go1.agent.discounting) == (0.995, 0.97)
   assert go1.agent.network.value_obs_key == "privileged_state"
-  assert compose(["env=CartpoleBalanceSparse", "tuned=null"]).agent.discounting == 0.99
+  assert compose(["env=CartpoleBalance", "tuned=null"]).agent.discounting == 0.99
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,9 @@ def test_a_variant_keeps_the_agent_that_is_measured_on_it():
   assert [compose([f"env=AcrobotSwingup{kind}"]).agent_name for kind in ("", "Sparse")] == ["reppo", "ppo"]
 
 
-@pytest.mark.parametrize(("task", "tuned"), [("joystick", "ppo/joystick"), ("biped_joystick", "fast_sac/biped_joystick")])
+@pytest.mark.parametrize(
+  ("task", "tuned"), [("joystick", "ppo/joystick"), ("biped_joystick", "fast_sac/biped_joystick")]
+)
 def test_a_new_robot_trains_with_the_set_of_robots_like_it(configs: Path, task: str, tuned: str):
   assert compose([f"env={task}", "robot=h1"]).choices["tuned"] == tuned
   (configs / "env/Mine.yaml").write_text(f"defaults: [{task}, override /robot@_global_.robot: h1, _self_]\n")

@@ -1,7 +1,8 @@
 """Writes the tables of the result pages and the grids of the gallery from results/reference/ and the catalogue.
 
 A page is written by hand except for the text between two comments, which `playground-bench report pages=docs` replaces.
-Each suite has a page with a row for each task, and a page with every run, open tasks first; one page compares the agents.
+Each suite has a page with a row for each task, and a page with every run, open tasks first.
+One page compares the agents.
 """
 
 import re
@@ -65,8 +66,8 @@ def write_pages(pages: Path, reference: Path) -> list[Path]:
       found = tasks.table(_entries(name, rows), rows[name])
       written.append(_rewrite(pages / f"results-{name}.md", TASKS_BEGIN, TASKS_END, [found]))
       written.append(_rewrite(pages / f"runs-{name}.md", RUNS_BEGIN, RUNS_END, list(_blocks(rows[name]))))
-    every = [row for found in rows.values() for row in found]
-    written.append(_rewrite(pages / AGENTS, AGENTS_BEGIN, AGENTS_END, [tasks.agents_table([*entries().values()], every)]))
+    by_agent = tasks.agents_table([*entries().values()], [row for found in rows.values() for row in found])
+    written.append(_rewrite(pages / AGENTS, AGENTS_BEGIN, AGENTS_END, [by_agent]))
     for suite in dict.fromkeys(entry.suite for entry in entries().values()):
       _rewrite(pages / GALLERY, GRID_BEGIN.format(suite), GRID_END, _grid(suite))
   except FileNotFoundError as error:

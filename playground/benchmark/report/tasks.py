@@ -1,4 +1,4 @@
-"""Builds tables of tasks: the best run of each beside the best public ones at equal steps, and the best of each agent."""
+"""Builds tables of tasks: the best run of each beside the best public ones at equal steps, and that of each agent."""
 
 import re
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from playground.text import millions
 
 _HEADER = ("task", "status", "best run", "M steps", "default budget", "runs (seeds)", "sampled", "mode")
 _PUBLIC = ("best public PPO", "best public")  # at as many steps
-_AGENTS = ("task", "best run", "M steps", "runs (seeds)", "sampled", "mode", "falls or success", "trained on", "default")
+_AGENTS = ("task", "best run", "M steps", "runs (seeds)", "sampled", "mode", "ended", "trained on", "default")
 _BY_MODE = ("reppo", "fast_td3", "fast_sac")  # whose agent.deterministic_eval is true by default
 Row = dict[str, str]
 
