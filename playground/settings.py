@@ -18,6 +18,8 @@ import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
+from ml_collections import ConfigDict
+
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.limits import Limit
 from playground.text import format_value, join, wrong_type
@@ -169,6 +171,14 @@ def plain(value: Plain, finite: bool = False) -> Plain:
   if isinstance(value, float):
     return None if finite and not math.isfinite(value) else value
   return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def config_dict(values: Section | ConfigDict) -> Plain:
+  """Returns a ConfigDict whose keys keep their order, in which terms apply; ConfigDict itself sorts them."""
+  config: Plain = ConfigDict(sort_keys=False)
+  for key, value in values.items():
+    config[key] = config_dict(value) if isinstance(value, Mapping | ConfigDict) else value
+  return config
 
 
 def members(hint: Any) -> tuple[Any, ...]:

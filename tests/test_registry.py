@@ -1,6 +1,8 @@
 """Task names to tasks: ours, and those of an outside package."""
 
+import copy
 import os
+import pickle
 import subprocess
 import sys
 import textwrap
@@ -19,6 +21,7 @@ import playground
 from playground import registry, trust
 from playground.config import compose, config_dict, config_roots, options
 from playground.config.files import lineage
+from playground.envs.c_physics import on_c_physics
 from playground.envs.wrappers import wrap_for_evaluation
 from playground.errors import ConfigError, UnknownNameError
 from playground.randomization import Randomizer
@@ -86,6 +89,35 @@ def test_load_with_a_config_leaves_it_alone():
   config.episode_length = 12
   env = registry.load("CartpoleBalance", config, overrides={"ctrl_dt": 0.02})
   assert (env.episode_length, env.dt, config.ctrl_dt) == (12, 0.02, 0.01)
+
+
+@pytest.mark.parametrize(
+  ("name", "overrides"),
+  [
+    ("CartpoleBalance", {"episode_length": 10}),
+    ("Go1JoystickFlatTerrain", {"rewards.joint_power_l1.weight": -5.0}),
+    ("CartpoleBalanceVision", {"vision.width": 8, "vision.height": 4}),
+  ],
+)
+def test_a_pickled_task_is_built_from_its_config(name: str, overrides: dict[str, Any]):
+  env = registry.load(name, overrides=overrides)
+  for task in (env, copy.copy(env), copy.deepcopy(env)):
+    other = pickle.loads(pickle.dumps(task))
+    assert type(other) is type(env)
+    assert str(other.config.to_dict()) == str(env.config.to_dict()), "the keys keep their order"
+    parts, own = other.observation_parts, env.observation_parts
+    assert [(group, list(terms.items())) for group, terms in parts.items()] == [
+      (group, list(terms.items())) for group, terms in own.items()
+    ]
+  assert copy.copy(env).mj_model is env.mj_model, "a copy builds nothing"
+
+
+def test_a_changed_task_is_not_pickled():
+  env = registry.load("CartpoleBalance")
+  with pytest.raises(ConfigError, match="Only a task as its config describes it can be pickled"):
+    pickle.dumps(env.with_settings({"rewards.none.weight": jnp.ones(())}))
+  with pytest.raises(ConfigError, match="Only a task as its config describes it can be pickled"):
+    pickle.dumps(on_c_physics(env))
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,6 @@ from playground.config.overrides import (
 from playground.config.run_config import (
   RunConfig,
   TaskConfig,
-  config_dict,
   from_dict,
   in_order_of,
   load,
@@ -57,4 +56,5 @@ from playground.config.sweeps import (
   varying,
   with_listed,
 )
+from playground.settings import config_dict
 from playground.text import format_value

@@ -22,7 +22,7 @@ from playground.envs.options import EnvConfig
 from playground.errors import ConfigError
 from playground.hardware.options import HardwareConfig
 from playground.learning.hyperparameters import AgentConfig, read_config
-from playground.settings import Plain, Section, build
+from playground.settings import Plain, Section, build, config_dict
 from playground.text import dump_yaml, first_line, format_value
 
 if TYPE_CHECKING:
@@ -84,14 +84,6 @@ SECTIONS = tuple(_FIELDS[_FIELDS.index("env") : _FIELDS.index("seed")])
 SCALARS = tuple(_FIELDS[_FIELDS.index("seed") : _FIELDS.index("choices")])
 _UNTYPED = ("env", "agent")  # whose keys, or class, the configuration itself chooses
 _CLASSES = {name: cls for name, cls in get_type_hints(RunConfig).items() if name in SECTIONS and name not in _UNTYPED}
-
-
-def config_dict(values: Section | ConfigDict) -> TaskConfig:
-  """Returns a ConfigDict whose keys keep their order, in which terms apply; ConfigDict itself sorts them."""
-  config: Plain = ConfigDict(sort_keys=False)
-  for key, value in values.items():
-    config[key] = config_dict(value) if isinstance(value, Mapping | ConfigDict) else value
-  return config
 
 
 def in_order_of(first: object, values: object) -> Plain:

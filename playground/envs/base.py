@@ -10,12 +10,14 @@ import jax
 import mujoco
 import numpy as np
 from flax import struct
+from ml_collections import ConfigDict
 
 from playground.envs.options import auto_impl, uses_vision
 from playground.errors import ConfigError
 from playground.mdp.traced import traced_settings
 from playground.physics.backend import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.physics.warp_kernels import quiet_warp
+from playground.settings import Section, config_dict
 
 Observation = jax.Array | dict[str, jax.Array]
 PIXELS = "pixels/"  # prefix of image groups of an observation: [height, width, channels] uint8
@@ -65,6 +67,8 @@ class Env(abc.ABC):
   keys: ClassVar[type] = object
   # Whether `redraw(info, key, model)` draws entries of `info` where an auto-reset starts from a stored state.
   redraws: bool = False
+  # Whether the config describes all of the task; if not, the task cannot be pickled.
+  as_configured: bool = True
 
   def __init__(self, config: Any, mj_model: mujoco.MjModel):
     """Sets the time step and puts the model on the device.
@@ -126,15 +130,34 @@ class Env(abc.ABC):
     if not values:
       return self
     other = copy.copy(self)
+    other.as_configured = False
     vars(other).pop("jitted", None)  # has the values of this task
     for name in self.managers:
       setattr(other, name, getattr(self, name).with_settings(values))
     return other
 
+  def __reduce__(self) -> tuple[Callable[..., "Env"], tuple[type["Env"], Section]]:
+    """Pickles the class and the config, from which unpickling builds the task again.
+
+    Raises:
+      ConfigError: the task has another physics or other settings than its config.
+    """
+    if not self.as_configured:
+      raise ConfigError("Only a task as its config describes it can be pickled: pickle it before it is changed.")
+    return _build, (type(self), self.config.to_dict())  # a pickled ConfigDict would sort its keys
+
+  def __copy__(self) -> Self:
+    """Copies the attributes, without what `__reduce__` does."""
+    other = object.__new__(type(self))
+    vars(other).update(vars(self))
+    return other
+
   def __deepcopy__(self, memo: dict[int, object]) -> Self:
-    """Copies the task with its models; the spec copies itself, for Python cannot."""
+    """Copies the task with its models and the order of its keys; the spec copies itself, for Python cannot."""
     other = copy.copy(self)
     memo[id(self)] = other
+    if isinstance(self.config, ConfigDict):
+      memo[id(self.config)] = config_dict(self.config)
     if self.spec is not None:
       memo[id(self.spec)] = self.spec.copy()
     vars(other).pop("jitted", None)  # is of this task
@@ -181,6 +204,11 @@ class Env(abc.ABC):
   @property
   def unwrapped(self) -> "Env":
     return self
+
+
+def _build(cls: Callable[[ConfigDict], Env], config: Section) -> Env:
+  """Builds the task that a pickle describes."""
+  return cls(config_dict(config))
 
 
 def newest_image(env: Env, obs: Observation) -> jax.Array | None:

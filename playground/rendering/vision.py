@@ -28,7 +28,7 @@ class Vision(Wrapper):
   restores the first observation with its brightness; the next step draws a new one.
   """
 
-  jitted, observation_size = Env.jitted, Env.observation_size
+  jitted, observation_size, __copy__ = Env.jitted, Env.observation_size, Env.__copy__
 
   def __init__(self, env: Env):
     """Takes a task whose config has `vision`, see `VisionConfig` in `envs/options.py`.
@@ -56,6 +56,10 @@ class Vision(Wrapper):
     kind = "rgb" if self._image in ("rgb", "gray") else self._image
     visuals = {"shadows": config.shadows, "textures": config.textures}
     self._renderer = BatchRenderer(env.physics, View((config.camera,), kinds=(kind,), **size, **visuals))
+
+  def __reduce__(self) -> tuple[type["Vision"], tuple[Env]]:
+    """Pickles the task, see `Env.__reduce__`."""
+    return Vision, (self.env,)
 
   @property
   def episode_info(self) -> tuple[str, ...]:
