@@ -22,6 +22,7 @@ from playground.deploy.menu import Menu
 from playground.deploy.player import Player
 from playground.deploy.session import Session
 from playground.deploy.web.server import Watch
+from playground.errors import ConfigError
 from tests.command import caller
 from tests.deploy.untrained import UntrainedRun, free_port
 
@@ -330,6 +331,23 @@ def test_terrain(watch: Watch, session: Session) -> None:
   watch.panel.joints.by_hand.value = False
   watch.panel.leave.value = True
   watch.frame()
+
+
+def test_a_terrain_that_fails_to_load(watch: Watch, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+  said: list[str] = []
+  monkeypatch.setattr(watch.panel, "say", lambda title, body: said.append(body))
+  player, terrain = session.player, session.terrain
+  with monkeypatch.context() as patched:
+    patched.setattr("playground.deploy.session.load_on_c_physics", refuse)
+    watch.panel.terrain.value = "slope"
+    watch.frame()
+  assert said == ["no such terrain"] and watch.panel.terrain.value == terrain
+  watch.frame()
+  assert session.player is player and session.terrain == terrain, "the menu's change loads nothing"
+
+
+def refuse(*_: Any, **__: Any) -> None:
+  raise ConfigError("no such terrain")
 
 
 def test_a_randomized_model_stays_randomized_on_another_terrain(session: Session) -> None:

@@ -17,6 +17,7 @@ from playground.deploy.web.joints import Joints
 from playground.deploy.web.plots import Plots
 from playground.deploy.web.recording import Recorder
 from playground.deploy.web.view import View
+from playground.errors import PlaygroundError
 from playground.robots.terrain import TERRAINS
 
 Key = Any  # a literal type of viser that is not public
@@ -166,9 +167,21 @@ class Panel:
 
   def _choose_terrain(self, name: str) -> None:
     if name in TERRAINS:
-      self._ask(lambda: self._session.choose_terrain(name))
+      self._ask(lambda: self._load_terrain(name))
     elif self._session.terrain is not None:  # not in the menu: sent by a client that is no browser
       self.terrain.value = self._session.terrain
+
+  def _load_terrain(self, name: str) -> None:
+    """Loads a terrain unless it is the present one; if that fails, the menu shows the present one again."""
+    present = self._session.terrain
+    if name == present:
+      return
+    try:
+      self._session.choose_terrain(name)
+    except PlaygroundError:
+      if self.terrain.value == name and present is not None:  # not if the user has chosen another one since
+        self.terrain.value = present
+      raise
 
   def _choose_checkpoint(self, label: str) -> None:
     if label in self._choices:
