@@ -8,6 +8,7 @@ from playground.benchmark.report import public
 from playground.benchmark.report.evidence import Evidence
 from playground.benchmark.report.public import Curve, at, beside_public, our_best, public_curves
 from playground.benchmark.report.sections import Notes
+from playground.benchmark.schema import Table as Rows
 from playground.config.files import task_names
 from playground.reporting.page import Image, Table
 
@@ -45,6 +46,24 @@ def test_the_best_of_each_algorithm_and_way_to_act(tmp_path: Path) -> None:
   assert {(curve.label, curve.actions, curve.points[-1][1]) for curve in best} == {
     ("ours: ppo_s1", "as set", 50), ("ours: ppo_s2", "mode", 90), ("ours: sac_s1", "as set", 900),
   }  # fmt: skip
+
+
+def test_a_run_without_an_algorithm_in_its_name_is_not_ppo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  header = "run,step,eval/episode_reward,eval/mode/episode_reward"
+  rows = ["CheetahRun_s1,100,60,", "CheetahRun_theirs_s1,100,10,", "CheetahRun_ppo_s1,100,50,"]
+  (tmp_path / "curves.csv").write_text("\n".join([header, *rows]) + "\n")
+  monkeypatch.setattr(public, "public_curves", lambda: {"CheetahRun": [Curve("PPO (some)", "mode", [(50, 100.0)])]})
+  table = next(block for block in beside_public(Evidence([tmp_path]), Notes()) if isinstance(block, Table))
+  assert [(row[1], row[7]) for row in table.rows] == [("ours: ppo_s1", "below"), ("ours: s1", "")]
+
+
+def test_rows_have_their_algorithm_in_a_column(tmp_path: Path) -> None:
+  rows = Rows(tmp_path / "rows.csv")
+  shared = {"benchmark": "learning", "setting": "step=100", "quantity": "return", "value": 50.0}
+  rows.add({**shared, "task": "CheetahRun", "agent": "sac", "who": "ours"})
+  rows.add({**shared, "task": "WalkerRun", "agent": "ppo", "who": "playground 0.2.0"})
+  best = our_best(Evidence([tmp_path]), {})
+  assert {task: [curve.label for curve in curves] for task, curves in best.items()} == {"CheetahRun": ["ours: sac"]}
 
 
 def test_a_run_that_trains_as_long_as_the_public_comes_first(tmp_path: Path) -> None:

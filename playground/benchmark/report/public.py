@@ -18,7 +18,7 @@ from playground.reporting.page import Block, Heading, Image, Table, Text
 Points = list[tuple[float, float]]  # (environment steps, return), steps ascending
 SHARE = 0.95  # of the best public PPO at equal steps: below it a task counts as below
 _AS_SET = "as set"
-_AGENT = re.compile(r"(?<![a-z])(fast_sac|fast_td3|reppo|sac)(?![a-z])")
+_AGENT = re.compile(r"(?<![a-z])(fast_sac|fast_td3|reppo|ppo|sac)(?![a-z])")
 _SLM_LAB = "kengz/SLM-Lab"  # whose manipulation tasks have episodes of other lengths, and whose returns of 0.0 failed
 
 
@@ -49,7 +49,8 @@ def beside_public(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   yield Text(
     "Our best run of each task and algorithm, of those that train as long if there are any, over what public "
     "repositories report (`benchmarks/public/`). `At equal steps` is the best public PPO there, read between its "
-    f"points and never beyond our last step; our PPO is below where it has under {SHARE:.0%} of that. Policies act as "
+    f"points and never beyond our last step; our PPO is below where it has under {SHARE:.0%} of that. A run whose name "
+    "has no algorithm does not count as PPO. Policies act as "
     "`our actions` and the public names say (as set: as the run's agent.deterministic_eval says, sampled by default). "
     "Public settings stand below the table, ours are in the run's name."
   )
@@ -131,10 +132,8 @@ def our_best(evidence: Evidence, starts: Mapping[str, float]) -> dict[str, list[
           Curve(f"ours: {name.removeprefix(task).strip('_') or 'run'}", actions, points)
         )
   for actions, quantity in ((_AS_SET, "return"), ("mode", "mode_return")):
-    for task, runs in runs_by_step(evidence, quantity).items():
-      found.setdefault(task, []).extend(
-        Curve(f"ours: {name}", actions, points) for name, points in runs.items() if not name.startswith("playground")
-      )
+    for task, runs in runs_by_step(evidence, quantity, only_ours=True).items():
+      found.setdefault(task, []).extend(Curve(f"ours: {name}", actions, points) for name, points in runs.items())
   best: dict[str, dict[tuple[str, str], Curve]] = {}
   for task, curves in found.items():
     ascending = [dataclasses.replace(curve, points=sorted(curve.points)) for curve in curves]
@@ -145,9 +144,9 @@ def our_best(evidence: Evidence, starts: Mapping[str, float]) -> dict[str, list[
 
 
 def _agent_of(label: str) -> str:
-  """Returns the algorithm in a run's name; `ppo` if the name has none."""
+  """Returns the algorithm in a run's name; `run` if the name has none, which may be any."""
   found = _AGENT.search(label)
-  return found.group() if found else "ppo"
+  return found.group() if found else "run"
 
 
 @cache

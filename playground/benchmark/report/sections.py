@@ -313,13 +313,16 @@ def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     yield Table(["task", "agent", "who", "setting", "return of each run", "backend", "device", "note"], sorted(rows))
 
 
-def runs_by_step(evidence: Evidence, quantity: str = "return") -> dict[str, dict[str, list[tuple[float, float]]]]:
+def runs_by_step(
+  evidence: Evidence, quantity: str = "return", only_ours: bool = False
+) -> dict[str, dict[str, list[tuple[float, float]]]]:
   """Returns learning curves by task and run, from the rows of evaluations, whose setting ends in `step=`.
 
   A run's name holds the words in which it differs from the task's other runs. `quantity` is `return` or `mode_return`.
+  `only_ours` leaves out runs of other packages, and the names always have the agent.
   """
   tasks: dict[str, dict[tuple[str, ...], dict[float, float]]] = {}
-  for figure in evidence.find(quantity=quantity):
+  for figure in evidence.find(quantity=quantity, **({"who": "ours"} if only_ours else {})):
     setting, by_step, step = figure["setting"].rpartition("step=")
     if by_step:
       run = (figure["who"], figure["agent"], figure["device"], *setting.split())
@@ -327,7 +330,9 @@ def runs_by_step(evidence: Evidence, quantity: str = "return") -> dict[str, dict
   curves = {}
   for task, runs in tasks.items():
     shared = set.intersection(*map(set, runs))
-    names = {run: [_KEY.sub("", word) for word in run if word not in shared] or [run[0]] for run in runs}
+    if only_ours:
+      shared -= {agent for _, agent, *_ in runs}
+    names = {run: [_KEY.sub("", word) for word in run if word and word not in shared] or [run[0]] for run in runs}
     curves[task] = {" ".join(names[run]): sorted(points.items()) for run, points in sorted(runs.items())}
   return dict(sorted(curves.items()))
 
