@@ -290,10 +290,15 @@ def test_rows_that_are_being_written_and_damaged_ones(tmp_path: Path):
 @pytest.mark.parametrize(
   ("row", "message"),
   [
-    ({"benchmark": "topology", "devices": ""}, "has devices=, which must be a whole number from 1 for topology"),
+    ({"benchmark": "topology", "devices": ""}, "has devices=, which must be a whole number from 1 to 1,000,000,000"),
     ({"benchmark": "topology", "devices": "two"}, "has devices=two, which must be a whole number"),
     ({"benchmark": "together", "setting": "env.impl=jax"}, "has num_agents=, which must be a whole number from 1"),
     ({"benchmark": "pixels", "setting": "env.vision.width=a"}, "has env.vision.width=a, which must be"),
+    ({"benchmark": "scaling", "setting": "env.impl=jax"}, "has agent.num_envs=, which must be a whole number from 1"),
+    (
+      {"benchmark": "scaling", "setting": f"agent.num_envs={'9' * 400}"},
+      f"has agent.num_envs={'9' * 40}..., which must be a whole number from 1 to 1,000,000,000 for scaling",
+    ),
     ({"quantity": "return", "setting": "step=abc"}, "has step=abc, which must be a number"),
     (
       {"benchmark": "breakdown", "quantity": "seconds_per_step", "setting": "part=update", "value": 0},

@@ -19,7 +19,10 @@ _COUNTS = {  # benchmark -> the column, or the keys of its setting, that hold wh
   "topology": ("devices",),
   "together": ("num_agents",),
   "pixels": ("env.vision.width", "env.vision.height", "agent.num_envs"),
+  "scaling": ("agent.num_envs",),
 }
+_LARGEST = 1e9  # of these numbers: a figure's axis has to hold them
+_LONGEST = 40  # characters of a wrong number that an error shows
 Row = dict[str, Any]  # the columns as text, `value` as a number, the file as `source`, and a run's `note`
 
 
@@ -101,8 +104,12 @@ def number(where: str, name: str, text: str, positive: bool = False) -> float:
     value = None
   if value is None or (positive and not 0 < value < math.inf):
     kind = "a number above 0" if positive else "a number"
-    raise ConfigError(f"{where} has {name}={text}, which must be {kind}: mend or remove that line.")
+    raise ConfigError(f"{where} has {name}={_short(text)}, which must be {kind}: mend or remove that line.")
   return value
+
+
+def _short(text: str) -> str:
+  return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def value_of(setting: str, key: str) -> str:
@@ -132,8 +139,8 @@ def _check(where: str, row: Row) -> None:
   setting = row["setting"]
   for key in _COUNTS.get(row["benchmark"], ()):
     text = row[key] if key in row else value_of(setting, key)
-    if not text.isdecimal() or int(text) < 1:
-      what = f"{key}={text}, which must be a whole number from 1 for {row['benchmark']}"
+    if not text.isdecimal() or not 1 <= float(text) <= _LARGEST:
+      what = f"{key}={_short(text)}, which must be a whole number from 1 to {_LARGEST:,.0f} for {row['benchmark']}"
       raise ConfigError(f"{where} has {what}: mend or remove that line.")
   if row["quantity"] in ("return", "mode_return") and "step=" in setting:
     number(where, "step", setting.rpartition("step=")[2])

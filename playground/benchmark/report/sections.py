@@ -130,16 +130,15 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   rows = []
   for quantity, label in (("env_steps_per_s", "environment"), ("training_steps_per_s", "training")):
     for figure in evidence.find(benchmark="scaling", who="ours", quantity=quantity):
-      if counts := re.findall(r"agent\.num_envs=(\d+)", figure["setting"]):
-        count = counts[-1]  # the last override applies
-        task = _named(figure, "agent.num_envs=", "agent.batch_size=")
-        line = series.setdefault(f"{task}, {label}, {figure['device']}", {})
-        line.setdefault(float(count), figure.mean)  # the newest
-        same = {name: figure[name] for name in ("task", "agent", "setting", "seed", "device", "commit")}
-        memory = evidence.best(benchmark="scaling", quantity="peak_memory_gib", **same)
-        used = f"{memory.mean:.2f}" if memory else ""
-        device, note = figure["device"], notes.number(figure)
-        rows.append([task, label, count, f"{figure.mean:,.0f}", used, device, note])
+      count = value_of(figure["setting"], "agent.num_envs")
+      task = _named(figure, "agent.num_envs=", "agent.batch_size=")
+      line = series.setdefault(f"{task}, {label}, {figure['device']}", {})
+      line.setdefault(float(count), figure.mean)  # the newest
+      same = {name: figure[name] for name in ("task", "agent", "setting", "seed", "device", "commit")}
+      memory = evidence.best(benchmark="scaling", quantity="peak_memory_gib", **same)
+      used = f"{memory.mean:.2f}" if memory else ""
+      device, note = figure["device"], notes.number(figure)
+      rows.append([task, label, count, f"{figure.mean:,.0f}", used, device, note])
   if not rows:
     yield nothing("scaling")
     return
