@@ -305,11 +305,24 @@ def test_rows_that_are_being_written_and_damaged_ones(tmp_path: Path):
       "has seconds_per_step=0, which must",
     ),
     ({"benchmark": "topology", "value": "nan"}, "has training_steps_per_s=nan, which must be a number"),
+    ({"quantity": "final_return", "value": "nan"}, "has final_return=nan, which must be a number"),
+    ({"quantity": "mode_return", "setting": "step=5", "value": "-inf"}, "has mode_return=-inf, which must be a number"),
+    ({"quantity": "return", "setting": "step=nan"}, "has step=nan, which must be a number"),
   ],
 )
 def test_a_row_with_a_wrong_number_is_named(row: dict[str, Any], message: str, tmp_path: Path):
   with pytest.raises(ConfigError, match=rf"^{tmp_path}/rows.csv, line 3 {message}.*: mend or remove that line\.$"):
     evidence(tmp_path, {"seed": 1, "value": 1e6}, {"value": 1.0, **row})
+
+
+def test_an_evaluation_without_a_number_is_no_point_of_a_curve(tmp_path: Path):
+  (tmp_path / "run").mkdir()
+  metrics = tmp_path / "run" / "metrics.csv"
+  metrics.write_text("step,eval/episode_reward\n0,1.0\n100,nan\n200,\n300,4.0\n")
+  assert Evidence([tmp_path]).curves == {"run": [(0, 1.0), (300, 4.0)]}
+  metrics.write_text("step,eval/episode_reward\n0,inf\n")
+  with pytest.raises(ConfigError, match=r"line 2 has eval/episode_reward=inf, which must be a number"):
+    Evidence([tmp_path])
 
 
 def test_rows_of_tasks_and_agents_that_are_not_installed_are_shown(tmp_path: Path):

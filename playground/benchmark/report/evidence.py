@@ -97,12 +97,12 @@ def read_lines(path: Path) -> dict[str, dict[str, str]]:
 
 
 def number(where: str, name: str, text: str, positive: bool = False) -> float:
-  """Returns the number `name` of the row that stands at `where`; raises ConfigError for other text."""
+  """Returns the number `name` of the row that stands at `where`; raises ConfigError for text, NaN and infinity."""
   try:
     value = float(text)
   except ValueError:
-    value = None
-  if value is None or (positive and not 0 < value < math.inf):
+    value = math.nan
+  if not math.isfinite(value) or (positive and value <= 0):
     kind = "a number above 0" if positive else "a number"
     raise ConfigError(f"{where} has {name}={_short(text)}, which must be {kind}: mend or remove that line.")
   return value
@@ -147,13 +147,16 @@ def _check(where: str, row: Row) -> None:
 
 
 def _curves(lines: Mapping[str, dict[str, str]], path: Path, column: str) -> dict[str, list[tuple[float, float]]]:
-  """Returns learning curves of a file, (steps, return in `column`) by name, one for each run."""
+  """Returns learning curves of a file, (steps, return in `column`) by name, one for each run.
+
+  A return of NaN counts as not measured, as an empty one: metrics.csv of a run may have it.
+  """
   curves: dict[str, list[tuple[float, float]]] = {}
   if (path.parent.parent / "config.yaml").is_file():  # a stage of a chain; the chain's curve includes it
     return curves
   name = path.parent.name if path.stem == "metrics" else path.stem.removeprefix("curve_")
   for where, line in lines.items():
-    if "step" in line and line.get(column):
+    if "step" in line and line.get(column, "").lower() not in ("", "nan"):
       point = number(where, "step", line["step"]), number(where, column, line[column])
       curves.setdefault(line.get("run") or name, []).append(point)
   return curves
