@@ -1,16 +1,18 @@
 """`playground pretrained`: lists the policies that come with the package, or adds one."""
 
 import math
+from pathlib import Path
 
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from playground import catalog
+from playground import catalog, pretrained
 from playground.cli.play import play, result_name
+from playground.config import task_names
 from playground.deploy.export import export_run
 from playground.errors import ConfigError
-from playground.files import read_json
+from playground.files import need_folder, read_json
 from playground.learning.checkpoints import find_checkpoints
 from playground.pretrained import add, cards
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, newest_evaluation
@@ -50,7 +52,8 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
 
   Raises:
     PlaygroundError: no such run, or a policy without an ONNX form.
-    ConfigError: the run has not been evaluated, or the package has a policy of its task.
+    ConfigError: the run has not been evaluated, its task is not one of `playground list`, the package has a policy of
+      it, or a folder cannot be written.
   """
   newest = find_checkpoints(path)[0]  # of a chain, that of its last stage
   run, steps = RunDirectory.open(newest.parents[1]), int(newest.name)
@@ -59,19 +62,24 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
     if not (run.path / name).is_file():
       raise ConfigError(f"{run.path / name} is missing: only a whole run can be added.")
   task = str(run.config["choices"]["env"])
+  if task not in task_names():
+    raise ConfigError(f"{path} trained env={task}: only policies of tasks that `playground list` shows can be added.")
   if (old := cards().get(task)) and not replace:
     raise ConfigError(
       f"There is a policy of {task} already: {old['agent']}, {millions(old['steps'])} M steps, return "
       f"{old['c_mujoco']['return']:g} in C MuJoCo. --replace replaces it."
     )
-  export_run(path)
-  result = run.path / "export" / result_name(steps, seed=0, episodes=_EPISODES)
-  if not result.is_file():
-    play(path, episodes=_EPISODES)
-  scores = read_json(result)["scores"]
   row = newest_evaluation(run.metrics_csv, steps)
   if row is None:
     raise ConfigError(f"{path} was not evaluated before its newest checkpoint, step {steps}.")
+  result = run.path / "export" / result_name(steps, seed=0, episodes=_EPISODES)
+  need_folder(result.parent, str(result.parent), run.path)
+  need_folder(pretrained.POLICIES, str(pretrained.POLICIES))
+  scores = _scores(result) if result.exists() else None
+  export_run(path)
+  if scores is None:
+    play(path, episodes=_EPISODES)
+    scores = _scores(result)
   config, manifest = run.config, run.manifest
   git: dict[str, Plain] = manifest.get("git") or {}
   as_set, other = ("mode", "sampled") if config["agent"]["deterministic_eval"] else ("sampled", "mode")
@@ -106,6 +114,14 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
   print(f"{folder}: {size / 1e6:.1f} MB")
   return 0
+
+
+def _scores(result: Path) -> dict[str, float]:
+  """Returns the scores in a result of `play`; raises ConfigError if it has none."""
+  scores = read_json(result, scores=dict).get("scores")
+  if not scores:
+    raise ConfigError(f"{result} holds no scores: move it away, or see why `playground play` did not write it.")
+  return scores
 
 
 def _status(scores: dict[str, float]) -> catalog.Status:

@@ -1,5 +1,6 @@
 """`playground pretrained`: a run's policy becomes one that comes with the package."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from playground.config import compose
 from playground.errors import ConfigError
 from playground.learning.checkpoints import Checkpoint
 from playground.runs.restore_plan import weights_of
+from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.runs.helpers import TASK
 
@@ -50,3 +52,54 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
   metrics.write_text(header)
   with pytest.raises(ConfigError, match="was not evaluated before its newest checkpoint"):
     add_policy(str(run), replace=True)
+
+
+@pytest.fixture
+def untrained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+  """Makes a run of a task that `add_policy` can read up to its policy."""
+  for name in ("export_run", "play"):
+    monkeypatch.setattr(f"playground.cli.pretrained.{name}", pytest.fail)
+  monkeypatch.setattr(pretrained, "POLICIES", tmp_path / "policies")
+
+  def make(task: str, *overrides: str) -> Path:
+    run = RunDirectory.create(tmp_path / "run", compose([f"env={task}", *overrides]).resolved).path
+    (run / "checkpoints" / f"{100:012d}").mkdir(parents=True)
+    (run / "manifest.json").write_text("{}")
+    (run / "metrics.csv").write_text("step,eval/episode_reward\n100,1.0\n")
+    return run
+
+  return make
+
+
+@pytest.mark.parametrize("overrides", [["v020/CartpoleBalance"], ["joystick", "robot=go1"]])
+def test_a_run_of_a_task_that_is_not_listed_is_refused(untrained: Callable[..., Path], overrides: list[str]) -> None:
+  run, task = untrained(*overrides), overrides[0]
+  with pytest.raises(ConfigError, match=rf"run trained env={task}: only policies of tasks that `playground list`"):
+    add_policy(str(run))
+
+
+def test_folders_that_cannot_be_written_are_said_first(untrained: Callable[..., Path], tmp_path: Path) -> None:
+  run = untrained("CartpoleBalance")
+  (tmp_path / "policies").touch()
+  with pytest.raises(ConfigError, match=r"/policies cannot be written: .* is not a folder that you may write to"):
+    add_policy(str(run))
+  (run / "export").touch()
+  with pytest.raises(ConfigError, match=r"/run/export cannot be written: .* is not a folder that you may write to"):
+    add_policy(str(run))
+
+
+def test_a_result_without_scores_is_refused(
+  untrained: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  run = untrained("CartpoleBalance")
+  result = run / "export" / f"play_step_{100:012d}_seed_0_episodes_20.json"
+  result.parent.mkdir()
+  result.write_text("{}")
+  with pytest.raises(ConfigError, match=r"episodes_20.json holds no scores: move it away"):
+    add_policy(str(run))
+  result.unlink()
+  for name in ("export_run", "play"):  # which says why it does not write a result, and ends well
+    monkeypatch.setattr(f"playground.cli.pretrained.{name}", lambda *_, **__: 0)
+  with pytest.raises(ConfigError, match=r"episodes_20.json holds no scores: .* why `playground play` did not write it"):
+    add_policy(str(run))
+  assert not (tmp_path / "policies").exists()
