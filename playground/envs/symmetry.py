@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from scipy.linalg import block_diag
 
-from playground.envs.base import Env
+from playground.envs.base import PIXELS, Env
 from playground.envs.task import Task
 from playground.errors import ConfigError
 from playground.mdp.legged import LeggedRobot
@@ -72,6 +72,21 @@ def mirror_of(env: Env) -> Mirror:
     groups[group] = _repeated(step, sum(sizes.values()))  # the group `state` may hold several steps
   obs = {group: Reflection(np.abs(m).argmax(axis=1), m.sum(axis=1, dtype=np.float32)) for group, m in groups.items()}
   return Mirror(obs, joints)
+
+
+def augmentation(env: Env) -> Mirror:
+  """Returns the mirror for `agent.mirror_augmentation`.
+
+  Raises:
+    ConfigError: the task has none, or has images.
+  """
+  sizes = env.observation_size
+  try:
+    if isinstance(sizes, Mapping) and any(group.startswith(PIXELS) for group in sizes):
+      raise ConfigError("images are not mirrored.")
+    return mirror_of(env)
+  except ConfigError as error:
+    raise ConfigError(f"agent.mirror_augmentation=true: {error}") from None
 
 
 def joint_reflection(robot: LeggedRobot) -> Reflection:

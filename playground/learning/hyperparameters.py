@@ -122,6 +122,9 @@ class OffPolicyConfig(AgentConfig):
   checkpoint_replay: Annotated[
     bool, "whether the newest checkpoint holds the buffer, for an exact resume; else it is refilled"
   ] = True
+  mirror_augmentation: Annotated[
+    bool, "whether a random half of the drawn transitions are their left-right mirror images (robots on legs)"
+  ] = False
   replay_dtype: Annotated[
     Literal["float32", "bfloat16"], "of observations and actions in the buffer; bfloat16 takes half of the memory"
   ] = "float32"

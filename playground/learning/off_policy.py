@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from playground.envs.base import Env, Observation
+from playground.envs.symmetry import Mirror, augmentation
 from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy
@@ -62,6 +63,7 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
   Attributes:
     logged: names of the metrics of `learn`.
     buffer: the replay buffer.
+    mirror: the task's left-right mirror, with `mirror_augmentation`, else None.
   """
 
   logged: ClassVar[tuple[str, ...]]
@@ -72,6 +74,7 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
         f"{config.num_timesteps:,} environment steps are over before agent.min_replay_size={config.min_replay_size} "
         "transitions are collected, so nothing would be learned: train for longer."
       )
+    self.mirror: Mirror | None = augmentation(env) if config.mirror_augmentation else None
     shape = lambda *size: jax.ShapeDtypeStruct(size, jnp.float32)
     self._inside = groups_inside(env, networks.obs_sizes)
     obs = {key: shape(*size) for key, size in networks.obs_sizes.items() if key not in self._inside}
@@ -135,8 +138,11 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
       else:
         batches = self.buffer.sample(replay, replay_key, shape)
       seen = normalizer if config.normalize_observations else None
-      read = lambda obs: normalize(obs | {key: obs[of][..., :n] for key, (of, n) in self._inside.items()}, seen)
-      batches = batches.replace(obs=read(batches.obs), next_obs=read(batches.next_obs))
+      whole = lambda obs: obs | {key: obs[of][..., :n] for key, (of, n) in self._inside.items()}
+      batches = batches.replace(obs=whole(batches.obs), next_obs=whole(batches.next_obs))
+      if self.mirror is not None:
+        batches = mirror_half(batches, self.mirror, jax.random.fold_in(replay_key, 1))
+      batches = batches.replace(obs=normalize(batches.obs, seen), next_obs=normalize(batches.next_obs, seen))
       return self.learn(start, batches, learn_key, replay.inserted)
 
     ready = state.replay.inserted >= config.prefill_updates
@@ -188,6 +194,20 @@ def groups_inside(env: Env, sizes: Mapping[str, tuple[int, ...]]) -> dict[str, t
     if first != group and sizes.get(first) == (length,):
       found[first] = group, length
   return found
+
+
+def mirror_half(batch: Transition, mirror: Mirror, key: jax.Array) -> Transition:
+  """Replaces each transition, with a probability of one half, by its left-right mirror image.
+
+  Args:
+    batch: transitions before normalisation, each [..., ].
+    mirror: of the task.
+    key: draws which.
+  """
+  swap = jax.random.bernoulli(key, shape=(*batch.reward.shape, 1))
+  obs = lambda groups: {name: jnp.where(swap, mirror.obs[name](x), x) for name, x in groups.items()}
+  action = jnp.where(swap, mirror.action(batch.action), batch.action)
+  return batch.replace(obs=obs(batch.obs), next_obs=obs(batch.next_obs), action=action)
 
 
 def n_step(windows: Transition, discounting: float) -> Transition:

@@ -14,7 +14,7 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from playground.envs.base import Env
-from playground.envs.symmetry import Mirror, mirror_of
+from playground.envs.symmetry import Mirror, augmentation
 from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import Algorithm, AlgorithmState, Metrics, Policy, gradient_step
@@ -82,7 +82,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
         f"agent.augment_pixels={config.augment_pixels} shifts images, and the task has none: set it to 0."
       )
     super().__init__(config, networks)
-    self.mirror: Mirror | None = _mirror(env, networks) if config.mirror_augmentation else None
+    self.mirror: Mirror | None = augmentation(env) if config.mirror_augmentation else None
     self.bounds_kl = config.desired_kl is not None or config.max_kl is not None
     self.losses = LOSSES + (ESTIMATION,) * bool(networks.estimated_obs_key) + (KL,) * self.bounds_kl
 
@@ -293,16 +293,6 @@ def ppo_loss(
   parts = (loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction)
   bounded = {} if batch.old_logits is None else {KL: networks.kl(batch.old_logits, logits).mean()}
   return loss, dict(zip(LOSSES, parts, strict=True)) | estimation | bounded
-
-
-def _mirror(env: Env, networks: ActorCritic) -> Mirror:
-  """Returns the task's mirror; raises ConfigError if it has none."""
-  try:
-    if networks.pixel_sizes:
-      raise ConfigError("images are not mirrored.")
-    return mirror_of(env)
-  except ConfigError as error:
-    raise ConfigError(f"agent.mirror_augmentation=true: {error}") from None
 
 
 def adapted_rate(rate: jax.Array, kl: jax.Array, config: PPOConfig) -> jax.Array:

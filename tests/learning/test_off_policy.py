@@ -1,9 +1,16 @@
-"""Returns of several steps against a loop."""
+"""Returns of several steps against a loop, and mirror images of transitions."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from playground.learning.off_policy import Transition, n_step
+from playground.envs.symmetry import Mirror, Reflection
+from playground.errors import ConfigError
+from playground.learning.off_policy import Transition, mirror_half, n_step
+from tests.dummy import SMALL_FAST_SAC, point_trainer
 
 
 def test_returns_of_several_steps_equal_a_loop() -> None:
@@ -22,3 +29,21 @@ def test_returns_of_several_steps_equal_a_loop() -> None:
     assert float(found.next_obs["state"][i, 0]) == obs["state"][length - 1, i, 0] + 0.5
   np.testing.assert_array_equal(found.obs["state"], obs["state"][0])
   np.testing.assert_array_equal(found.action, obs["state"][0])
+
+
+def test_half_of_the_transitions_are_their_mirror_images() -> None:
+  swap = Reflection(np.array([1, 0]), np.array([1.0, -1.0], np.float32))
+  x = jnp.arange(2 * 500 * 2.0).reshape(2, 500, 2)  # gradient steps, transitions, elements
+  one = jnp.ones((2, 500))
+  batch = Transition({"state": x}, {"state": x + 0.5}, -x, one, one, 0 * one)
+  found = mirror_half(batch, Mirror({"state": swap}, swap), jax.random.PRNGKey(0))
+  mirrored = (found.action != batch.action).any(axis=-1)
+  assert 0.4 < mirrored.mean() < 0.6
+  for before, after in ((x, found.obs["state"]), (x + 0.5, found.next_obs["state"]), (-x, found.action)):
+    image = jnp.stack([before[..., 1], -before[..., 0]], axis=-1)
+    np.testing.assert_array_equal(after, jnp.where(mirrored[..., None], image, before))
+
+
+def test_a_task_without_a_mirror_is_refused() -> None:
+  with pytest.raises(ConfigError, match=r"agent\.mirror_augmentation=true: only tasks of robots on legs"):
+    point_trainer(dataclasses.replace(SMALL_FAST_SAC, mirror_augmentation=True))
