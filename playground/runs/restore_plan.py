@@ -24,6 +24,7 @@ from playground.settings import Section
 from playground.text import format_value
 
 _ONLY_AT_FIRST = ("value_dtype", "policy_output_scale")  # keys of networks that their weights do not depend on
+_OF_NETWORKS = ("normalize_observations", "min_value", "max_value")  # keys beside those of `network` that they do
 
 
 def weights_of(path: str | Path) -> Checkpoint:
@@ -181,7 +182,7 @@ class RestorePlan:
 def networks_of(agent: Section) -> dict[str, str]:
   """Returns the keys of an agent section, with their values, that say what its networks compute with given weights."""
   found = {f"network.{name}": value for name, value in agent.get("network", {}).items() if name not in _ONLY_AT_FIRST}
-  found |= {"normalize_observations": agent["normalize_observations"]} if "normalize_observations" in agent else {}
+  found |= {name: agent[name] for name in _OF_NETWORKS if name in agent}
   return {f"agent.{key}": format_value(value) for key, value in found.items()}
 
 

@@ -450,6 +450,15 @@ def test_weights_of_another_network_are_refused(
   assert f"was trained with {key}={there}: a run with {key}={here} cannot start from it." in sentence
 
 
+def test_weights_of_a_critic_of_other_values_are_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
+  """The same logits would mean other returns."""
+  sizes = ["policy_hidden_layer_sizes=[64,64]", "q_hidden_layer_sizes=[128,128]"]
+  task = ["env=PendulumSwingup", "agent=fast_sac", *TASK[3:], *(f"agent.network.{line}" for line in sizes)]
+  task += ["agent.max_value=900", "agent.num_timesteps=50000", "init_from=pretrained:PendulumSwingup"]
+  sentence = refused(*task, f"run_dir={tmp_path / 'run'}")
+  assert "was trained with agent.max_value=450.0: a run with agent.max_value=900.0 cannot start from it." in sentence
+
+
 def test_a_checkpoint_may_be_named_from_where_it_lies(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   newest, *_ = find_checkpoints(whole)
   monkeypatch.chdir(newest.parent)
