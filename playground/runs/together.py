@@ -31,6 +31,8 @@ from playground.runs.train import open_run, prepare, say_where, timings_of
 if TYPE_CHECKING:
   from playground.config import RunConfig
 
+Group = tuple[list["RunConfig"], Population | None]  # runs that train together, and their population if they are one
+
 
 def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explore: Sequence[str] = ()) -> int:
   """Trains runs that have the same program, new or to resume.
@@ -56,18 +58,25 @@ def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explo
   population = population_of(configs, exploit_every, explore)
   with Interrupts() as interrupts:
     try:
-      hardware, groups = setup(configs[0].hardware), _groups(configs, population)
-      codes = [_train_group(*group, interrupts, hardware) for group in groups if interrupts.signum is None]
+      hardware = setup(configs[0].hardware)
+      return _train_groups(_groups(configs, population), interrupts, hardware)
     except Interrupted as interrupt:
       print(f"Interrupted by {interrupt}.")
       return exit_code(interrupt.signum)
+
+
+def _train_groups(groups: Sequence[Group], interrupts: Interrupts, hardware: Hardware) -> int:
+  """Trains groups one after another, until a signal; returns the exit code."""
+  codes: list[int] = []
+  for group in groups:
+    if interrupts.signum is None:
+      codes.append(_train_group(*group, interrupts, hardware))
+      interrupts.stop_saving()  # the next group compiles first
   unfinished = any(codes) or len(codes) < len(groups)
   return exit_code(interrupts.signum) if interrupts.signum is not None and unfinished else max(codes, default=0)
 
 
-def _groups(
-  configs: Sequence["RunConfig"], population: Population | None
-) -> "list[tuple[list[RunConfig], Population | None]]":
+def _groups(configs: Sequence["RunConfig"], population: Population | None) -> list[Group]:
   """Groups the unfinished runs: a population is one group, others are grouped by step and by what they start from.
 
   A run that failed, or lost its folder, leaves a population whose other runs are too far ahead to go on with it.
@@ -113,7 +122,7 @@ def _train_group(
     if len({plan.update for plan in plans}) > 1:  # a checkpoint is damaged, and its run is behind the others
       _set_damaged_apart(configs, plans)
       runs.close()
-      return max(_train_group(*group, interrupts, hardware) for group in _groups(configs, population))
+      return _train_groups(_groups(configs, population), interrupts, hardware)
     members = [Member(open_run(config, plan), interrupts) for config, plan in zip(configs, plans, strict=True)]
     for member in members:
       runs.enter_context(member)

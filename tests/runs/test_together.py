@@ -20,6 +20,7 @@ from playground.learning.checkpoints import find_checkpoints
 from playground.learning.population import Population
 from playground.runs import together
 from playground.runs.callbacks import RunCallbacks
+from playground.runs.interrupts import Interrupts
 from playground.runs.programs import program_of
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
@@ -196,6 +197,21 @@ def test_a_stop_between_two_groups_is_no_success(tmp_path: Path, monkeypatch: py
 
   monkeypatch.setattr(together, "_train_group", end_with_a_signal)
   assert train_together(groups) == 128 + signal.SIGTERM
+
+
+def test_a_signal_ends_a_group_that_still_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  """As it ends the first group: nothing is there to save yet, and compiling may take longer than the grace."""
+  groups = [saved(tmp_path / "a", [400], "preempted"), saved(tmp_path / "b", [500], "preempted")]
+  saving: list[bool] = []
+
+  def train_group(configs: Any, population: Any, interrupts: Interrupts, hardware: Any) -> int:
+    saving.append(interrupts.saving)
+    interrupts.start_saving()
+    return 0
+
+  monkeypatch.setattr(together, "_train_group", train_group)
+  assert train_together(groups) == 0
+  assert saving == [False, False]
 
 
 POPULATION = Population(1, {}, 0)
