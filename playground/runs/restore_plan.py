@@ -58,6 +58,7 @@ class RestorePlan:
     columns: columns of metrics.csv at the restored checkpoint.
     settings: the agent's settings at the restored checkpoint, which population-based training may have changed.
     began_s: age of the process when the run started.
+    error: why nothing can be restored, of a run that trains with others; else None.
   """
 
   run_dir: RunDirectory | None = None
@@ -72,6 +73,7 @@ class RestorePlan:
   columns: list[str] = dataclasses.field(default_factory=list)
   settings: dict[str, float | list[float]] = dataclasses.field(default_factory=dict)
   began_s: float = 0.0
+  error: str | None = None
 
   @classmethod
   def find(cls, config: RunConfig, began_s: float = 0.0) -> Self:

@@ -3,6 +3,7 @@
 import contextlib
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, cast
 
@@ -37,9 +38,9 @@ Group = tuple[list["RunConfig"], Population | None]  # runs that train together,
 def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explore: Sequence[str] = ()) -> int:
   """Trains runs that have the same program, new or to resume.
 
-  A run that fails (non-finite numbers, a full disk) ends alone. Runs at different steps (an earlier start was
-  interrupted between two runs) are trained one group after another, those of the same step together. A population
-  continues from the newest step that all its runs have.
+  A run that fails (non-finite numbers, a full disk, no intact checkpoint) ends alone. Runs at different steps (an
+  earlier start was interrupted between two runs) are trained one group after another, those of the same step together.
+  A population continues from the newest step that all its runs have.
 
   Args:
     configs: of the runs.
@@ -119,6 +120,15 @@ def _train_group(
           plan.start_over(config)
         plan.checkpoints = [path for path in plan.checkpoints if path.name in steps]
     training = prepare(configs, plans, hardware, together=True)
+    if any(plan.error for plan in plans):
+      runs.close()
+      others: list[RunConfig] = []
+      for config, plan in zip(configs, plans, strict=True):
+        if plan.error is None:
+          others.append(config)
+        else:
+          print(f"{Path(config.resume or str(config.run_dir)).name} failed: {plan.error}", file=sys.stderr)
+      return max(2, _train_groups(_groups(others, population), interrupts, hardware))
     if len({plan.update for plan in plans}) > 1:  # a checkpoint is damaged, and its run is behind the others
       _set_damaged_apart(configs, plans)
       runs.close()

@@ -13,6 +13,7 @@ from playground import registry
 from playground.config import RunConfig
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
+from playground.errors import CheckpointError
 from playground.hardware.distributed import ending_together, is_main, leave, noting_loss, preflight, share, wait_for_all
 from playground.hardware.setup import Hardware, setup
 from playground.learning.algorithm import Policy, other_acts
@@ -136,7 +137,8 @@ def prepare(
     together: whether arrays have an axis of agents, even of length 1.
 
   Raises:
-    PlaygroundError: a setting, a checkpoint or a size that does not fit.
+    PlaygroundError: a setting, a checkpoint or a size that does not fit; with `together` a plan notes the error of its
+      checkpoint.
   """
   config, plan = configs[0], plans[0]
   preflight(config.hardware, [config.resolved["env"], config.resolved["agent"], config.seed])
@@ -157,7 +159,12 @@ def prepare(
   if trainer.num_devices > 1:
     plan.notices.append(describe_division(agent, trainer.num_devices))
   for each, theirs in zip(plans, configs, strict=True):
-    each.restore(trainer, theirs.agent_name, draw)
+    try:
+      each.restore(trainer, theirs.agent_name, draw)
+    except CheckpointError as error:
+      if not together:
+        raise
+      each.error = str(error)
   trainer.settings = trainer.join([each.settings_over(own) for each, own in zip(plans, settings, strict=True)])
   preflight(config.hardware, [plan.step, plan.weights and plan.weights.step], "checkpoint")  # some may find it damaged
 

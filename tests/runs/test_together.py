@@ -79,6 +79,7 @@ def test_what_was_cut_short_goes_on_together_or_alone(
   assert [run.status["status"] for run in cut.values()] == ["preempted"] * 3
   shutil.copytree(tmp_path / "cut" / "b", tmp_path / "alone")
   shutil.copytree(tmp_path / "cut", tmp_path / "damaged", symlinks=True)
+  shutil.copytree(tmp_path / "cut", tmp_path / "lost", symlinks=True)
   assert train_together(resumed(tmp_path / "cut", *AGENTS)) == 0
   assert {name: run.summary["params_sha256"] for name, run in cut.items()} == whole, "bit for bit"
 
@@ -89,6 +90,14 @@ def test_what_was_cut_short_goes_on_together_or_alone(
   said = capsys.readouterr().out
   assert f"b: {newest} is damaged" in said and "Falling back to the checkpoint before it." in said
   assert newest.with_name(f"damaged_{newest.name}").is_dir()
+  found = find_checkpoints(tmp_path / "lost" / "b")
+  for checkpoint in found:
+    truncate(checkpoint)
+  assert train_together(resumed(tmp_path / "lost", *AGENTS)) == 2, "b alone fails"
+  assert f"b failed: {found[-1]} is damaged" in capsys.readouterr().err
+  lost = {name: RunDirectory(tmp_path / "lost" / name).status["status"] for name in AGENTS}
+  assert lost == {"a": "finished", "b": "preempted", "c": "finished"}
+
   final = lambda path: RunDirectory(path).summary["final_return"]
   for path in (tmp_path / "alone", tmp_path / "damaged" / "a", tmp_path / "damaged" / "b"):
     assert final(path) == pytest.approx(final(group / ("b" if path.name == "alone" else path.name)), rel=1e-3)
