@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import mujoco
@@ -13,7 +13,7 @@ from playground import registry
 from playground.config import RunConfig
 from playground.envs.base import Env
 from playground.envs.wrappers import ModelFields
-from playground.errors import CheckpointError
+from playground.errors import CheckpointError, HardwareError
 from playground.hardware.distributed import ending_together, is_main, leave, noting_loss, preflight, share, wait_for_all
 from playground.hardware.setup import Hardware, setup
 from playground.learning.algorithm import Policy, other_acts
@@ -43,6 +43,7 @@ from playground.runs.provenance import process_age_s
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.scaling import describe_division, scale_envs
+from playground.text import first_line
 
 ROWS = 100  # approximate rows of metrics.csv in a run; each call to the device makes one row
 
@@ -81,6 +82,20 @@ def _train(config: RunConfig, interrupts: Interrupts, began_s: float = 0.0) -> i
   return 0
 
 
+@contextlib.contextmanager
+def _memory_errors() -> Iterator[None]:
+  """Raises HardwareError where memory does not suffice for the block."""
+  try:
+    yield
+  except jax.errors.JaxRuntimeError as error:
+    text = first_line(error)
+    if "RESOURCE_EXHAUSTED" not in text and "Out of memory" not in text:
+      raise
+    raise HardwareError(
+      f"This machine has too little memory for the training: lower agent.num_envs, batch or replay buffer ({text})."
+    ) from error
+
+
 @dataclasses.dataclass
 class Training:
   """Compiles and runs the training of a process: one run, or several runs that share a program.
@@ -107,11 +122,13 @@ class Training:
     """Returns the environment steps of each agent."""
     return self.events[-1].update * self.trainer.steps_per_update
 
+  @_memory_errors()
   def compile(self, plans: Sequence[RestorePlan]) -> CompiledFunctions:
     """Compiles the functions; `plans` hold the initial weights of each agent."""
     resets = any(event.reset for event in self.events)
     return compile_program(self.trainer, self.evaluate, self.draw, self._policies(plans), self.stored, resets)
 
+  @_memory_errors()
   def run(self, loop: Loop, plans: Sequence[RestorePlan], interrupts: Interrupts) -> tuple[TrainState, bool]:
     """Trains from the start of the plans; returns the last state, and whether the schedule was completed."""
     wait_for_all()  # processes compile at different speeds, and the first collective on CPUs waits only half a minute

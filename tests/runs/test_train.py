@@ -27,7 +27,7 @@ from playground.files import is_locked
 from playground.hardware.setup import setup
 from playground.learning import checkpoints
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
-from playground.learning.loop import schedule
+from playground.learning.loop import Loop, schedule
 from playground.runs import train as train_module
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
@@ -415,6 +415,16 @@ def test_more_devices_than_there_are(tmp_path: Path, refused: Callable[..., str]
     *TASK, "hardware.devices=99", f"run_dir={tmp_path / 'run'}"
   )
   assert not (tmp_path / "run").exists()
+
+
+def test_too_little_memory(tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
+  def allocate(*_: Any) -> None:
+    raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9 bytes.")
+
+  monkeypatch.setattr(Loop, "init", allocate)
+  sentence = refused(*TASK, f"run_dir={tmp_path / 'run'}")
+  assert "agent.num_envs" in sentence and "Out of memory while trying to allocate 9 bytes)." in sentence
+  assert RunDirectory(tmp_path / "run").status["status"] == "failed"
 
 
 def test_a_camera_that_is_not_there(
