@@ -149,6 +149,7 @@ def test_limits(limit: Limit, good: list[Any], bad: list[Any], said: str) -> Non
     "agent.learning_rate=1e39",
     "agent.num_evals=1e9",
     "agent.num_envs=1e400",
+    "hardware.distributed.lost_after=1e7",  # ms in a C integer
     "seed=4294967296",
     "seed=1e30",
     f"seed={10**400}",

@@ -23,7 +23,7 @@ class DistributedConfig:
   process_id: Annotated[int | None, count(0, 100_000), "number of this process, from 0; null asks as above"] = None
   timeout: Annotated[float, positive(), "seconds to wait for the others, and for a first exchange with them"] = 300.0
   lost_after: Annotated[
-    float, positive(), "seconds without a sign of life after which a process is lost, and all others end"
+    float, positive(1e6), "seconds without a sign of life after which a process is lost, and all others end"
   ] = 60.0
 
 
