@@ -176,7 +176,8 @@ class RunCallbacks:
     column = lambda name: np.asarray(table[name] if name in table else np.full(len(table), np.nan), float)
     steps, returns, rate = (column(name) for name in ("step", RETURN, "time/steps_per_second"))
     last = lambda name: next((value for value in column(name)[::-1].tolist() if np.isfinite(value)), None)
-    chosen = "mode" if self._trainer.config.deterministic_eval else "sampled"
+    acts_by_mode = self._trainer.config.deterministic_eval or not self._trainer.algorithm.samples
+    chosen = "mode" if acts_by_mode else "sampled"
     own = np.isfinite(returns) & ~np.isfinite(column(PARENT))
     scores = [(float(value), int(step)) for value, step in zip(returns[own], steps[own], strict=True)]
     # As for `checkpoints/best`: the last of equal returns, and no policy without a checkpoint (the untrained one).

@@ -91,6 +91,13 @@ def test_a_run_without_its_replay_buffer_collects_it_anew(tmp_path: Path, capsys
   assert RunDirectory(run).summary["steps"] == STEPS
 
 
+def test_the_return_of_a_policy_that_has_only_a_mode_is_the_modes(tmp_path: Path) -> None:
+  run = tmp_path / "run"
+  assert train(compose([*FAST, "agent=fast_td3", "agent.deterministic_eval=false", f"run_dir={run}"])) == 0
+  summary = RunDirectory(run).summary
+  assert summary["final_mode_return"] == summary["final_return"] and summary["final_sampled_return"] is None
+
+
 def test_a_new_run_starts_from_weights(
   whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
