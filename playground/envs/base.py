@@ -185,7 +185,7 @@ class Env(abc.ABC):
   def observation_parts(self) -> dict[str, dict[str, int]]:
     """The terms of each observation group, in order: name to length. A flat observation is the group "state".
 
-    A term that has the name of another group stands for that group.
+    The term `state` of another group stands for the whole of the group `state`.
     """
     return {}
 

@@ -21,6 +21,7 @@ from playground.learning.hyperparameters import OffPolicyConfig
 from playground.learning.networks import Actor, normalize, update_normalizer
 from playground.learning.replay import ReplayBuffer
 from playground.learning.rollout import Environments
+from playground.mdp.managers import ACTOR
 from playground.pytree import PyTree
 
 
@@ -182,7 +183,7 @@ class OffPolicy(Algorithm[ConfigT, NetworksT, OffPolicyState], Generic[ConfigT, 
 
 
 def groups_inside(env: Env, sizes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[str, int]]:
-  """Finds observation groups with which another one begins; the buffer does not store them.
+  """Finds the group `state` where another one begins with it; the buffer does not store it then.
 
   Returns:
     By group: the other group, and the size of the first one.
@@ -191,8 +192,8 @@ def groups_inside(env: Env, sizes: Mapping[str, tuple[int, ...]]) -> dict[str, t
   parts = env.observation_parts if len(sizes) > 1 else {}
   for group in sizes:
     first, length = next(iter(parts.get(group, {}).items()), (group, 0))
-    if first != group and sizes.get(first) == (length,):
-      found[first] = group, length
+    if group != ACTOR and first == ACTOR and sizes.get(ACTOR) == (length,):
+      found[ACTOR] = group, length
   return found
 
 

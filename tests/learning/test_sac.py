@@ -63,6 +63,10 @@ def test_groups_that_another_one_begins_with() -> None:
   sizes = {"state": (2,), "privileged_state": (4,)}
   assert groups_inside(PointInParts(), sizes) == {"state": ("privileged_state", 2)}
   assert groups_inside(PointInParts(), {"state": (6,), "privileged_state": (4,)}) == {}, "frames: it is longer"
+  parts = {"state": {"linvel": 3, "gyro": 3}, "linvel": {"linvel": 3}}
+  with pytest.MonkeyPatch.context() as patch:  # a term of `state` has noise, and may have the name of an exact group
+    patch.setattr(PointTask, "observation_parts", parts)
+    assert groups_inside(PointTask(), {"state": (6,), "linvel": (3,)}) == {}
   assert groups_inside(PointInParts(), {"privileged_state": (4,)}) == groups_inside(PointTask(), sizes) == {}
 
 
