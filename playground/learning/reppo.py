@@ -7,9 +7,9 @@ buffer and no target network. One training step collects `unroll_length` steps o
 
 Differences from the published code: the true last observation of an episode is the next one where time cuts it; the
 entropy bonus of a next state ends with the episode; the divergence is the exact one of the Gaussians before squashing;
-the critic's prior is a constant. The actor is Brax's: layer normalisation follows the activation instead of a
-normalisation before it, the standard deviation is softplus(s) + 0.1 instead of exp(s) + 0.1, and the weights are
-LeCun-uniform.
+the critic's prior is a constant; nothing is added to the variance of an observation. The actor is Brax's: layer
+normalisation follows the activation instead of a normalisation before it, the standard deviation is softplus(s) + 0.1
+instead of exp(s) + 0.1, and the weights are LeCun-uniform.
 """
 
 import jax
