@@ -60,7 +60,7 @@ def schedule(num_updates: int, num_evals: int, num_resets_per_eval: int, max_upd
   events, at = [], 0
   for stop in sorted(evals | resets | {num_updates}):
     events += [ScheduleEvent(update) for update in range(at + max_updates, stop, max_updates)]
-    events.append(ScheduleEvent(stop, stop in evals and num_evals > 0, stop in resets))
+    events.append(ScheduleEvent(stop, stop in evals, stop in resets))
     at = stop
   return events
 
