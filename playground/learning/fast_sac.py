@@ -12,8 +12,7 @@ rad: -0.69 an action where ±1 is half a radian, and -1.9 where, as there, it re
 Differences from the published code: hidden layers are normalised after their activation, not before; log-probabilities
 are exact; the temperature's logarithm does not decay; observation statistics count each observation once, when it is
 collected, and nothing is added to their standard deviation, which there is 0.01 larger; weights are LeCun-uniform and
-biases 0 at first; transitions are mirrored only with
-`mirror_augmentation`.
+biases 0 at first; transitions are mirrored only with `mirror_augmentation`.
 """
 
 import jax
