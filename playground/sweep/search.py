@@ -142,12 +142,13 @@ def distribution(override: HydraOverride) -> CategoricalDistribution | FloatDist
     if isinstance(start, int) and isinstance(end, int):
       return IntDistribution(start, end, log=log)
     return FloatDistribution(start, end, log=log)
-  if isinstance(value, RangeSweep) and not value.shuffle:
-    values = list(value.range())
-    if all(isinstance(v, int) for v in values):
-      return IntDistribution(min(values), max(values), step=abs(int(value.step)))
-  if isinstance(value, ChoiceSweep | RangeSweep):
-    return CategoricalDistribution(list(override.sweep_string_iterator()))
+  if isinstance(value, ChoiceSweep | RangeSweep) and not value.shuffle:  # a study needs one order in every process
+    numbers = list(value.range()) if isinstance(value, RangeSweep) else []
+    if numbers and all(isinstance(number, int) for number in numbers):
+      return IntDistribution(min(numbers), max(numbers), step=abs(int(value.step)))
+    if choices := list(override.sweep_string_iterator()):
+      return CategoricalDistribution(choices)
+    raise ConfigError(f"{override.input_line} has no values to draw from.")
   raise ConfigError(f"{override.input_line}: a search draws from interval(a, b), range(a, b) or a list.")
 
 

@@ -36,6 +36,9 @@ def test_distributions(line: str, expected: BaseDistribution) -> None:
   ("lines", "message"),
   [
     (["a=glob(*)"], "a=glob(*): a search draws from"),
+    (["a=shuffle(1,2)"], "a=shuffle(1,2): a search draws from"),  # another order in each process
+    (["a=range(3,3)"], "a=range(3,3) has no values to draw from"),
+    (["a=range(0.1,0.1,0.1)"], "a=range(0.1,0.1,0.1) has no values to draw from"),
     (["a=tag(log,interval(0,1))"], "a=tag(log,interval(0,1)): an interval needs ends"),
     (["seed=1"], "search=optuna needs something to draw"),
   ],
