@@ -214,7 +214,7 @@ class SweepDirectory:
     sweep = cls(path, name, list(command), list(settings), list(lines), list(jobs), Path.cwd(), now())
     try:
       sweep.path.mkdir(parents=True, exist_ok=True)
-      sweep._write()
+      sweep.save()
     except OSError as error:
       raise CheckpointError(f"sweep_dir={path} cannot be written: {error.strerror}.") from error
     return sweep
@@ -260,7 +260,7 @@ class SweepDirectory:
   def add(self, job: Job) -> None:
     """Adds a job that a search has drawn."""
     self.jobs.append(job)
-    self._write()
+    self.save()
 
   @contextlib.contextmanager
   def controlled(self) -> Iterator[None]:
@@ -273,7 +273,8 @@ class SweepDirectory:
         )
       yield
 
-  def _write(self) -> None:
+  def save(self) -> None:
+    """Writes sweep.yaml."""
     content = dataclasses.asdict(self) | {"cwd": str(self.cwd)}
     del content["path"]
     write_text(self.path / "sweep.yaml", dump_yaml(content))

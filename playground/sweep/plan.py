@@ -60,13 +60,15 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
     ]
   lines = [line for line in lines if not configs.is_of_command(line)]
   found = _find(chosen.sweep_dir, name, settings, lines, jobs)
+  command = ["playground-run", "-m", *overrides]
+  settings = [line for line in settings if not line.startswith("sweep_dir=")]
   if found is not None:
+    found.command, found.settings = command, settings  # `run_sweep` saves them, for `playground sweep retry`
     return found, chosen
   launcher_class(chosen.launcher).check(chosen.launcher, jobs)
   started = ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"  # another sweep may have the same name
   path = chosen.sweep_dir or numbered(started)
-  settings = [line for line in settings if not line.startswith("sweep_dir=")]
-  return SweepDirectory.create(path, name, ["playground-run", "-m", *overrides], settings, lines, jobs), chosen
+  return SweepDirectory.create(path, name, command, settings, lines, jobs), chosen
 
 
 def _lines(overrides: Sequence[str]) -> tuple[list[str], SweepSettings, list[list[str]]]:

@@ -113,6 +113,7 @@ def run_sweep(
       search = Search(sweep, settings.search, view.print)
     wait = not isinstance(settings.launcher, SlurmConfig) or settings.launcher.wait
     with contextlib.closing(launcher_class(settings.launcher)(sweep, settings.launcher, command)) as launcher:
+      sweep.save()  # the command may have changed its settings
       code = Runner(sweep, launcher, view, search, settings.on_error == "stop", wait).run()
     if wait:
       write_result(sweep, view.print)

@@ -9,7 +9,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 
 from playground.errors import ConfigError
 from playground.sweep.folder import SweepDirectory
-from playground.sweep.plan import plan
+from playground.sweep.plan import plan, settings_of
 from playground.sweep.search import distribution, first_values
 from tests.sweep.helpers import output, run
 
@@ -56,8 +56,11 @@ def test_a_search_finds_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
   assert sweep.jobs == []
   assert run(sweep, *SEARCH, "search.trials=2") == 0
   assert len(SweepDirectory.open("mine").jobs) == 2
-  sweep, _ = plan([*LINE, *SEARCH, "sweep_dir=mine"])
-  assert run(sweep, *SEARCH) == 0
+  more = [*SEARCH, "search.sampler=random", "launcher.timeout=600"]
+  sweep, _ = plan([*LINE, *more, "sweep_dir=mine"])
+  assert run(sweep, *more) == 0
+  saved = settings_of(SweepDirectory.open("mine"))  # for `playground sweep retry`
+  assert (saved.resolved["search"]["sampler"], saved.launcher.timeout) == ("random", 600)
   table = pd.read_csv("mine/sweep.csv")
   assert len(table) == 4 and set(table["status"]) == {"finished"}
   rates = list(table["agent.learning_rate"])
