@@ -39,6 +39,7 @@ class Job:
     varies: the values in which the sweep's jobs differ, by key.
     needs: number of GPUs; None is one if there is any.
     steps: budget of environment steps.
+    task: name of the task; "" in the files of earlier versions.
   """
 
   name: str
@@ -46,6 +47,7 @@ class Job:
   varies: dict[str, Plain]
   needs: int | None = None
   steps: int | None = None
+  task: str = ""
 
   @classmethod
   def of_run(cls, number: int, overrides: Sequence[str], varying: Sequence[str], config: RunConfig) -> "Job":
@@ -72,7 +74,7 @@ class Job:
     stages = [stage.agent.num_timesteps for stage in config.stages]
     steps = sum(stages) if stages else config.agent.num_timesteps
     kept = [text for text in overrides if not is_of_command(text)]
-    return cls(f"{number:03d}_{text}", kept, varies, needs, int(steps))
+    return cls(f"{number:03d}_{text}", kept, varies, needs, int(steps), str(config.choices["env"]))
 
 
 def _value(config: RunConfig, key: str) -> Plain:
@@ -296,6 +298,7 @@ def _check(content: Plain) -> None:
     _need("varies", job.varies, dict)
     _need("needs", job.needs, int | None)
     _need("steps", job.steps, int | None)
+    _need("task", job.task, str)
 
 
 def _need(what: str, value: Plain, kind: type | types.UnionType) -> Plain:

@@ -137,7 +137,7 @@ def _write_curves(sweep: SweepDirectory) -> list[Path]:
     table = read_metrics(sweep.folder(job).path / "metrics.csv")
     if RETURN in table and len(table := table.dropna(subset=[RETURN])):
       name = ", ".join(f"{key.split('.')[-1]}={job.varies.get(key)}" for key in keys)
-      tables[str(job.varies.get(PANEL, sweep.name))][name or "mean"].append(table)
+      tables[job.task or str(job.varies.get(PANEL, sweep.name))][name or "mean"].append(table)
   written = []
   for file, (column, unit, label) in AXES.items() if tables else ():
     panels: dict[str, dict[str, Curve]] = {}

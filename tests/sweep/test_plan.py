@@ -45,6 +45,7 @@ def test_a_listed_job_is_named_after_what_it_says_itself(here: Path, monkeypatch
     "000_CartpoleBalance_max_grad_norm=2", "001_cheetah_run_seed=4", "002_cheetah_run_seed=5",
   ]  # fmt: skip
   assert [job.varies["env"] for job in sweep.jobs] == ["CartpoleBalance", "CheetahRun", "CheetahRun"]
+  assert [job.task for job in sweep.jobs] == ["CartpoleBalance", "CheetahRun", "CheetahRun"]
   assert plan(["sweep=these"])[0].path == sweep.path  # the same command goes on with it
   with pytest.raises(ConfigError, match="its sweep file cannot list jobs"):
     plan(["sweep=these", "search=optuna", "agent.learning_rate=interval(1e-4,1e-2)"])

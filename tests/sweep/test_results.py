@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from playground.files import write_json
+from playground.reporting import figures
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.report import collect, group, group_keys, mean_curve, write_result
 
@@ -69,6 +70,26 @@ def test_a_sweep_that_has_only_begun_has_a_result(tmp_path: Path) -> None:
   sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], [Job("000", ["seed=1"], {"seed": 1})])
   write_result(sweep, lambda text: None)
   assert list(pd.read_csv(tmp_path / "sweep.csv")["status"]) == ["queued"]
+
+
+def test_a_task_has_a_panel_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  jobs = [
+    Job(name, [f"experiment={name}"], {"experiment": name}, task=task)
+    for name, task in (("go1_joystick", "Go1JoystickFlatTerrain"), ("spot_joystick", "SpotFlatTerrainJoystick"))
+  ]
+  sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], jobs)
+  for job in jobs:
+    sweep.folder(job).path.mkdir(parents=True)
+    (sweep.folder(job).path / "metrics.csv").write_text("step,eval/episode_reward\n0,1\n")
+  drawn: list[dict[str, list[str]]] = []
+  monkeypatch.setattr(
+    figures, "curves", lambda panels, *_: drawn.append({k: list(v) for k, v in panels.items()}) or b""
+  )
+  write_result(SweepDirectory.open(tmp_path), lambda text: None)
+  assert drawn[0] == {
+    "Go1JoystickFlatTerrain": ["experiment=go1_joystick"],
+    "SpotFlatTerrainJoystick": ["experiment=spot_joystick"],
+  }
 
 
 def test_curves_are_compared_where_all_have_points() -> None:
