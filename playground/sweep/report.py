@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table as ConsoleTable
 
 from playground.files import replacing, write_text
@@ -53,7 +54,7 @@ def write_result(sweep: SweepDirectory, notify: Callable[[str], None] = print) -
     header, rows = _group_rows(groups)
     shown = ConsoleTable(*header, title="mean ± 95 % confidence interval")
     for row in rows:
-      shown.add_row(*row)
+      shown.add_row(*map(escape, row))
     Console().print(shown)
   files += [*curves, page]
   notify(f"Result of {sweep.path}: {', '.join(str(path.relative_to(sweep.path)) for path in files)}")

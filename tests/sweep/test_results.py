@@ -72,6 +72,16 @@ def test_a_sweep_that_has_only_begun_has_a_result(tmp_path: Path) -> None:
   assert list(pd.read_csv(tmp_path / "sweep.csv")["status"]) == ["queued"]
 
 
+def test_a_list_of_texts_is_no_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  jobs = [Job(name, [], {"a.joints": f"[{name}]"}) for name in ("hip", "knee")]
+  sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], jobs)
+  for job in jobs:
+    sweep.folder(job).write(status="finished")
+  write_result(sweep, lambda text: None)
+  shown = capsys.readouterr().out
+  assert "[hip]" in shown and "[knee]" in shown
+
+
 def test_a_task_has_a_panel_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   jobs = [
     Job(name, [f"experiment={name}"], {"experiment": name}, task=task)
