@@ -334,6 +334,12 @@ def test_rows_of_tasks_and_agents_that_are_not_installed_are_shown(tmp_path: Pat
   }
 
 
+def test_parts_of_another_version_have_no_breakdown(tmp_path: Path):
+  row = {"benchmark": "breakdown", "quantity": "seconds_per_step", "value": 1e-6}
+  found = evidence(tmp_path, {**row, "setting": "part=gone"}, {**row, "task": "HopperHop", "setting": "part=physics"})
+  assert [row[0] for row in table_with(page(found), "physics (µs)").rows] == ["HopperHop"]
+
+
 def test_memory_that_is_none_has_no_ratio(tmp_path: Path):
   memory = {"benchmark": "compare", "quantity": "used_memory_gib", "seed": 1}
   found = evidence(tmp_path, {**memory, "value": 0.0}, {**memory, "who": "playground 0.2.0", "value": 1.0})

@@ -263,9 +263,9 @@ def breakdown(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     parts.setdefault(figure["setting"].rpartition("part=")[2], figure)  # the newest
   for (task, device), of_it in measured.items():
     have = [part for part in PARTS if part in of_it]
-    times = [of_it[part].mean for part in have]
-    shares = {p: max(0.0, t - s) * 1e6 for p, t, s in zip(have, times, [0.0, *times[:-1]], strict=True)}
-    if have:
+    if have:  # else the rows are of parts of another version
+      times = [of_it[part].mean for part in have]
+      shares = {p: max(0.0, t - s) * 1e6 for p, t, s in zip(have, times, [0.0, *times[:-1]], strict=True)}
       bars[f"{task}, {device}"] = {part: share / (times[-1] * 1e6) for part, share in shares.items()}
       cells = [f"{shares[part]:.3g}" if part in shares else "" for part in PARTS]
       rows.append([task, *cells, f"{1 / times[-1]:,.0f}", device, notes.number(of_it[have[-1]])])
