@@ -69,7 +69,7 @@ class SlurmConfig(LauncherConfig):
   requeues: Annotated[int, count(0), "how often a job may go on after its time limit; after preemption always"] = 10
   max_parallel: Annotated[int | None, count(1), "jobs at a time; null is as many as Slurm gives"] = None
   gpus_per_job: Annotated[
-    float | None, at_least_0(), "null: the job's hardware.devices, 1 if that is null, 0 for hardware=cpu"
+    int | None, count(0), "null: the job's hardware.devices, 1 if that is null, 0 for hardware=cpu"
   ] = None
   cores_per_job: Annotated[int, count(1), "CPU cores of a job"] = 8
   memory_gb: Annotated[int, positive(), "memory of a job, GB"] = 32

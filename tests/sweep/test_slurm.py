@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import submitit
 
+from playground.config import compose_settings
 from playground.config.sweep_options import SlurmConfig
 from playground.errors import ConfigError, HardwareError
 from playground.sweep import slurm
@@ -82,6 +83,8 @@ def test_what_sbatch_is_told() -> None:
   assert "gpus_per_node" not in slurm_parameters(config, Job("a", [], {}, needs=0))
   executor = submitit.SlurmExecutor.__new__(submitit.SlurmExecutor)
   assert set(told) <= set(executor._valid_parameters()), "submitit knows them all"
+  with pytest.raises(ConfigError, match=r"^launcher\.gpus_per_job=0\.5 must be a whole number"):  # sbatch shares none
+    compose_settings(["launcher=slurm", "launcher.gpus_per_job=0.5"])
 
 
 def test_without_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
