@@ -4,6 +4,7 @@ import argparse
 import importlib
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from playground import __version__, registry
@@ -215,7 +216,10 @@ def _list(args: argparse.Namespace) -> int:
 
 def _run_path(name: str) -> str:
   """Returns the path of a run that a command line names: a path, a pretrained policy or a run on W&B."""
-  return working_copy(local_path(name), registry.names())
+  tasks = registry.names()
+  if name.isidentifier() and name not in tasks and not Path(name).exists():
+    raise UnknownNameError(f"{name} is no run directory, checkpoint or task.{nearest(name, tasks)}")
+  return working_copy(local_path(name), tasks)
 
 
 def _play(args: argparse.Namespace) -> int:

@@ -179,6 +179,15 @@ def test_an_unknown_command_is_answered_with_the_nearest(command: Command, capsy
   assert not out and err.startswith("error: playground lst does not exist") and "Did you mean 'list'?" in err
 
 
+@pytest.mark.parametrize("name", ["eval", "export", "play"])
+def test_a_task_of_a_pretrained_policy_is_answered_with_the_nearest(
+  command: Command, capsys: pytest.CaptureFixture[str], name: str
+):
+  assert command(name, "CartpolBalance") == 2
+  said = "error: CartpolBalance is no run directory, checkpoint or task. Did you mean 'CartpoleBalance'?\n"
+  assert capsys.readouterr().err == said
+
+
 def test_keys_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   assert command("keys", "agnt") == 2
   assert "Did you mean 'agent'?" in capsys.readouterr().err
