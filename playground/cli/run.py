@@ -91,7 +91,7 @@ def _main(argv: Sequence[str]) -> int:
     return _help(words, overrides)
   overrides = [_downloaded(text) for text in overrides]
   if args.multirun:
-    return _sweep(overrides, args.cfg, trusted)
+    return _sweep(overrides, args.cfg, args.package, trusted)
   config = compose(overrides)
   if args.cfg == "job":
     print(_shown(config, args.package), end="")
@@ -162,7 +162,7 @@ def _hydra_app(
 
   register_options()
   roots = config_roots()
-  sys.argv[1:] = [*flags, *overrides, *search_path_override(roots)]
+  sys.argv[1:] = [*overrides, *search_path_override(roots), *flags]  # last, since --info may stand alone
   hydra.main(config_path=str(roots[0]), config_name="config", version_base="1.3")(job)()
   return next(iter(codes), 0)
 
@@ -225,13 +225,15 @@ def _trusted(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
   return others, packages
 
 
-def _sweep(overrides: Sequence[str], show: str | None, trusted: Sequence[str]) -> int:
+def _sweep(overrides: Sequence[str], show: str | None, package: str | None, trusted: Sequence[str]) -> int:
   from playground.sweep.plan import compose_jobs, plan
 
   if show is not None:
     if show != "job":
       raise ConfigError(f"--cfg {show} shows one run: leave -m out; --cfg job shows all jobs of a sweep.")
-    print("---\n".join(f"# {' '.join(config.overrides)}\n{to_yaml(config)}" for config in compose_jobs(overrides)))
+    print(
+      "---\n".join(f"# {' '.join(config.overrides)}\n{_shown(config, package)}" for config in compose_jobs(overrides))
+    )
     return 0
   from playground.sweep.runner import run_sweep
   from playground.sweep.worker import job_command

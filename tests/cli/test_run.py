@@ -97,6 +97,8 @@ def test_resumes(command: Command, trained: list[RunConfig], tmp_path: Path, cap
     (["--help", "agent.learning_rate"], ["agent.learning_rate", "a number above 0"]),
     (["--help", "video", "env=CheetahRun"], ["video.visuals", "whether videos are recorded"]),
     (["--info", "searchpath"], ["configs"]),
+    (["--info"], ["Config search path"]),
+    (["-m", "seed=1,2", "--cfg", "job", "--package", "seed"], ["seed=1\n1\n---\n", "seed=2\n2\n"]),
   ],
 )
 def test_shows_and_does_not_train(
