@@ -128,7 +128,7 @@ def _compose(overrides: Sequence[str], files: "Callable[..., _Files]", roots: Se
   given: dict[str, Plain] = {o.key: o.value for o in parsed}
   for key in ("resume", "init_from"):
     if given.get(key) is not None:
-      given[key] = _resolve(given[key])
+      given[key] = _resolve(key, given[key])
       _check_path(key, given[key])
   if given.get("resume") is not None:
     return _compose_resumed(Path(os.path.expanduser(str(given["resume"]))), parsed, roots)
@@ -336,7 +336,7 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Section) -
       raise ConfigError(f"{min(missing)} has no value: set {min(missing)}=<value>.")
     return fit(OmegaConf.to_container(config, resolve=True), schema, chosen_names(schema))
   except OmegaConfBaseException as error:
-    raise ConfigError(f"{first_line(error)}.") from None
+    raise ConfigError(f"{error.full_key}: {first_line(error)}.") from None
 
 
 def _plain(config: object) -> Plain:
@@ -391,12 +391,12 @@ def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:
       raise ConfigError(f"{override.text} cannot be given with resume, {what}; {instead}.")
 
 
-def _resolve(value: object) -> Plain:
-  """Returns a value with interpolations such as ${oc.env:SCRATCH} resolved; escaped ones become text."""
+def _resolve(key: str, value: object) -> Plain:
+  """Returns a key's value with interpolations such as ${oc.env:SCRATCH} resolved; escaped ones become text."""
   try:
-    return OmegaConf.create({"value": value}).value
+    return OmegaConf.create({key: value})[key]
   except OmegaConfBaseException as error:
-    raise ConfigError(f"{first_line(error)}.") from None
+    raise ConfigError(f"{error.full_key}: {first_line(error)}.") from None
 
 
 def _check_path(key: str, value: object) -> None:
