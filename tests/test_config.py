@@ -275,7 +275,7 @@ def test_saved_configuration_reads_back(tmp_path: Path):
 def test_foreign_configuration_is_refused(tmp_path: Path):
   for text in ("a: 1", "[1]", "a: [", "${"):
     (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError, match=rf"^{tmp_path}/config\.yaml"):  # a chain has one for each stage
       config.load(tmp_path / "config.yaml")
   with pytest.raises(ConfigError, match="missing"):
     config.load(tmp_path / "missing")

@@ -135,7 +135,10 @@ def load(path: Path) -> RunConfig:
     raise ConfigError(f"{path} cannot be read: {first_line(error)}.") from None
   if not isinstance(resolved, dict):
     raise ConfigError(f"{path} is not the configuration of a run.")
-  return from_dict(resolved)  # pyright: ignore[reportArgumentType]
+  try:
+    return from_dict(resolved)  # pyright: ignore[reportArgumentType]
+  except ConfigError as error:
+    raise type(error)(f"{path}: {error}") from None
 
 
 def to_yaml(config: RunConfig) -> str:
