@@ -143,14 +143,16 @@ def combinations(*sets: Sequence[str]) -> list[list[str]]:
   """Returns the overrides of each job of a sweep: every combination of values, for each set of lines.
 
   Raises:
-    ConfigError: an interval, which has no values to combine.
+    ConfigError: an interval, which has no values to combine, or no combination.
   """
   for line in itertools.chain(*sets):
     override = parse_with_hydra(line)
     if override.is_sweep_override() and not override.is_discrete_sweep():
       raise ConfigError(f"{line} is a range to draw from: add search=optuna, or list values.")
-  jobs = (job for lines in sets for job in itertools.product(*map(_values, lines)))
-  return [list(job) for job in dict.fromkeys(jobs)]
+  jobs = dict.fromkeys(job for lines in sets for job in itertools.product(*map(_values, lines)))
+  if not jobs:
+    raise ConfigError("This sweep has no job: one of its keys has no value.")
+  return [list(job) for job in jobs]
 
 
 def varying(*sets: Iterable[str]) -> list[str]:

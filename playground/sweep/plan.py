@@ -49,8 +49,6 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
     name = _name(overrides, [config])
   else:
     combinations = configs.combinations(*sets)
-    if not combinations:
-      raise ConfigError("This sweep has no job: one of its keys has no value.")
     composed = configs.compose_all(combinations)
     name = _name(overrides, composed)
     varying = configs.varying(*sets)

@@ -121,6 +121,7 @@ def test_shows_and_does_not_train(
     (["-m", "seed=1", "env=Gone"], "error: "),
     (["-m", "agent.num_envs=0"], "error: agent.num_envs=0 must be a whole number from 1 to"),
     (["-m", "sweep=dm_control_pop"], "error: sweep=dm_control_pop does not exist: choose from dm_control_ppo, "),
+    (["-m", "seed=range(3,1)", "--cfg", "job"], "error: This sweep has no job: one of its keys has no value."),
     (["launcher=ray"], "launcher=ray is about a sweep: add -m"),
     (["-m", "agent.num_envs=128,7"], "error: Job experiment=quickstart agent.num_envs=7: agent.num_envs=7 does not"),
     (["-m", "agent.learning_rate=interval(0,1)"], "is a range to draw from: add search=optuna"),
