@@ -87,6 +87,6 @@ def test_a_row_for_each_agent_of_a_task_that_several_trained():
   ]
   entries_ = [entries()[TASK], entries()["WalkerRun"], entries()["HopperHop"]]
   assert agents_table(entries_, rows).rows == [
-    [TASK, "ppo_v020", "60", "1 (1)", "800", "", "0.75 success", "GPU", ""],
+    [TASK, "ppo_v020", "60", "1 (1)", "800", "", "success 0.75", "GPU", ""],
     [TASK, "fast_sac", "1", "2 (2)", "", "620 ± 254", "0.38 falls", "CPU", "yes"],
   ]

@@ -80,7 +80,7 @@ class _Comparison:
   def below(self) -> bool:
     return (
       self.equal is not None
-      and _agent_of(self.curve.label) == "ppo"
+      and agent_of(self.curve.label) == "ppo"
       and self.score < self.equal[0] - (1 - SHARE) * abs(self.equal[0])
     )
 
@@ -139,11 +139,11 @@ def our_best(evidence: Evidence, starts: Mapping[str, float]) -> dict[str, list[
     ascending = [dataclasses.replace(curve, points=sorted(curve.points)) for curve in curves]
     ends = lambda curve, start=starts.get(task, 0): (curve.points[-1][0] >= start, curve.points[-1][1])
     for curve in sorted(ascending, key=ends):
-      best.setdefault(task, {})[_agent_of(curve.label), curve.actions] = curve  # the highest is the last
+      best.setdefault(task, {})[agent_of(curve.label), curve.actions] = curve  # the highest is the last
   return {task: list(curves.values()) for task, curves in best.items()}
 
 
-def _agent_of(label: str) -> str:
+def agent_of(label: str) -> str:
   """Returns the algorithm in a run's name; `run` if the name has none, which may be any."""
   found = _AGENT.search(label)
   return found.group() if found else "run"
@@ -172,7 +172,7 @@ def _task_of(name: str) -> str | None:
 
 def _panel(ours: Sequence[Curve], theirs: Sequence[Curve]) -> dict[str, figures.Curve]:
   """Returns a task's curves by short names, ours first."""
-  named = {f"our {_agent_of(curve.label)}{', mode' * (curve.actions == 'mode')}": curve.points for curve in ours}
+  named = {f"our {agent_of(curve.label)}{', mode' * (curve.actions == 'mode')}": curve.points for curve in ours}
   for curve in sorted(theirs, key=lambda curve: curve.points[-1][1]):
     named[re.split(r"[ ,(]", curve.label)[0]] = curve.points  # the highest is the last
   return {

@@ -149,13 +149,4 @@ def _run(row: Row) -> tuple[str, str, str]:
 
 def _cells(key: tuple[str, ...], runs: Sequence[Row]) -> list[str]:
   returns = ", ".join(f"{float(row['final_return']):.4g}" for row in runs)
-  return [*key, returns, next(filter(None, map(_figure, reversed(runs))), "")]
-
-
-def _figure(row: Row) -> str:
-  """Returns the fraction of successes, the turns of a cube or the falls an episode; "" if the run logged none."""
-  if row.get("success"):
-    return f"success {float(row['success']):.2f}"
-  if row.get("turns"):
-    return f"{float(row['turns']):.1f} turns"
-  return f"{float(row['falls_per_episode']):.2f} falls" if row.get("falls_per_episode") else ""
+  return [*key, returns, next(filter(None, (tasks.ended([row]) for row in reversed(runs))), "")]

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from statistics import fmean
 
-from playground.benchmark.report.public import at, is_ppo, public_curves
+from playground.benchmark.report.public import agent_of, at, is_ppo, public_curves
 from playground.catalog import Entry, best_runs, reached_return, run_name
 from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
 from playground.text import millions
@@ -54,18 +54,13 @@ def agents_table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
   for entry in entries:
     by_agent: dict[str, list[Row]] = {}
     for row in rows:
-      by_agent.setdefault(_agent(row), []).append(row)
+      by_agent.setdefault(agent_of(row["agent"]), []).append(row)
     found = [runs for of_agent in by_agent.values() if (runs := best_runs(of_agent, entry.task))]
     for runs in sorted(found, key=lambda runs: -fmean(map(reached_return, runs))) if len(found) > 1 else []:
       on = "CPU" if runs[0].get("device") == "CPU" else "GPU"
-      default = "yes" if _agent(runs[0]) == entry.agent else ""
-      cells.append([entry.task, *_cells(runs), _ended(runs), on, default])
+      default = "yes" if agent_of(runs[0]["agent"]) == entry.agent else ""
+      cells.append([entry.task, *_cells(runs), ended(runs), on, default])
   return Table(_AGENTS, cells)
-
-
-def _agent(row: Row) -> str:
-  """Returns a run's algorithm, without the set of hyperparameters that some rows name with it."""
-  return re.split(r"[, ]|_v020|_paper", row["agent"])[0]
 
 
 def _cells(runs: Sequence[Row]) -> list[str]:
@@ -76,11 +71,11 @@ def _cells(runs: Sequence[Row]) -> list[str]:
   return [run_name(runs[0]), millions(float(runs[0]["steps"])), count, sampled, mode]
 
 
-def _ended(runs: Sequence[Row]) -> str:
-  """Returns the mean fraction of successes, else the mean number of falls an episode; "" if the runs logged neither."""
-  for column, name in (("success", "success"), ("falls_per_episode", "falls")):
+def ended(runs: Sequence[Row]) -> str:
+  """Returns the fraction of successes, the turns of a cube or the falls an episode, means; "" if no run logged one."""
+  for column, text in (("success", "success {:.2f}"), ("turns", "{:.1f} turns"), ("falls_per_episode", "{:.2f} falls")):
     if values := _returns(runs, column):
-      return f"{fmean(values):.2f} {name}"
+      return text.format(fmean(values))
   return ""
 
 
