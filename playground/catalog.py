@@ -153,7 +153,7 @@ def reached_return(row: dict[str, str]) -> float:
 
 
 def run_name(row: dict[str, str]) -> str:
-  """Returns a run's agent, with the stage of a chain, the task of its first policy, and pushes that are off."""
+  """Returns a run's agent, with a chain's stage, its first policy's task, mirrored data, and pushes that are off."""
   setting = row["setting"]
   chain = f", {row['experiment']}'s {stage}" if (stage := _stage_of(row)) else ""
   start = re.search(r"init_from=<(\w+)>", setting)
@@ -161,6 +161,7 @@ def run_name(row: dict[str, str]) -> str:
     row["agent"].split(",")[0].replace("agent.", "")
     + chain
     + (f", from {start.group(1)}" if start else "")
+    + ", mirrored data" * ("agent.mirror_augmentation=true" in setting)
     + ", no pushes, nothing randomised" * (_NO_PUSHES in setting)
   )
 
