@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from playground.limits import Limit
+from playground.limits import SHARE, Limit
 
 QUARTER = 4
 PARENT = "population/parent"  # in metrics.csv: the index of the agent that was copied after the row's evaluation
@@ -38,7 +38,8 @@ class Population:
 
     Returns:
       The index of the agent that each copies, [agents], and the new settings: an agent that copies another
-      multiplies each of the explored ones by 0.8 or 1.25, within its limit.
+      multiplies each of the explored ones by 0.8 or 1.25, within its limit; of a share above a half, such as a
+      discount, its distance from 1.
     """
     rng = np.random.default_rng([self.seed, update])
     ranked = np.argsort(np.where(np.isnan(returns), -np.inf, returns), kind="stable")
@@ -48,5 +49,7 @@ class Population:
     changed, values = dict(settings), {key: settings[key][parents] for key in self.explore}
     for agent in ranked[:count]:
       for key, limit in self.explore.items():
-        values[key][agent] = np.clip(values[key][agent] * rng.choice(FACTORS), limit.low, limit.high)
+        value, factor = values[key][agent], rng.choice(FACTORS)
+        value = 1 - (1 - value) * factor if limit == SHARE and value > 0.5 else value * factor
+        values[key][agent] = np.clip(value, limit.low, limit.high)
     return parents, changed | values

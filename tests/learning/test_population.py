@@ -11,7 +11,7 @@ from playground.learning.evaluation import make_evaluator
 from playground.learning.loop import Loop, compile_program, schedule
 from playground.learning.population import PARENT, Population
 from playground.learning.trainer import Trainer, trainer_settings
-from playground.limits import positive
+from playground.limits import SHARE, positive
 from tests.dummy import SMALL_PPO, PointTask, Recorder, check_resume, numbers
 
 RATE, COST = "agent.learning_rate", "agent.entropy_cost"
@@ -37,6 +37,13 @@ def test_a_number_stays_within_its_limit(start: float) -> None:
   settings = {RATE: np.full(4, start, np.float32)}
   found = [POPULATION.exchange(np.arange(4.0), settings, update)[1][RATE].max() for update in range(20)]
   assert max(found) == np.float32(1e-2)
+
+
+def test_a_discount_varies_by_its_distance_from_1() -> None:
+  population = dataclasses.replace(POPULATION, explore={"agent.discounting": SHARE})
+  settings = {"agent.discounting": np.full(4, 0.99, np.float32)}
+  found = {float(population.exchange(np.arange(4.0), settings, i)[1]["agent.discounting"][0]) for i in range(20)}
+  assert sorted(found) == pytest.approx([0.9875, 0.992])
 
 
 def test_a_population_goes_on_where_it_was_cut_short() -> None:
