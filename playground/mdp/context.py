@@ -66,14 +66,21 @@ class Robot:
     return data.sensordata[self.rows(name)]
 
   def find_joints(self, joints: str | Sequence[str], key: str = "joints") -> np.ndarray:
-    """Returns the indices of joints, in the order of `joint_names`; raises UnknownNameError if one matches no joint.
+    """Returns the indices of joints, in the order of `joint_names`.
 
     `joints` is a group of `joint_groups`, a regular expression that matches whole names, or several of them.
+
+    Raises:
+      UnknownNameError: one matches no joint.
+      ConfigError: one is no regular expression.
     """
     found: set[int] = set()
     for name in (joints,) if isinstance(joints, str) else joints:
       patterns = self.joint_groups.get(name, [name])
-      matches = {i for i, joint in enumerate(self.joint_names) if any(re.fullmatch(p, joint) for p in patterns)}
+      try:
+        matches = {i for i, joint in enumerate(self.joint_names) if any(re.fullmatch(p, joint) for p in patterns)}
+      except re.error as error:
+        raise ConfigError(f"{key}={name!r} is no regular expression, such as '.*_hip_joint': {error}.") from None
       if not matches:
         known = [*self.joint_groups, *self.joint_names]
         raise UnknownNameError(f"{key}={name!r} matches no joint of the robot.{nearest(name, known)}")

@@ -66,7 +66,7 @@ class RewardManager(_Manager):
 
 def _value(term: Term, c: StepContext) -> jax.Array:
   """The value of a reward term, 0 where its `when` is not met."""
-  value = term(c)
+  value = term.scalar(c)
   for name, bound in (term.options.when or {}).items():
     with term.reading(c):
       speed = jnp.linalg.norm(c.command)
@@ -83,7 +83,7 @@ class TerminationManager(_Manager):
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns whether each term ends the episode, by name, each a bool of shape []."""
-    return {term.name: term(c) for term in self.terms}
+    return {term.name: term.scalar(c).astype(bool) for term in self.terms}
 
   def any(self, c: StepContext) -> jax.Array:
     """Returns whether any term ends the episode, a bool of shape []."""
@@ -103,6 +103,8 @@ class ObservationManager(_Manager):
     self._level: float = config.noise_level
     self._frames: int = config.observation_frames
     self.groups = {}
+    for group in order:
+      lookup(section, group, "env.observation_order")
     for group in sorted(section, key=lambda name: (name != ACTOR, name)):
       entries = {name: entry for name, entry in (section[group] or {}).items() if entry is not None}
       first = list(order.get(group) or ())
@@ -179,7 +181,7 @@ class ObservationManager(_Manager):
         sizes = {}
         for term in terms:
           actor = _is_actor(group, term)
-          sizes[term.name] = sum(found[ACTOR].values()) if actor else term(c).size * term.options.history
+          sizes[term.name] = sum(found[ACTOR].values()) if actor else jnp.size(term(c)) * term.options.history
         found[group] = sizes
         if group == ACTOR and self._frames > 1:
           found[group] = sizes | {"past_frames": (self._frames - 1) * sum(sizes.values())}

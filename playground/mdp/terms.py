@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.options import OPTIONS, is_model_field, keys
@@ -69,6 +70,13 @@ class Term(NamedTuple):
   def __call__(self, *args: Any) -> Any:
     with self.reading(*args):
       return self.func(*args, **self.params)
+
+  def scalar(self, *args: Any) -> jax.Array:
+    """Returns the function's value, shape []; raises ConfigError where it has another shape."""
+    value = jnp.asarray(self(*args))
+    if value.ndim:
+      raise ConfigError(f"{self.key} must return one number, and returns {value.size} of them: add .sum() or .any().")
+    return value
 
   @contextlib.contextmanager
   def reading(self, *args: Any) -> Iterator[None]:

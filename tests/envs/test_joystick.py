@@ -296,6 +296,8 @@ def test_joints_are_found_by_group_or_expression() -> None:
   assert robot.find_joints(["FR_hip_joint", "FL_.*"]).tolist() == [0, 3, 4, 5]
   with pytest.raises(UnknownNameError, match=r"joints='FR_hip_jont' matches no joint .*Did you mean 'FR_hip_joint'"):
     robot.find_joints("FR_hip_jont")
+  with pytest.raises(ConfigError, match=r"joints='\*_hip_joint' is no regular expression, such as '\.\*_hip_joint'"):
+    robot.find_joints("*_hip_joint")
   with pytest.raises(ConfigError, match=r"env\.robot\.sensors\.mine=3 must name a sensor, or be a list of names"):
     Robot(robot.mj_model, [], {"mine": 3})
   with pytest.raises(UnknownNameError, match="feet: 'FX' is unknown"):

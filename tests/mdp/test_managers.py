@@ -93,6 +93,24 @@ def test_any_termination_ends_the_episode() -> None:
 
 
 @pytest.mark.parametrize(
+  ("manager", "half"),
+  [
+    (RewardManager({"mine": {"func": "joint_vel_l2", "weight": 1.0}}), 0.5),
+    (TerminationManager({"mine": {"func": "nonfinite_state"}}), True),
+  ],
+)
+def test_a_term_returns_one_number(manager: RewardManager | TerminationManager, half: float) -> None:
+  def compute(func: Any) -> Any:
+    manager.groups = {kind: [term._replace(func=func)]}
+    return manager.compute(context())["mine"]
+
+  ((kind, (term,)),) = manager.groups.items()
+  assert compute(lambda c: 0.5) == half
+  with pytest.raises(ConfigError, match=rf"^env\.{kind}\.mine must return one number, and returns 2 of them: add .sum"):
+    compute(lambda c: c.joint_vel)
+
+
+@pytest.mark.parametrize(
   ("total", "clip", "value"),
   [
     ("sum", None, 0.02 * (3 - 1.5)),
@@ -165,6 +183,8 @@ def test_the_order_may_be_given_apart() -> None:
   np.testing.assert_allclose(obs, [0.5, 1, 3, 3, 3, 0.5, -0.5])
   with pytest.raises(UnknownNameError, match=r"env\.observation_order\.state: 'joint_vell'.*Did you mean 'joint_vel'"):
     manager(order={"state": ["joint_vell"]}, joint_vel={})
+  with pytest.raises(UnknownNameError, match=r"env\.observation_order: 'stat' is unknown.*Did you mean 'state'"):
+    manager(order={"stat": ["joint_vel"]}, joint_vel={})
 
 
 def test_a_value_is_clipped_and_then_scaled() -> None:
