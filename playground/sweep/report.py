@@ -129,21 +129,27 @@ def mean_curve(curves: "Sequence[tuple[np.ndarray, np.ndarray]]") -> "tuple[np.n
 
 
 def _write_curves(sweep: SweepDirectory) -> list[Path]:
-  """Draws mean evaluation returns with their 95 % confidence bands over seeds; returns the files written."""
+  """Draws mean evaluation returns with their 95 % confidence bands over seeds; returns the files written.
+
+  The curve of a group is that of its finished jobs, if there are any: one that failed early would cut it off.
+  """
   from playground.reporting.figures import Curve, curves
 
   keys = [key for key in group_keys(sweep) if key != PANEL]
-  tables: dict[str, dict[str, list[pd.DataFrame]]] = defaultdict(lambda: defaultdict(list))
+  tables: dict[str, dict[str, list[tuple[bool, pd.DataFrame]]]] = defaultdict(lambda: defaultdict(list))
   for job in sweep.jobs:
-    table = read_metrics(sweep.folder(job).path / "metrics.csv")
+    folder = sweep.folder(job)
+    table = read_metrics(folder.path / "metrics.csv")
     if RETURN in table and len(table := table.dropna(subset=[RETURN])):
       name = ", ".join(f"{key.split('.')[-1]}={job.varies.get(key)}" for key in keys)
-      tables[job.task or str(job.varies.get(PANEL, sweep.name))][name or "mean"].append(table)
+      task = job.task or str(job.varies.get(PANEL, sweep.name))
+      tables[task][name or "mean"].append((folder.state().status == "finished", table))
   written = []
   for file, (column, unit, label) in AXES.items() if tables else ():
     panels: dict[str, dict[str, Curve]] = {}
     for task, groups in tables.items():
-      lines = {name: [_line(t, column, unit) for t in some if column in t] for name, some in groups.items()}
+      finished = {name: [t for done, t in some if done] or [t for _, t in some] for name, some in groups.items()}
+      lines = {name: [_line(t, column, unit) for t in some if column in t] for name, some in finished.items()}
       means = {name: mean_curve(some) for name, some in lines.items() if some}
       panels[task] = {name: Curve(*(axis.tolist() for axis in mean)) for name, mean in means.items()}
     path = sweep.path / "plots" / file

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -100,6 +101,17 @@ def test_a_task_has_a_panel_of_its_own(tmp_path: Path, monkeypatch: pytest.Monke
     "Go1JoystickFlatTerrain": ["experiment=go1_joystick"],
     "SpotFlatTerrainJoystick": ["experiment=spot_joystick"],
   }
+
+
+def test_a_job_that_failed_early_leaves_its_groups_curve_whole(
+  sweep: SweepDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  (sweep.folder(sweep.jobs[-1]).path / "metrics.csv").write_text("step,eval/episode_reward,time/wall_clock_s\n0,1,0\n")
+  drawn: list[Any] = []
+  monkeypatch.setattr(figures, "curves", lambda panels, *_: drawn.append(panels["mine"]) or b"")
+  write_result(sweep, lambda text: None)
+  assert [[curve.x[-1] for curve in groups.values()] for groups in drawn] == [[1e-4, 1e-4], [100 / 7, 100 / 7]]
+  assert drawn[0]["agent=sac<1>"].y[-1] == 105.0
 
 
 def test_curves_are_compared_where_all_have_points() -> None:
