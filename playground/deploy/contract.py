@@ -82,7 +82,7 @@ def describe_policy(
     "action": _action(env, env_config, state),
     "actuators": _actuators(env.mj_model, _home(env, env_config)),
     "joints": [env.mj_model.joint(i).name or "(free)" for i in range(env.mj_model.njnt)],
-    **_commands(env),
+    **commands_of(env),
     "env": env_config,
   }
   return plain(contract)
@@ -187,12 +187,12 @@ def _options(options: ObservationOptions, noise_level: float) -> dict[str, objec
   }
 
 
-def _commands(env: Env) -> Contract:
+def commands_of(env: Env) -> Contract:
   """Returns the parameters of the task's velocity command (as `command`) and of its gait, if it has them."""
   manager = getattr(env.unwrapped, "commands", None)
   terms = manager.terms if manager else []
   kinds = (("command", UniformVelocity | VelocityWalk), ("gait", Gait))
-  return {key: dict(term.params) for key, kind in kinds for term in terms if isinstance(term.instance, kind)}
+  return {key: plain(term.params) for key, kind in kinds for term in terms if isinstance(term.instance, kind)}
 
 
 def _camera(env: Env, entry: str) -> dict[str, object]:

@@ -1,12 +1,11 @@
 """Zero or random actions, to view a task without a policy."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
 
-from playground.deploy.contract import Contract
+from playground.deploy.contract import Contract, commands_of
 from playground.deploy.policy import Seen
 from playground.envs.base import Env, Observation
 from playground.errors import lookup
@@ -28,12 +27,7 @@ class ScriptedPolicy:
     self._action_size = env.action_size
     self._sizes = env.observation_size
     self._generator = np.random.default_rng(seed)
-    velocity: Any = (env.config.get("commands") or {}).get("velocity") or {}
-    self.contract: Contract = {
-      "task": task,
-      "origin": {"steps": 0, "evaluation": None},
-      "command": dict(velocity.get("params") or {}),
-    }
+    self.contract: Contract = {"task": task, "origin": {"steps": 0, "evaluation": None}, **commands_of(env)}
 
   def actions(self, obs: Seen) -> np.ndarray:
     """Returns actions [..., action_size] for observations with any leading axes."""

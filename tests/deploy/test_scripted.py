@@ -28,6 +28,12 @@ def test_actions_of_a_batch() -> None:
   assert 0 < np.abs(random.actions(obs)).max() <= 1 and (random.actions(obs) != random.actions(obs)).any()
 
 
+def test_a_command_of_any_name_has_its_range() -> None:
+  walk = {"func": "uniform_velocity", "params": {"max": [1.0, 0.0, 0.5]}}
+  env = registry.load("Go1JoystickFlatTerrain", overrides={"commands.velocity": None, "commands.walk": walk})
+  assert ScriptedPolicy("zero", "Go1JoystickFlatTerrain", env, 0).contract["command"] == {"max": [1.0, 0.0, 0.5]}
+
+
 def test_play_measures_a_task(command: Command, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any):
   monkeypatch.chdir(tmp_path)
   assert command("play", "CartpoleBalance", "--agent", "zero", "--episodes", "1") == 0
