@@ -1,8 +1,11 @@
 """Policies that come with the package: they are what was trained, and a changed file or task is refused."""
 
+import contextlib
 import copy
 import json
 import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +73,22 @@ def test_a_copy_is_made_once_and_again_for_another_policy(policies: Path) -> Non
   working_copy(TASK, [TASK])
   assert not (copied / "eval").exists() and (copied.parent / f"{TASK}_old" / "eval").is_dir(), "nor is it lost"
   assert (copied / "card.yaml").read_text() == card.read_text()
-  assert sorted(path.name for path in copied.parent.iterdir()) == [TASK, f"{TASK}_old"]
+  assert sorted(path.name for path in copied.parent.iterdir()) == [".lock", TASK, f"{TASK}_old"]
+
+
+def test_processes_that_start_together_share_a_copy(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  begun, copytree = threading.Barrier(2), shutil.copytree
+
+  def slowly(*args: Any) -> Any:
+    with contextlib.suppress(threading.BrokenBarrierError):
+      begun.wait(0.3)  # for the other one, if it copies, too
+    return copytree(*args)
+
+  monkeypatch.setattr(shutil, "copytree", slowly)
+  with ThreadPoolExecutor(2) as pool:
+    copies = set(pool.map(lambda _: working_copy(TASK, [TASK]), range(2)))
+  assert copies == {str(Path("results/pretrained") / TASK)}
+  assert [path.name for path in Path("results/pretrained").glob("[!.]*")] == [TASK]
 
 
 def test_a_path_of_that_name_comes_first(policies: Path) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 import yaml
 
 from playground.errors import CheckpointError, UnknownNameError, nearest
-from playground.files import numbered, read_csv
+from playground.files import locking, numbered, read_csv
 from playground.settings import Plain, Section
 
 PREFIX = "pretrained:"
@@ -25,6 +25,7 @@ POLICIES = Path(__file__).parent / "policies"
 CARD = "card.yaml"
 CRITIC_BITS = 4
 _COPIES = Path("results/pretrained")
+_PATIENCE_S = 60.0  # for the copies of other processes
 # Keys of an env section on which the meaning of inputs and outputs depends; `action_repeat` may be an agent's own.
 _MEANING = ("observations", "observation_order", "observation_frames", "ctrl_dt")
 _MEANING += ("action_base", "action_scale", "clip_targets")
@@ -73,14 +74,15 @@ def working_copy(name: str, tasks: Container[str]) -> str:
   source = Path(locate(name))
   copy = _COPIES / source.name
   try:
-    if not copy.is_dir() or (copy / CARD).read_bytes() != (source / CARD).read_bytes():
-      copy.parent.mkdir(parents=True, exist_ok=True)
-      with tempfile.TemporaryDirectory(dir=copy.parent) as scratch:
-        shutil.copytree(source, Path(scratch) / source.name)
-        if copy.exists():  # with the user's results
-          old = copy.rename(numbered(copy.with_name(f"{copy.name}_old")))
-          print(f"The policy of {source.name} has changed; your results with the old one are in {old}.")
-        (Path(scratch) / source.name).rename(copy)
+    _COPIES.mkdir(parents=True, exist_ok=True)
+    with locking(_COPIES / ".lock", _PATIENCE_S):  # else processes that start together move each other's copy away
+      if not copy.is_dir() or (copy / CARD).read_bytes() != (source / CARD).read_bytes():
+        with tempfile.TemporaryDirectory(dir=_COPIES) as scratch:
+          shutil.copytree(source, Path(scratch) / source.name)
+          if copy.exists():  # with the user's results
+            old = copy.rename(numbered(copy.with_name(f"{copy.name}_old")))
+            print(f"The policy of {source.name} has changed; your results with the old one are in {old}.")
+          (Path(scratch) / source.name).rename(copy)
   except OSError as error:
     raise CheckpointError(f"{copy} cannot be written: {error.strerror}.") from error
   return str(copy)
