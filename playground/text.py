@@ -1,7 +1,7 @@
 """Values and errors in the words of the command line."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import yaml
 
@@ -12,8 +12,8 @@ def format_value(value: object) -> str:
   """A value as one would write it on the command line."""
   if value is None or isinstance(value, bool):
     return {None: "null", True: "true", False: "false"}[value]
-  if isinstance(value, Mapping):
-    return "{" + ", ".join(f"{k}: {format_value(v)}" for k, v in value.items()) + "}"
+  if items := getattr(value, "items", None):  # of a ConfigDict, too, which is no Mapping
+    return "{" + ", ".join(f"{k}: {format_value(v)}" for k, v in items()) + "}"
   return f"[{', '.join(map(format_value, value))}]" if isinstance(value, list | tuple) else str(value)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import pytest
 import yaml
+from ml_collections import ConfigDict
 
 import playground
 from playground import registry
@@ -93,6 +94,7 @@ def test_unknown_names(entry: Any, message: str) -> None:
     ({"func": "base_height_l2", "weight": 1, "params": {"target": float("nan")}}, r"target=nan must be a number"),
     ({"func": "feet_clearance", "weight": 1, "params": {"target": -0.1}}, r"target=-0\.1 must be a number above 0"),
     ({"func": "orientation_l2", "weight": 1, "params": {"target": [0, 1]}}, r"target=.* must be 3 numbers"),
+    ({"func": ConfigDict({"a": {"b": 1}}), "weight": 1}, r"env\.rewards\.x\.func=\{a: \{b: 1\}\} must be text"),
     ({"func": "joint_deviation_l1", "weight": 1, "params": {"joints": 3}}, r"joints=3 must be text or a list of texts"),
     ({"func": "ang_vel_xy_l2", "weight": 1, "params": {"sensor": 3}}, r"sensor=3 must be text"),
   ],
