@@ -110,7 +110,7 @@ def test_a_task_that_has_changed_is_refused(policies: Path) -> None:
   with pytest.raises(CheckpointError, match=r"env.action_scale has changed"):
     check_task(TASK, saved, {**noisier, "action_scale": 9.0})
   order = list(reversed(saved["observations"]["state"]))
-  changes = {"action_base": "joint_pos", "clip_targets": True, "observation_order": {"state": order}}
+  changes = {"action_base": "joint_pos", "clip_targets": True, "ema_alpha": 0.5, "observation_order": {"state": order}}
   for key, value in changes.items():
     with pytest.raises(CheckpointError, match=rf"env.{key} has changed"):
       check_task(TASK, saved, {**noisier, key: value})

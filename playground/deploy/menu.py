@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from playground.envs.options import MEANING
 from playground.errors import CheckpointError
 from playground.learning.checkpoints import BEST, find_checkpoints, find_stages
 from playground.runs.loaded_policy import LoadedPolicy
 
 # Keys of a run's config that define the meaning of an actor's inputs and outputs; its arrays define their sizes.
-_ENV = ("task", "robot", "observations", "observation_order", "observation_frames", "vision")
-_CONTROL = ("ctrl_dt", "action_repeat", "action_base", "action_scale", "clip_targets")
-_MEANING = {"env": (*_ENV, *_CONTROL), "agent": ("name", "network", "normalize_observations")}
+_ENV = ("task", "robot", "vision", "action_repeat", *MEANING)
+_MEANING = {"env": _ENV, "agent": ("name", "network", "normalize_observations")}
 
 
 class Menu:

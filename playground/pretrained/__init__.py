@@ -16,6 +16,7 @@ from pathlib import Path
 
 import yaml
 
+from playground.envs.options import MEANING
 from playground.errors import CheckpointError, UnknownNameError, nearest
 from playground.files import locking, numbered, read_csv
 from playground.settings import Plain, Section
@@ -26,9 +27,6 @@ CARD = "card.yaml"
 CRITIC_BITS = 4
 _COPIES = Path("results/pretrained")
 _PATIENCE_S = 60.0  # for the copies of other processes
-# Keys of an env section on which the meaning of inputs and outputs depends; `action_repeat` may be an agent's own.
-_MEANING = ("observations", "observation_order", "observation_frames", "ctrl_dt")
-_MEANING += ("action_base", "action_scale", "clip_targets")
 
 
 def cards() -> dict[str, dict[str, Plain]]:
@@ -96,7 +94,7 @@ def check_task(task: str, saved: Section, today: Section) -> None:
     saved: the env section that it was trained with.
     today: the task's.
   """
-  for key in _MEANING:
+  for key in MEANING:  # not `action_repeat`, which may be an agent's own
     if _without_noise(saved.get(key)) != _without_noise(today.get(key)):
       raise CheckpointError(
         f"The pretrained policy of {task} does not fit its task any more: env.{key} has changed since it was "
