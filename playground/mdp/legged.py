@@ -22,7 +22,7 @@ class LeggedRobot(Robot):
   The first joint is the free one of the base; actuators stand in the order of the other joints.
 
   Attributes:
-    joint_range: for joints that have no limits those of their targets, rad, shape [2, nu].
+    joint_range: for joints that have no limits those of their servos, rad, shape [2, nu].
     target_range: (lower, upper) limits of the joints' targets: the robot's own, or those of the servos, rad, [2, nu].
     root: id of the body that is pushed.
     base_site: id of the site that carries the inertial sensors.
@@ -57,10 +57,7 @@ class LeggedRobot(Robot):
     super().__init__(mj_model, joints, config.sensors)
     self.init_qpos = self.keyframe(config.keyframe)
     self.default_pose = self.init_qpos[7:]
-    limited = mj_model.jnt_limited[1:, None].astype(bool)
-    self.joint_range = jnp.array(np.where(limited, mj_model.jnt_range[1:], mj_model.actuator_ctrlrange).T)
-    own = config.get("target_range")
-    self.target_range = jnp.array([own.lower, own.upper] if own else mj_model.actuator_ctrlrange.T)
+    self.joint_range, self.target_range = _ranges(mj_model, joints, config.get("target_range"))
     self.root, self.base_site = self.find("body", config.root), self.find("site", config.base_site)
     self.foot_names = tuple(config.feet)
     self.feet = np.array([self.find("site", name) for name in config.feet])
@@ -138,6 +135,22 @@ class LeggedRobot(Robot):
   def mass(self, model: mjx.Model) -> jax.Array:
     """Returns the mass that a push on `root` moves, kg: the root's and that of all it carries."""
     return model.body_mass[np.array(self._subtree)].sum()
+
+
+def _ranges(mj_model: mujoco.MjModel, joints: Sequence[str], own: Any) -> tuple[jax.Array, jax.Array]:
+  """Returns the limits of joints and of their targets, rad, each [2, joints]; `own` is `target_range` of the YAML.
+
+  A servo without a range has that of its joint, and the other way round.
+
+  Raises:
+    ConfigError: neither of them has one.
+  """
+  limited, ranged = mj_model.jnt_limited[1:].astype(bool), mj_model.actuator_ctrllimited.astype(bool)
+  if unlimited := [joint for joint, any_range in zip(joints, limited | ranged, strict=True) if not any_range]:
+    raise ConfigError(f"env.robot.mjcf needs a range for each joint or for its servo: {', '.join(unlimited)} has none.")
+  of_joints, of_servos = mj_model.jnt_range[1:].T, mj_model.actuator_ctrlrange.T
+  targets = [own.lower, own.upper] if own else np.where(ranged, of_servos, of_joints)
+  return jnp.array(np.where(limited, of_joints, of_servos)), jnp.array(targets)
 
 
 def _check_lengths(config: Any) -> None:

@@ -27,7 +27,7 @@ class Manipulator(Robot):
 
   Attributes:
     joint_ids: of the arms' or the hand's joints, those of grippers' fingers excepted.
-    ctrl_range: (lower, upper) limits of `ctrl`, shape [2, nu].
+    ctrl_range: (lower, upper) limits of `ctrl`, infinite for an actuator without a range, shape [2, nu].
     init_ctrl: `ctrl` of the keyframe, shape [nu].
   """
 
@@ -38,7 +38,9 @@ class Manipulator(Robot):
     super().__init__(mj_model, [mj_model.joint(i).name for i in self.joint_ids], sensors)
     self.qpos, self.qvel = _span(mj_model.jnt_qposadr[self.joint_ids]), _span(mj_model.jnt_dofadr[self.joint_ids])
     self.joint_range = jnp.array(mj_model.jnt_range[self.joint_ids].T)
-    self.ctrl_range = jnp.array(mj_model.actuator_ctrlrange.T)
+    ranged = mj_model.actuator_ctrllimited.astype(bool)
+    no_limit = np.array([[-np.inf], [np.inf]])
+    self.ctrl_range = jnp.array(np.where(ranged, mj_model.actuator_ctrlrange.T, no_limit))
     key = mj_model.key(self.find("key", keyframe, "env.keyframe"))
     self.init_qpos, self.init_ctrl = jnp.array(key.qpos), jnp.array(key.ctrl)
     self.default_pose = self.init_qpos[self.qpos]

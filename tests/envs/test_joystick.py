@@ -376,6 +376,17 @@ def test_servos_that_do_not_fit_the_joints_or_a_model_that_does_not_compile(
     load_task(TASK, {"robot.mjcf": str(robot)})
 
 
+def test_targets_of_servos_without_a_range_have_that_of_their_joints(tmp_path: Path) -> None:
+  robot, text = tmp_path / "robot.xml", find_mjcf("go1").read_text()
+  robot.write_text(text.replace(' inheritrange="1"', ""))
+  env = load_task(TASK, {"robot.mjcf": str(robot), "clip_targets": True})
+  np.testing.assert_array_equal(env.robot.target_range, env.mj_model.jnt_range[1:].T.astype(np.float32))
+  (joint,) = re.findall(r'<joint name="FR_hip_joint" [^/]*', robot.read_text())
+  robot.write_text(robot.read_text().replace(joint, f'{joint} limited="false"'))
+  with pytest.raises(ConfigError, match=r"needs a range for each joint or for its servo: FR_hip_joint has none"):
+    load_task(TASK, {"robot.mjcf": str(robot)})
+
+
 def test_a_keyframe_may_be_empty(tmp_path: Path) -> None:
   robot, text = tmp_path / "robot.xml", find_mjcf("go1").read_text()
   robot.write_text(text.replace("<keyframe>", '<keyframe><key name="zero"/>', 1))

@@ -4,6 +4,7 @@ On recorded states of Playground 0.2.0, with what is looked at replaced: no phys
 """
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ from mujoco.mjx._src.math import quat_integrate
 from playground.envs.base import State
 from playground.envs.manipulation.reorient import new_spin
 from playground.mdp.poses import angle_between
+from playground.robots.scene import find_mjcf
 from tests.envs.golden import golden, recorded, without_physics
 
 REORIENT, ROTATE = "LeapCubeReorient", ("LeapCubeRotateZAxis", "AeroCubeRotateZAxis")
@@ -144,6 +146,14 @@ def test_targets_are_those_of_the_grasp_or_the_last_ones_plus_the_action() -> No
   half = build(REORIENT, ema_alpha=0.5).action_to_ctrl(recorded(REORIENT), jnp.ones(16))
   full = build(REORIENT).action_to_ctrl(recorded(REORIENT), jnp.ones(16))
   np.testing.assert_allclose(half, 0.5 * (full + recorded(REORIENT).data.ctrl), rtol=1e-5, atol=1e-6)
+
+
+def test_targets_of_servos_without_a_range_have_no_limits(tmp_path: Path) -> None:
+  hand, text = tmp_path / "hand.xml", find_mjcf("playground/robots/leap_hand/right_hand.xml").read_text()
+  hand.write_text(text.replace(' inheritrange="1"', ""))
+  env, state = build(REORIENT, robot__mjcf=str(hand)), recorded(REORIENT)
+  moved = env.action_to_ctrl(state, jnp.full(16, 0.1)) - state.data.ctrl
+  np.testing.assert_allclose(moved, 0.1 * env.config.action_scale, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", TASKS)
