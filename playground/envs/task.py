@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from flax import struct
 
 from playground.envs.base import Env, State
@@ -25,6 +26,7 @@ from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
 from playground.randomization import Randomizer
 from playground.text import first_line
 
+_LAGS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))  # their `act` follows `ctrl`
 _MODEL_FIELDS = "model_fields"  # entry of `info`: fields of the model that events of mode reset draw
 
 
@@ -125,9 +127,13 @@ class Task(Env):
     return {}
 
   def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:
-    """Returns the physics of a start state, after a forward pass."""
+    """Returns the physics of a start state, after a forward pass; actuators with a time constant have settled."""
     given = {name: value for name, value in vars(initial).items() if value is not None}
-    return self.physics.forward(model, self.physics.make(**{"ctrl": self.rest_ctrl(initial), **given}))
+    start = {"ctrl": self.rest_ctrl(initial), **given}
+    lags = np.isin(self.mj_model.actuator_dyntype, _LAGS)
+    if lags.any():
+      start["act"] = jnp.zeros(self.mj_model.na).at[self.mj_model.actuator_actadr[lags]].set(start["ctrl"][lags])
+    return self.physics.forward(model, self.physics.make(**start))
 
   def model_of(self, info: Mapping[str, Any], model: mjx.Model | None) -> mjx.Model:
     model = super().model_of(info, model)

@@ -14,6 +14,7 @@ from playground import registry
 from playground.config import compose
 from playground.envs import wrappers
 from playground.envs.base import State
+from playground.envs.c_physics import on_c_physics
 from playground.errors import ConfigError, UnknownNameError
 from playground.mdp.context import Robot
 from playground.robots.scene import find_mjcf
@@ -385,6 +386,14 @@ def test_targets_of_servos_without_a_range_have_that_of_their_joints(tmp_path: P
   robot.write_text(robot.read_text().replace(joint, f'{joint} limited="false"'))
   with pytest.raises(ConfigError, match=r"needs a range for each joint or for its servo: FR_hip_joint has none"):
     load_task(TASK, {"robot.mjcf": str(robot)})
+
+
+def test_servos_with_a_time_constant_hold_the_pose_that_an_episode_starts_in(tmp_path: Path) -> None:
+  robot, text = tmp_path / "robot.xml", find_mjcf("go1").read_text()
+  robot.write_text(text.replace("<position kp=", '<position timeconst="0.05" kp='))
+  data = on_c_physics(load_task(TASK, {"robot.mjcf": str(robot)})).reset(jax.random.PRNGKey(0)).data
+  np.testing.assert_array_equal(data.act, data.ctrl)
+  np.testing.assert_allclose(data.actuator_force, 0.0, atol=1e-4)
 
 
 def test_a_keyframe_may_be_empty(tmp_path: Path) -> None:
