@@ -62,11 +62,10 @@ class Episodes:
     return self._moment(state)
 
   def _moment(self, state: State) -> Moment:
-    state = jax.tree.map(lambda x: np.array(x[0]), state.replace(data=None))
-    truncated = bool(state.info["truncation"])
-    ended = bool(state.done) and not truncated
-    obs: PyTree = state.obs
-    return Moment(obs, float(state.reward), ended, truncated, {k: float(v) for k, v in state.metrics.items()})
+    outputs: PyTree = (state.obs, state.reward, state.done, state.info["truncation"], state.metrics)
+    obs, reward, done, truncated, metrics = jax.tree.map(lambda x: np.array(x)[0], outputs)
+    ended = bool(done) and not truncated
+    return Moment(obs, float(reward), ended, bool(truncated), {name: float(value) for name, value in metrics.items()})
 
 
 def need_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
