@@ -58,7 +58,7 @@ from playground.config.overrides import (
   with_default_experiment,
 )
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, from_dict, load
-from playground.config.schema import check_key, fit, is_terms
+from playground.config.schema import check_key, check_removed, fit, is_terms
 from playground.config.sweep_options import SweepSettings
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
@@ -325,6 +325,8 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Section) -
   try:
     for override in overrides:
       check_key(override.key, schema)
+      if override.value is None:
+        check_removed(override.key, config)
       if override.key in _CHOSEN_BY_GROUP:
         group = override.key.partition(".")[0]
         raise ConfigError(f"{override.text} cannot be set: {group}=<name> chooses it, with the keys that it has.")

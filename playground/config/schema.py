@@ -50,6 +50,20 @@ def is_open(parts: Sequence[str], schema: Section) -> bool:
   return True
 
 
+def check_removed(key: str, values: Section) -> None:
+  """Raises UnknownNameError if `key` is a term or a group of observations that `values` do not have to remove."""
+  *parents, name = parts = key.split(".")
+  if not is_of_terms(key) or len(parts) > (4 if parts[1] == "observations" else 3):
+    return
+  node: Plain = values
+  for part in parents:
+    node = (node.get(part) if isinstance(node, Mapping) else None) or {}
+  if name not in node:
+    has = f"has {', '.join(node)}" if node else "is empty"
+    near = nearest_in(".".join(parents), name, node)
+    raise UnknownNameError(f"{key} does not exist: {'.'.join(parents)} {has}.{near}")
+
+
 def is_of_terms(key: str) -> bool:
   """Whether a dotted key is in a mapping of terms (`env.rewards`, ...), which may have entries of any name."""
   parts = key.split(".")
