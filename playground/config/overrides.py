@@ -84,8 +84,10 @@ def parse_with_hydra(text: str) -> HydraOverride:
   except HydraException:
     if group := next((group for group in ("env", "experiment") if text in options(group)), None):
       raise ConfigError(f"{text!r} is not an override: write {group}={text}.") from None
-    if re.fullmatch(r"[\w.@/+~]+", key) and value and not set(value) & set("[]{}()'\""):
-      raise ConfigError(f"{text!r} is not an override: quote its value, in a shell '{key}=\"{value}\"'.") from None
+    if re.fullmatch(r"[\w.@/+~]+", key) and value:
+      forms = "a list is [1, 2], a mapping {a: 1, b: 2}, text with brackets or quotes stands in quotes"
+      how = forms if set(value) & set("[]{}()'\"") else f"quote its value, in a shell '{key}=\"{value}\"'"
+      raise ConfigError(f"{text!r} is not an override: {how}.") from None
     example = "such as env=CartpoleBalance or agent.num_envs=1024"
     raise ConfigError(f"{text!r} is not an override: write key=value, {example}.") from None
 
@@ -102,7 +104,8 @@ def parse(text: str, roots: Sequence[Path]) -> Override:
   parsed = parse_with_hydra(text)
   text, key = parsed.input_line or text, parsed.key_or_group
   if parsed.is_sweep_override():
-    raise ConfigError(f"{text} names several values, which is a sweep: add -m, or quote the value.")
+    otherwise = "a list is [1, 2], text with a comma stands in quotes"
+    raise ConfigError(f"{text} names several values, which is a sweep: add -m ({otherwise}).")
   is_group = key in groups(roots) and parsed.package is None
   value = parsed.value()
   if parsed.is_delete():
