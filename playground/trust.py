@@ -52,7 +52,7 @@ def trusted_object(key: str, spec: object) -> object:
   except ModuleNotFoundError as error:
     if not f"{module_name}.".startswith(f"{error.name}."):  # the module is there, something that it needs is not
       raise
-    raise ConfigError(f"{key}={spec}: there is no module {error.name}.") from None
+    raise ConfigError(f"{key}={spec}: there is no module {error.name} (installed, or on PYTHONPATH).") from None
   own = [n for n, value in vars(module).items() if getattr(value, "__module__", None) == module_name]
   if name not in vars(module):
     raise ConfigError(f"{key}={spec}: {module_name} has no {name}.{nearest(name, own)}")

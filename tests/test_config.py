@@ -382,7 +382,7 @@ ERRORS = {
   "run_dir=${oc.env:NO_SUCH_FOLDER}": ["run_dir: ", "'NO_SUCH_FOLDER' not found"],
   "init_from=${oc.env:NO_SUCH_FOLDER}": ["init_from: ", "'NO_SUCH_FOLDER' not found"],
   "run_dir=3": ["run_dir=3", "must be text (put quotes around a number)."],
-  "agent=[1": ["'agent=[1' is not an override: a list is [1, 2], a mapping {a: 1, b: 2}"],
+  "agent=[1": ["'agent=[1' is not an override: its value does not parse; a list is [1, 2], "],
   "agent.num_envs": ["'agent.num_envs' is not an override: write key=value, such as env=CartpoleBalance"],
   "hardware.xla_flags=--a=b": ["quote its value, in a shell 'hardware.xla_flags=\"--a=b\"'."],
   "Go1JoystickFlatTerrain": ["is not an override: write env=Go1JoystickFlatTerrain."],

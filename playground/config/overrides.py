@@ -85,7 +85,7 @@ def parse_with_hydra(text: str) -> HydraOverride:
     if group := next((group for group in ("env", "experiment") if text in options(group)), None):
       raise ConfigError(f"{text!r} is not an override: write {group}={text}.") from None
     if re.fullmatch(r"[\w.@/+~]+", key) and value:
-      forms = "a list is [1, 2], a mapping {a: 1, b: 2}, text with brackets or quotes stands in quotes"
+      forms = "its value does not parse; a list is [1, 2], a mapping {a: 1, b: 2}, other text stands in quotes"
       how = forms if set(value) & set("[]{}()'\"") else f"quote its value, in a shell '{key}=\"{value}\"'"
       raise ConfigError(f"{text!r} is not an override: {how}.") from None
     example = "such as env=CartpoleBalance or agent.num_envs=1024"

@@ -83,7 +83,8 @@ class Robot:
         raise ConfigError(f"{key}={name!r} is no regular expression, such as '.*_hip_joint': {error}.") from None
       if not matches:
         known = [*self.joint_groups, *self.joint_names]
-        raise UnknownNameError(f"{key}={name!r} matches no joint of the robot.{nearest(name, known)}")
+        no_group = "and is no group of joints in its YAML"
+        raise UnknownNameError(f"{key}={name!r} matches no joint of the robot {no_group}.{nearest(name, known)}")
       found |= matches
     return np.array(sorted(found))
 

@@ -122,7 +122,8 @@ def build_scene(
   if any(geom.name == "floor" for geom in spec.geoms):
     raise ConfigError(f"env.robot.mjcf={mjcf} has a geom named floor: remove it, the scene adds the ground.")
   if collision != "feet" and not _full_geoms(spec):
-    raise ConfigError(f"collision={collision}: {Path(mjcf).stem} has geoms for the feet only, choose collision=feet.")
+    feet_only = f"{Path(mjcf).stem} has collision geoms for the feet only"
+    raise ConfigError(f"env.scene.collision={collision}: {feet_only}, choose env.scene.collision=feet.")
   activate(spec)
   with added_to(mjcf):
     add_studio(spec)

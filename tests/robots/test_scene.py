@@ -84,7 +84,7 @@ def test_floor_contact_sensors_come_before_those_of_the_robots_parts() -> None:
 
 
 def test_a_robot_without_geoms_for_full_collisions() -> None:
-  with pytest.raises(ConfigError, match="collision=full_self: t1 has geoms for the feet only"):
+  with pytest.raises(ConfigError, match=r"env\.scene\.collision=full_self: t1 has collision geoms for the feet only"):
     build_scene("t1", collision="full_self")
 
 
