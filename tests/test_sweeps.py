@@ -230,7 +230,9 @@ def test_keys_that_jobs_cannot_have(line: str, message: str):
   ("line", "message"),
   {
     "launcher=slrm": "launcher=slrm does not exist: choose from local, ray, slurm, together. Did you mean 'slurm'?",
-    "launcher.timeot=3": "launcher.timeot does not exist",
+    "launcher.timeot=3": "launcher.timeot does not exist: launcher has name, ",
+    "launcher.exploit_every=1": "launcher.exploit_every does not exist for launcher=local, only for launcher=together.",
+    "search.trials=5": "search.trials does not exist for search=grid, only for search=optuna.",
     "launcher.timeout=-3": "launcher.timeout=-3 must be a number above 0 and at most 1000000000.",
     "launcher.slots_per_gpu=many": "launcher.slots_per_gpu=many has the wrong type",
     "on_error=halt": "on_error=halt is unknown: choose from continue, stop.",

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 
-from playground.config.definitions import agents, definition
+from playground.config.definitions import defined, definition
 from playground.config.files import DELTAS
 from playground.errors import UnknownNameError, nearest
 from playground.mdp.options import OPTIONS, keys
@@ -167,10 +167,9 @@ def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section)
     return UnknownNameError(f"{key} does not exist: {parent} is {what}.")
   if not node:
     return UnknownNameError(f"{key} does not exist: {parent} is empty. Set it whole: {parent}={{{part}: <value>}}.")
-  if parent == "agent" and (
-    owners := [f"agent={name}" for name, cls in agents().items() if part in cls.__dataclass_fields__]
-  ):
-    return UnknownNameError(f"{key} does not exist for agent={node['name']}, only for {', '.join(owners)}.")
+  classes = defined().get(parent, {})
+  if owners := [f"{parent}={name}" for name, cls in classes.items() if part in cls.__dataclass_fields__]:
+    return UnknownNameError(f"{key} does not exist for {parent}={node['name']}, only for {', '.join(owners)}.")
   known = [str(k) for k in node] if parent else [*schema, "robot", *DELTAS]
   near = nearest_in(parent, _MEANT.get(part, part), known)
   if not near and not parent:  # perhaps only the section is missing
