@@ -331,6 +331,7 @@ ERRORS = {
     "Did you mean 'quickstart'?",
   ],
   "hardware=tpu": ["hardware=tpu does not exist: choose from the ", "`playground keys hardware` shows"],
+  "env=v020/CartpoleBalanc": ["Did you mean 'v020/CartpoleBalance'?"],
   "env=go1_joystick": ["Did you mean experiment=go1_joystick?"],
   "experiment=CartpoleBalance": ["Did you mean env=CartpoleBalance?"],
   "robot=spotty_the_dog_123": ["These begin alike: spot."],

@@ -145,6 +145,7 @@ def _check_option(group: str, option: object, roots: Sequence[Path]) -> None:
   command = "playground list" if group == "env" else f"playground keys {group}"
   allowed = ", ".join(shown) if len(shown) <= 12 else f"the {len(shown)} that `{command}` shows"
   elsewhere = [f"{other}={option}" for other in ("experiment", "env", "robot") if option in options(other, roots)]
-  near = f" Did you mean {elsewhere[0]}?" if elsewhere else nearest(str(option), shown)
+  alike = known if "/" in str(option) else shown  # v020/<Task> is not listed
+  near = f" Did you mean {elsewhere[0]}?" if elsewhere else nearest(str(option), alike)
   near = (ELSEWHERE.get(str(option)) if group == "agent" else None) or near
   raise UnknownNameError(f"{group}={format_value(option)} does not exist: choose from {allowed}.{near}")
