@@ -31,7 +31,20 @@ def check_key(key: str, schema: Section) -> None:
 
 
 # Names of other libraries.
-_MEANT = {"task": "env", "algo": "agent", "algorithm": "agent", "lr": "learning_rate", "gamma": "discounting"}
+_MEANT = {
+  "task": "env",
+  "algo": "agent",
+  "algorithm": "agent",
+  "lr": "learning_rate",
+  "gamma": "discounting",
+  "lam": "gae_lambda",
+  "num_steps_per_env": "unroll_length",
+  "num_learning_epochs": "num_updates_per_batch",
+  "num_mini_batches": "num_minibatches",
+  "clip_param": "clipping_epsilon",
+  "entropy_coef": "entropy_cost",
+  "max_iterations": "num_timesteps",
+}
 
 
 def is_open(parts: Sequence[str], schema: Section) -> bool:
@@ -171,9 +184,11 @@ def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section)
   if owners := [f"{parent}={name}" for name, cls in classes.items() if part in cls.__dataclass_fields__]:
     return UnknownNameError(f"{key} does not exist for {parent}={node['name']}, only for {', '.join(owners)}.")
   known = [str(k) for k in node] if parent else [*schema, "robot", *DELTAS]
-  near = nearest_in(parent, _MEANT.get(part, part), known)
-  if not near and not parent:  # perhaps only the section is missing
-    near = nearest(part, _keys(schema))
+  meant = _MEANT.get(part, part)
+  near = nearest_in(parent, meant, known)
+  if not parent and meant not in known:  # perhaps only the section is missing
+    whole = [name for name in _keys(schema) if name.endswith(f".{meant}")]
+    near = f" Did you mean {whole[0]!r}?" if whole else near or nearest(part, _keys(schema))
   has = f"has {', '.join(known)}" if len(known) <= 12 or not near else f"has {len(known)} keys (--cfg job shows them)"
   return UnknownNameError(f"{key} does not exist: {parent or 'the configuration'} {has}.{near}")
 
