@@ -444,6 +444,14 @@ def test_errors_are_one_sentence(line: str):
   assert isinstance(caught.value, UnknownNameError) == ("does not exist" in message and "=/nowhere" not in line)
 
 
+def test_resume_of_a_folder_of_runs_names_the_newest(tmp_path: Path):
+  for name in ("2026-01-01_00-00-00", "2026-01-02_00-00-00"):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "config.yaml").touch()
+  with pytest.raises(ConfigError, match=r"is a folder of runs: name one, .* resume=\S*/2026-01-02_00-00-00\."):
+    compose([f"resume={tmp_path}"])
+
+
 def test_a_key_of_an_empty_mapping_is_set_with_the_mapping():
   with pytest.raises(UnknownNameError, match=r"is empty\. Set it whole: env\.observation_order=\{state: <value>\}\."):
     compose(["env=Go1JoystickFlatTerrain", "env.observation_order.state=[gyro]"])

@@ -44,5 +44,5 @@ def stop(folder: str) -> int:
   """Asks all running jobs to save and exit, on any machine."""
   sweep = SweepDirectory.open(folder)
   sweep.stop_file.touch()
-  print(f"Jobs of {sweep.path} are asked to stop; `playground sweep retry {sweep.path}` goes on.")
+  print(f"Jobs of {sweep.path} are asked to stop; `playground sweep retry {sweep.path}` continues them.")
   return 0

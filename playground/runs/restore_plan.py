@@ -156,7 +156,7 @@ class RestorePlan:
           )
       self.policy = self.weights.restore("policy", trainer.policy_shape())
       source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
-      self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is fresh.")
+      self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is new.")
       return
     model, _ = jax.eval_shape(draw)
     template = trainer.template(model)

@@ -109,7 +109,7 @@ def _find(
     if not _same(sweep, settings, lines, jobs):
       raise ConfigError(
         f"sweep_dir={path} holds a sweep of other jobs ({' '.join(sweep.command)}): name another folder, or give the "
-        "same command to go on with it."
+        "same command to continue it."
       )
     return sweep
   for folder in sorted((ROOT / name).glob("*/sweep.yaml"), reverse=True):

@@ -176,7 +176,7 @@ class Runner:
           sweep.stop_file.touch()
         raise
     if self._signum is not None:
-      view.print(f"{'Its jobs go on by themselves; ' if launcher.outlives else 'Interrupted: '}{view.again}.")
+      view.print(f"{'Its jobs keep running; ' if launcher.outlives else 'Interrupted: '}{view.again}.")
       return 128 + self._signum
     if not self._wait:
       view.print(f"Submitted; `playground sweep status|collect {sweep.path}` shows what becomes of it.")

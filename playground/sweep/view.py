@@ -25,7 +25,7 @@ class View:
     self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
     self._seen: dict[str, tuple[str, int]] = {}
     self._drawn_at = 0.0
-    self.again = f"the same command, or `playground sweep retry {sweep.path}`, goes on"  # after a stop
+    self.again = f"the same command, or `playground sweep retry {sweep.path}`, continues the sweep"  # after a stop
 
   def __enter__(self) -> Self:
     if self._live:

@@ -170,7 +170,7 @@ class Worker:
       return "timeout", f"took longer than launcher.timeout={self._timeout:g} s"
     if why == "stopped" or run.get("status") == "preempted":
       killed = code == -signal.SIGKILL
-      return "preempted", "killed before it could save" if killed else "stopped; goes on when it is started again"
+      return "preempted", "killed before it could save" if killed else "stopped; the next start of the sweep resumes it"
     if code < 0:
       name = signal.Signals(-code).name
       return "killed", f"killed by {name}{', perhaps for want of memory' if code == -signal.SIGKILL else ''}"

@@ -495,7 +495,7 @@ def test_a_new_run_starts_from_weights(
   assert update is None
   said = capsys.readouterr().out
   assert f"{checkpoint.path} (CartpoleBalance, {checkpoint.step:,} steps)" in said
-  assert "the optimiser is fresh" in said
+  assert "the optimiser is new" in said
   summary = RunDirectory(tmp_path / "run").summary
   assert summary["steps"] == 320, "a new budget"
   assert summary["params_sha256"] != checkpoint.meta["sha256"]["policy"], "it trained on"

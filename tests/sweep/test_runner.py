@@ -92,7 +92,7 @@ def test_an_interrupt_saves_and_starts_nothing_more(tmp_path: Path, signum: int,
   assert process.wait(60) == code
   states = [state.status for state in sweep.states().values()]
   assert states == ["preempted"] * slots + ["queued"] * (4 - slots)
-  assert "goes on" in output(sweep)
+  assert "continues the sweep" in output(sweep)
   assert run(sweep) == 0
   assert set(statuses(sweep).values()) == {"finished"}
 
