@@ -378,7 +378,9 @@ def find_checkpoints(path: str | Path) -> list[Path]:
 
 
 def find_stages(chain: Path) -> list[Path]:
-  """Returns the stages in a chain's directory that have a checkpoint, in order."""
+  """Returns the stages in a chain's directory that have a checkpoint, in order; none in a folder of a sweep's jobs."""
+  if not (chain / "config.yaml").is_file():
+    return []
   number = lambda stage: stage.name.partition("_")[0]
   stages = [stage for stage in chain.glob("*_*/") if number(stage).isdecimal() and _by_step(stage / "checkpoints")]
   return sorted(stages, key=lambda stage: int(number(stage)))

@@ -22,6 +22,7 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
   UntrainedRun(chain / "9_near", *FAST, "env.episode_length=20").save(1000, 2000, episode_return=5.0)
   UntrainedRun(chain / "10_far", *FAST).save(500, episode_return=1.0)
   UntrainedRun(chain / "11_next", *FAST)
+  (chain / "config.yaml").touch()
   return chain
 
 

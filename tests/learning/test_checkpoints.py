@@ -482,6 +482,9 @@ def test_those_of_a_chain(tmp_path: Path) -> None:
   save(tmp_path / "2_near", 20)
   expected = save(tmp_path / "10_far", 10)
   (tmp_path / "11_next/checkpoints/000000000005.orbax-checkpoint-tmp").mkdir(parents=True)
+  with pytest.raises(CheckpointError, match="is a folder of runs"):  # so are a sweep's jobs, `000_seed=1`
+    find_checkpoints(tmp_path)
+  (tmp_path / "config.yaml").touch()
   assert find_checkpoints(tmp_path) == expected
   assert [path.name for path in checkpoints.find_stages(tmp_path)] == ["2_near", "10_far"]
 
