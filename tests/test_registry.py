@@ -296,6 +296,7 @@ def test_a_term_that_is_none_is_one_sentence(override: str, message: str) -> Non
     (["env=joystick", "robot=leap_hand"], r"env\.robot\.root is missing: robot=leap_hand is no robot on legs"),
     (["env=LeapCubeReorient", "robot=go1"], r"env\.robot\.cube is missing: robot=go1 is no hand"),
     (["env=PandaPickCube", "env.commands.gait={params: {modes: [walk]}}"], r"env\.commands\.gait needs 'gait'"),
+    (["env=PointMass", "env.events.push.enabled=true"], r"env\.events\.push\.mode=null: DM Control's tasks take only"),
     (["env=PointMass", "env.rewards.joint_vel_l2.weight=1"], r"env\.rewards\.joint_vel_l2 needs 'qvel', which this"),
   ],
 )

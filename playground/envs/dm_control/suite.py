@@ -16,6 +16,7 @@ from playground.mdp.context import StepContext
 from playground.mdp.managers import RewardManager, TerminationManager
 from playground.mdp.tolerance import tolerance
 from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
+from playground.text import format_value
 
 Terms = dict[str, jax.Array]
 
@@ -40,7 +41,8 @@ class SuiteTask(Env):
     """Compiles the scene and binds the terms. `config`: the task's, e.g. `configs/env/WalkerStand.yaml`."""
     for name, entry in (config.get("events") or {}).items():
       if entry is not None and entry.get("mode") != "startup":
-        raise ConfigError(f"env.events.{name}.mode={entry.get('mode')}: tasks of this suite have startup events only.")
+        mode = format_value(entry.get("mode"))
+        raise ConfigError(f"env.events.{name}.mode={mode}: DM Control's tasks take only events of mode startup.")
     self.rewards, self.terminations = RewardManager(config.rewards), TerminationManager(config.terminations)
     added = [*self.rewards.terms, *self.terminations.terms]
     if self.rewards.terms or any(not term.func.__module__.startswith("playground.") for term in added):
