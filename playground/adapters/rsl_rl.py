@@ -18,7 +18,7 @@ from tensordict import TensorDict
 
 from playground.envs.base import PIXELS, Env, Observation, State
 from playground.envs.wrappers import FINAL_OBS, AutoReset, wrap_for_evaluation
-from playground.errors import ConfigError
+from playground.errors import ConfigError, lookup
 from playground.learning.rollout import episode_sums
 from playground.randomization import Randomizer
 from playground.settings import Section, plain
@@ -129,9 +129,12 @@ def vec_env(
 
   Raises:
     ConfigError: the task has images.
+    UnknownNameError: the task has no such observation group.
   """
   batch = AutoReset(wrap_for_evaluation(env), keep_final_obs=True)
   groups = dict(groups or group_entries(env))
+  for group, entry in groups.items():
+    lookup(_entries(env), entry, f"groups[{group!r}]")
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
   randomizer = Randomizer(env.mj_model, events) if events else None
   model = jax.jit(randomizer.sample_batch)(jax.random.split(model_key, num_envs)) if randomizer else {}
@@ -146,8 +149,12 @@ def group_entries(env: Env) -> dict[str, str]:
   Raises:
     ConfigError: the task has images, which the adapter does not pass on.
   """
-  sizes = env.observation_size
-  entries = list(sizes) if isinstance(sizes, Mapping) else ["state"]
+  entries = _entries(env)
   if any(entry.startswith(PIXELS) for entry in entries):
     raise ConfigError("RSL-RL gets no images from here: leave env.vision.enable=false.")
   return {"policy": "state", "critic": PRIVILEGED if PRIVILEGED in entries else "state"}
+
+
+def _entries(env: Env) -> dict[str, object]:
+  sizes = env.observation_size
+  return dict(sizes) if isinstance(sizes, Mapping) else {"state": sizes}

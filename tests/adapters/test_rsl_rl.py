@@ -18,7 +18,7 @@ import pytest
 
 from playground.envs.base import State
 from playground.envs.c_physics import on_c_physics
-from playground.errors import ConfigError
+from playground.errors import ConfigError, UnknownNameError
 from playground.registry import load
 from tests.dummy import Point
 
@@ -128,6 +128,11 @@ def test_groups_of_go1() -> None:
 
 
 @pytest.mark.slow  # compiles a task's physics
+def test_a_group_that_the_task_lacks_is_named() -> None:
+  with pytest.raises(UnknownNameError, match=r"groups\['policy'\]: 'stat' is unknown; choose from state"):
+    vec_env(Point(episode_length=LENGTH), NUM_ENVS, groups={"policy": "stat"})
+
+
 def test_each_environment_has_a_model_of_its_own() -> None:
   params = {"field": "dof_damping", "target": "all", "operation": "set", "range": [0.0, 5.0]}
   events = {"damping": {"mode": "startup", "func": "model_field", "params": params}}

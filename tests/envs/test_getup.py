@@ -97,8 +97,8 @@ def test_power_cutoff(state: State) -> None:
   """The first stage of the paper: 400 W ends an episode; without a threshold nothing does."""
   force, velocity = jnp.full(12, -10.0), jnp.zeros(18).at[6:].set(3.4)  # 408 W, all of it braking
   for power, done in ((400.0, 1.0), (409.0, 0.0), (None, 0.0)):
-    cutoff = None if power is None else {"params": {"limit": power}}
-    after = evaluate(load_task(TASK, {"terminations.power_above": cutoff}), state, actuator_force=force, qvel=velocity)
+    cutoff = {} if power is None else {"terminations.power_above": {"params": {"limit": power}}}
+    after = evaluate(load_task(TASK, cutoff), state, actuator_force=force, qvel=velocity)
     assert after.done == done
 
 
