@@ -45,7 +45,8 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   if not console.is_terminal:  # one line a task, however long
     console = Console(width=240)
   console.print(_table(rows))
-  console.print(f"{len(rows)} task{'s' * (len(rows) != 1)}. Train one with playground train env=<task>.", soft_wrap=True)
+  count = f"{len(rows)} task{'s' * (len(rows) != 1)}"
+  console.print(f"{count}. Train one with playground train env=<task>.", soft_wrap=True)
   return 0
 
 
