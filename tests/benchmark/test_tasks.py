@@ -65,14 +65,17 @@ def test_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch):
   theirs = [Curve("PPO (some)", "mode", [(10e6, 1.0), (90e6, 5.0)]), Curve("REPPO (x)", "sampled", [(50e6, 4.0)])]
   monkeypatch.setattr(tasks, "public_curves", lambda: {TASK: theirs})
   entry = entries()[TASK]
-  runs = [run(100, final_mode_return="110"), run(300, seed="2")]
+  in_c = {"c_mujoco_return": "90", "c_mujoco_falls": "0.25"}
+  runs = [run(100, final_mode_return="110", **in_c), run(300, seed="2", c_mujoco_return="92", c_mujoco_falls="0.5")]
   (row,) = table([entry], runs).rows
   assert row == [
-    *(TASK, entry.status, "ppo", "60", f"{entry.budget / 1e6:.3g}", "2 (2)", "200 ± 1271", "110"),
+    *(TASK, entry.status, "ppo", "60", f"{entry.budget / 1e6:.3g}", "2 (2)", "200 ± 1271", "110", "91, 0.38 falls"),
     *("3.5 (PPO, mode)", "4 (REPPO, sampled)"),
   ]
   (row,) = table([entry], [run(50, agent="reppo", steps="5000000")]).rows
-  assert row[5:] == ["1 (1)", "", "50", "1 after 10 (PPO, mode)", "1 after 10 (PPO, mode)"]
+  assert row[5:] == ["1 (1)", "", "50", "", "1 after 10 (PPO, mode)", "1 after 10 (PPO, mode)"]
+  (row,) = table([entry], [run(5, c_mujoco_return="6", c_mujoco_success="1", c_mujoco_calm_return="7")]).rows
+  assert row[8] == "6, success 1.00 (7)"
   (row,) = table([entry], []).rows
   assert row[2] == "not measured"
 

@@ -9,7 +9,7 @@ from playground.catalog import Entry, best_runs, reached_return, run_name
 from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
 from playground.text import millions
 
-_HEADER = ("task", "status", "best run", "M steps", "default budget", "runs (seeds)", "sampled", "mode")
+_HEADER = ("task", "status", "best run", "M steps", "default budget", "runs (seeds)", "sampled", "mode", "in C MuJoCo")
 _PUBLIC = ("best public PPO", "best public")  # at as many steps
 _AGENTS = ("task", "best run", "M steps", "runs (seeds)", "sampled", "mode", "ended", "trained on", "default")
 _BY_MODE = ("reppo", "fast_td3", "fast_sac")  # whose agent.deterministic_eval is true by default
@@ -33,11 +33,11 @@ def table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
     budget = millions(entry.budget)
     runs = best_runs(rows, entry.task)
     if not runs:
-      cells.append([entry.task, entry.status, NOT_MEASURED, "", budget, "", "", "", "", ""])
+      cells.append([entry.task, entry.status, NOT_MEASURED, "", budget, *[""] * 6])
       continue
     name, steps, *returns = _cells(runs)
     public = [_public(entry.task, float(runs[0]["steps"]), ppo_only) for ppo_only in (True, False)]
-    cells.append([entry.task, entry.status, name, steps, budget, *returns, *public])
+    cells.append([entry.task, entry.status, name, steps, budget, *returns, in_c_mujoco(runs), *public])
   if not any(row[-1] for row in cells):
     return Table(_HEADER, [row[: -len(_PUBLIC)] for row in cells])
   return Table([*_HEADER, *_PUBLIC], cells)
@@ -73,10 +73,25 @@ def _cells(runs: Sequence[Row]) -> list[str]:
 
 def ended(runs: Sequence[Row]) -> str:
   """Returns the fraction of successes, the turns of a cube or the falls an episode, means; "" if no run logged one."""
-  for column, text in (("success", "success {:.2f}"), ("turns", "{:.1f} turns"), ("falls_per_episode", "{:.2f} falls")):
+  return _ended(runs, ("success", "turns", "falls_per_episode"))
+
+
+def _ended(runs: Sequence[Row], columns: Sequence[str]) -> str:
+  """Formats the first of the columns of successes, turns and falls that a run has."""
+  for column, text in zip(columns, ("success {:.2f}", "{:.1f} turns", "{:.2f} falls"), strict=True):
     if values := _returns(runs, column):
       return text.format(fmean(values))
   return ""
+
+
+def in_c_mujoco(runs: Sequence[Row]) -> str:
+  """Returns the mean return and successes or falls an episode in C MuJoCo, in brackets without pushes; "" without."""
+  texts = []
+  for kind in ("c_mujoco_", "c_mujoco_calm_"):
+    if values := _returns(runs, f"{kind}return"):
+      end = _ended(runs, (f"{kind}success", f"{kind}turns", f"{kind}falls"))
+      texts.append(", ".join(filter(None, (short(fmean(values)), end))))
+  return f"{texts[0]} ({texts[1]})" if len(texts) > 1 else "".join(texts)
 
 
 def _returns(runs: Sequence[Row], column: str) -> list[float]:
