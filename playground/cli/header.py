@@ -28,7 +28,8 @@ def _rows(config: RunConfig) -> Iterator[tuple[str, str]]:
   yield "agent", f"tuned set {tuned}" if tuned else "default hyperparameters: no tuned set for this task"
   backend = "jax, or warp on a GPU" if (env.impl, env.cuda_impl) == ("auto", "warp") else env.impl
   yield "hardware", f"{choices.get('hardware')}; physics backend {backend.replace('auto', 'jax')}; seed {config.seed}"
-  if set_here := [text for text in config.overrides if "." in text.partition("=")[0] and not is_hydras(text)]:
+  given = [text.lstrip("+") for text in config.overrides if not is_hydras(text)]  # Hydra's form has ++ before terms
+  if set_here := [text for text in given if "." in text.partition("=")[0]]:
     more = f" and {len(set_here) - _SHOWN} more" if len(set_here) > _SHOWN else ""
     yield "changed", " ".join(set_here[:_SHOWN]) + more
   for key in ("resume", "init_from"):
