@@ -343,6 +343,9 @@ ERRORS = {
   "num_envs=1": ["num_envs does not exist", "Did you mean 'agent.num_envs'?"],
   "lr=1": ["lr does not exist", "Did you mean 'agent.learning_rate'?"],
   "agent.num_steps_per_env=24": ["Did you mean 'agent.unroll_length'?"],
+  "env=T1JoystickFlatTerrain agent.num_steps_per_env=24": [
+    "agent.num_steps_per_env is agent.unroll_length, which does not exist for agent=fast_sac, only for agent=ppo",
+  ],
   "agent.learning_rat=1": ["agent.learning_rat does not exist: agent has", "Did you mean 'agent.learning_rate'?"],
   "agent.network.activatio=relu": ["agent.network has policy_hidden_layer_sizes, ", "'agent.network.activation'?"],
   "agent.network={activatio: relu}": ["agent.network.activatio", "does not exist.", "'agent.network.activation'?"],

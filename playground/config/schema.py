@@ -180,11 +180,12 @@ def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section)
     return UnknownNameError(f"{key} does not exist: {parent} is {what}.")
   if not node:
     return UnknownNameError(f"{key} does not exist: {parent} is empty. Set it whole: {parent}={{{part}: <value>}}.")
-  classes = defined().get(parent, {})
-  if owners := [f"{parent}={name}" for name, cls in classes.items() if part in cls.__dataclass_fields__]:
-    return UnknownNameError(f"{key} does not exist for {parent}={node['name']}, only for {', '.join(owners)}.")
+  classes, meant = defined().get(parent, {}), _MEANT.get(part, part)
+  owners = [f"{parent}={name}" for name, cls in classes.items() if meant in cls.__dataclass_fields__]
+  if owners and meant not in node:
+    own = key if meant == part else f"{key} is {join(parent, meant)}, which"
+    return UnknownNameError(f"{own} does not exist for {parent}={node['name']}, only for {', '.join(owners)}.")
   known = [str(k) for k in node] if parent else [*schema, "robot", *DELTAS]
-  meant = _MEANT.get(part, part)
   near = nearest_in(parent, meant, known)
   if not parent and meant not in known:  # perhaps only the section is missing
     whole = [name for name in _keys(schema) if name.endswith(f".{meant}")]
