@@ -23,7 +23,8 @@ class Walker(PointTask):
   """Has the feet of the tables above."""
 
   def __init__(self, **robot: Any):
-    super().__init__(episode_length=len(TOUCHES))
+    repeat = robot.pop("action_repeat", 1)
+    super().__init__(episode_length=len(TOUCHES) * repeat, action_repeat=repeat)
     self.config = ConfigDict({"robot": {"foot_linvel": ["left", "right"]} | robot})
     names = robot.pop("left_to_right", {"left": "right"})
     self.robot = SimpleNamespace(foot_names=("left_foot", "right_foot"), left_to_right=names)
@@ -61,6 +62,12 @@ def test_the_gait_of_an_episode() -> None:
     "gait/foot_slip": pytest.approx(slip.mean(), rel=1e-5),
     "gait/duty_asymmetry": pytest.approx(3 / 4 - 1 / 4),
   }
+
+
+def test_the_change_of_an_action_that_repeats() -> None:
+  change = np.sqrt((np.diff(ACTIONS, axis=0, prepend=0) ** 2).mean(1)).mean()
+  env = Walker(action_repeat=2, foot_linvel=[], left_to_right={})
+  assert measured(GaitMetrics(env)) == {"gait/action_rate": pytest.approx(change, rel=1e-5)}
 
 
 def test_a_robot_without_sensors_or_a_mirror_has_the_others() -> None:

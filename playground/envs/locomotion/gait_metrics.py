@@ -60,8 +60,10 @@ class GaitMetrics(Wrapper):
     after = self.env.step(state.replace(info=before), action, model)
     c = task.context(task, after.data, before, action)
     touches = c.contact.astype(jnp.float32)
+    change = jnp.sqrt(jnp.square(action - c.last_act).mean())
+    is_repeat = own[_STEPS] % task.action_repeat > 0  # of the same action, which had its change before
     own = {_TOUCHED: own[_TOUCHED] + touches, _STEPS: own[_STEPS] + 1}
-    metrics = {ACTION_RATE: jnp.sqrt(jnp.square(action - c.last_act).mean())}
+    metrics = {ACTION_RATE: jnp.where(is_repeat, state.metrics[ACTION_RATE], change)}
     if self._measures_slip:
       speed = jnp.linalg.norm(c.feet_velocity[:, :2], axis=1)
       metrics[FOOT_SLIP] = (touches * speed).sum() / jnp.maximum(touches.sum(), 1)
