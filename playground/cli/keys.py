@@ -14,7 +14,7 @@ from playground.config.comments import keys_and_comments, meaning
 from playground.config.definitions import chosen_names, definition
 from playground.config.files import find_file, groups, lineage, listed_options
 from playground.config.schema import check_key
-from playground.errors import UnknownNameError
+from playground.errors import UnknownNameError, nearest
 from playground.mdp.options import OPTIONS
 from playground.settings import Plain, Section, Setting
 from playground.text import join
@@ -67,8 +67,10 @@ def _at(prefix: str, values: Section) -> Plain:
   for part in prefix.split("."):
     if not isinstance(node, Mapping) or part not in node:
       check_key(prefix, values)
-      why = "its term is not one of the task's" if isinstance(node, Mapping) else f"a key before {part} holds a value"
-      raise UnknownNameError(f"{prefix} does not exist in this configuration: {why}.")
+      why, near = f"a key before {part} holds a value", ""
+      if isinstance(node, Mapping):
+        why, near = "its term is not one of the task's", nearest(part, node)
+      raise UnknownNameError(f"{prefix} does not exist in this configuration: {why}.{near}")
     node = node[part]
   return node
 

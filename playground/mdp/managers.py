@@ -112,7 +112,7 @@ class ObservationManager(_Manager):
         lookup(entries, name, f"env.observation_order.{group}")
       noisy: list[str] = []
       for name in dict.fromkeys([*first, *entries]):
-        term = _bind_observation(group, name, entries[name], noisy)
+        term = _bind_observation(group, name, entries, noisy)
         noisy += [name] if term.options.noise and "same_as" not in term.options.noise else []
         self.groups.setdefault(group, []).append(term)
     if ACTOR not in self.groups:
@@ -190,16 +190,16 @@ class ObservationManager(_Manager):
     return found
 
 
-def _bind_observation(group: str, name: str, entry: Any, noisy: list[str]) -> Term:
-  """Binds a term; `noisy` are those above it in its group that have noise of their own."""
+def _bind_observation(group: str, name: str, entries: Mapping[str, Any], noisy: list[str]) -> Term:
+  """Binds a term of a group; `noisy` are those above it that have noise of their own."""
   key = f"env.observations.{group}.{name}"
   if group != ACTOR and name == ACTOR:
-    if (given := plain(entry)) != {}:
+    if (given := plain(entries[name])) != {}:
       raise ConfigError(
         f"{key}={format_value(given)} must be {{}}, for all of env.observations.{ACTOR}: give a term another name."
       )
     return Term(name, key, lambda c: None, {}, ObservationOptions())
-  term = bind_one("observations", key, name, entry)
+  term = bind_one("observations", key, name, entries[name], entries)
   if term.options.noise is None:
     return term
   noise = term.options.noise

@@ -22,7 +22,7 @@ import importlib
 import inspect
 import re
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -170,11 +170,11 @@ def bind(kind: str, section: Mapping[str, Any] | None, group: str = "") -> list[
   entries = {name: entry for name, entry in (section or {}).items() if entry is not None}
   prefix = f"env.{kind}.{group}." if group else f"env.{kind}."
   own = [name for name, entry in entries.items() if kind != "events" or not is_model_field(name, entry)]
-  return [bind_one(kind, prefix + name, name, entries[name]) for name in own]
+  return [bind_one(kind, prefix + name, name, entries[name], entries) for name in own]
 
 
-def bind_one(kind: str, key: str, name: str, entry: Any) -> Term:
-  """Binds one term; `key` is its place in the config. See `bind`."""
+def bind_one(kind: str, key: str, name: str, entry: Any, others: Iterable[str] = ()) -> Term:
+  """Binds one term; `key` is its place in the config, `others` are the terms there, to suggest one. See `bind`."""
   if not hasattr(entry, "items"):
     raise ConfigError(f"{key}={entry!r} is no mapping such as {{func: {name}, params: {{}}}}.")
   entry = dict(entry.items())
@@ -183,13 +183,13 @@ def bind_one(kind: str, key: str, name: str, entry: Any) -> Term:
   for field in entry:
     if field not in known:
       raise UnknownNameError(f"{key}.{field} does not exist: a term has {', '.join(known)}.{nearest(field, known)}")
-  for field in options._fields:
-    if field not in options._field_defaults and entry.get(field) is None:
-      raise ConfigError(f"{key}.{field} is missing: every term of env.{kind} has one.")
   given_func = entry.get("func")
   if given_func is not None and not isinstance(given_func, str):
     raise ConfigError(f"{key}.func={format_value(given_func)} must be text: a registered function or module:function.")
-  func = find(kind, given_func or name, key)
+  func = find(kind, given_func or name, key, () if given_func else [other for other in others if other != name])
+  for field in options._fields:
+    if field not in options._field_defaults and entry.get(field) is None:
+      raise ConfigError(f"{key}.{field} is missing: every term of env.{kind} has one.")
   params = check_params(func, entry.get("params") or {}, f"{key}.params", _LEADING[kind])
   hints = typing.get_type_hints(options, include_extras=True)
   values = {field: plain(entry.get(field)) for field in options._fields}
@@ -201,14 +201,17 @@ def bind_one(kind: str, key: str, name: str, entry: Any) -> Term:
   return Term(name, key, func, params, options(**given))
 
 
-def find(kind: str, name: str, key: str) -> Callable[..., Any]:
-  """Returns the registered function or the one that `module:function` names; raises ConfigError if there is none."""
+def find(kind: str, name: str, key: str, others: Iterable[str] = ()) -> Callable[..., Any]:
+  """Returns the registered function or the one that `module:function` names; raises ConfigError if there is none.
+
+  The error suggests a function, or one of `others`.
+  """
   table = registered(kind)
   if name in table:
     return table[name]
   if ":" not in name:
     renamed = renamed_function(kind, name)
-    near = f" Did you mean {renamed!r}?" if renamed else nearest(name, table)
+    near = f" Did you mean {renamed!r}?" if renamed else nearest(name, [*others, *table])
     raise UnknownNameError(
       f"{key}: no function {name!r} is registered for env.{kind}; name one, or write func: module:function.{near}"
     )

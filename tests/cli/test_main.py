@@ -193,6 +193,8 @@ def test_keys_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   assert "Did you mean 'agent'?" in capsys.readouterr().err
   assert command("keys", "env.rewards.foo") == 2
   assert "env.rewards.foo does not exist" in capsys.readouterr().err
+  assert command("keys", "env.commands.velocty", "env=Go1JoystickFlatTerrain") == 2
+  assert "its term is not one of the task's. Did you mean 'velocity'?" in capsys.readouterr().err
   assert command("keys", "env.vision.brightness.0") == 2
   assert "a key before 0 holds a value" in capsys.readouterr().err
 
