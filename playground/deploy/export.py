@@ -11,7 +11,7 @@ from rich.console import Console
 from playground.deploy.contract import Contract
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.trained import export_policy, load_exact, record
-from playground.errors import PlaygroundError
+from playground.errors import ConfigError, PlaygroundError
 from playground.extras import need
 from playground.files import need_folder, replacing, write_text
 
@@ -38,7 +38,8 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
 
   Raises:
     ParityError: the exported policy's actions differ; nothing is written.
-    PlaygroundError: no such run or checkpoint, a policy without an ONNX form, or a folder that is not writable.
+    PlaygroundError: no such run or checkpoint, a policy without an ONNX form, or a folder that is not writable or holds
+      the policy of another task.
   """
   console = console or Console()
   need("deploy", "onnx", "onnxruntime")
@@ -49,6 +50,7 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   if folder is None:
     folder = trained.run_dir.path / "export"
     need_folder(folder, str(folder), trained.run_dir.path)
+  _check_task(folder, trained.task)
   obs, actions, state = record(trained, _ENVS, _DECISIONS)
   exported = export_policy(trained, state)
   error = check_parity(exported, obs, actions)
@@ -63,6 +65,16 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   )
   console.print(f"written to {folder / 'policy.onnx'} and policy.yaml", soft_wrap=True, markup=False)
   return 0
+
+
+def _check_task(folder: Path, task: str) -> None:
+  """Raises ConfigError where a folder holds the policy of another task, which an export would replace."""
+  try:
+    there = yaml.safe_load((folder / "policy.yaml").read_text(encoding="utf-8"))["task"]
+  except (OSError, yaml.YAMLError, ValueError, RecursionError, TypeError, KeyError):  # none, or no contract
+    return
+  if there != task:
+    raise ConfigError(f"{folder} holds a policy of {there}, not of {task}: give another folder, --out=<folder>.")
 
 
 def check_parity(exported: ExportedPolicy, obs: Mapping[str, np.ndarray], actions: np.ndarray) -> float:

@@ -161,6 +161,12 @@ def test_a_damaged_policy_and_one_of_another_task(
     assert command("play", str(tmp_path / "policy.onnx")) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"error: {tmp_path / 'policy.onnx'}: The policy ") and said in line
+  assert command("export", str(run), "--out", str(tmp_path)) == 0, "the same task's, whatever state it is in"
+  told = contract.replace("task: CartpoleBalance\n", "task: CheetahRun\n")
+  (tmp_path / "policy.yaml").write_text(told)
+  assert command("export", str(run), "--out", str(tmp_path)) == 2
+  assert "holds a policy of CheetahRun, not of CartpoleBalance" in capsys.readouterr().err
+  assert (tmp_path / "policy.yaml").read_text() == told
 
 
 def test_files_of_two_exports_are_refused(
