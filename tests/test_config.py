@@ -455,6 +455,12 @@ def test_resume_of_a_folder_of_runs_names_the_newest(tmp_path: Path):
     compose([f"resume={tmp_path}"])
 
 
+def test_resume_of_a_sweep_names_its_command(tmp_path: Path):
+  (tmp_path / "sweep.yaml").touch()
+  with pytest.raises(ConfigError, match=r"is the folder of a sweep: `playground sweep retry \S+` continues it, resume="):
+    compose([f"resume={tmp_path}"])
+
+
 def test_a_key_of_an_empty_mapping_is_set_with_the_mapping():
   with pytest.raises(UnknownNameError, match=r"is empty\. Set it whole: env\.observation_order=\{state: <value>\}\."):
     compose(["env=Go1JoystickFlatTerrain", "env.observation_order.state=[gyro]"])

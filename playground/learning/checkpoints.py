@@ -371,8 +371,9 @@ def find_checkpoints(path: str | Path) -> list[Path]:
     folder = stages[-1] / "checkpoints"
   found = _by_step(folder)
   if not found:
-    if runs := sorted(run.name for run in path.glob("*/") if (run / "checkpoints").is_dir()):
-      raise NoCheckpointError(f"{path} is a folder of runs: name one, such as the newest, {path / runs[-1]}.")
+    folders = [*path.glob("*/"), *path.glob("jobs/*/")]  # `path` may be that of a sweep
+    if runs := sorted(run for run in folders if (run / "checkpoints").is_dir()):
+      raise NoCheckpointError(f"{path} is a folder of runs: name one, such as the newest, {runs[-1]}.")
     raise NoCheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
   return [found[step] for step in sorted(found, reverse=True)]
 

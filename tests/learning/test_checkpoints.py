@@ -477,6 +477,12 @@ def test_find_checkpoints(tmp_path: Path) -> None:
   assert find_checkpoints(expected[1]) == [expected[1]]
 
 
+def test_a_sweeps_folder_holds_runs(tmp_path: Path) -> None:
+  save(tmp_path / "jobs" / "000_seed=1", 10)
+  with pytest.raises(CheckpointError, match=r"is a folder of runs: name one, .* \S+/jobs/000_seed=1\."):
+    find_checkpoints(tmp_path)
+
+
 def test_those_of_a_chain(tmp_path: Path) -> None:
   """They are the last stage's that has any: one that is about to save its first has none."""
   save(tmp_path / "2_near", 20)
