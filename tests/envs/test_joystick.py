@@ -331,6 +331,7 @@ SLIDES_AND_A_BALL = '<joint type="slide"/>' * 3 + '<joint type="ball"/>'  # as m
   ("ours", "theirs", "message"),
   [
     ("<freejoint/>", SLIDES_AND_A_BALL, "needs <freejoint/> as its first joint, in the body trunk"),
+    ("<position name=", '<position gear="2" name=', "the actuator FR_hip has gear=2, and an action is its joint's tar"),
     ("<position name=", '<motor ctrlrange="-1 1" name=', "the actuator FR_hip is no position servo"),
   ],
 )

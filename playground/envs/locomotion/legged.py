@@ -96,11 +96,16 @@ class LeggedTask(Task):
 
 
 def _need_servos(mj_model: mujoco.MjModel, mjcf: str) -> None:
-  """Raises ConfigError where an actuator does not hold a position: an action is a joint's target."""
+  """Raises ConfigError where an actuator does not hold its joint at `ctrl`: an action is a joint's target."""
   for i in range(mj_model.nu):
+    name, gear = mj_model.actuator(i).name or f"number {i}", mj_model.actuator_gear[i, 0]
     if not mj_model.actuator_biasprm[i, 1] < 0:
-      name = mj_model.actuator(i).name or f"number {i}"
       raise ConfigError(
         f"env.robot.mjcf={mjcf}: the actuator {name} is no position servo, and an action is a joint's target: "
         'use <position inheritrange="1">, or a task with its own action_to_ctrl.'
+      )
+    if gear != 1:  # the servo holds gear * angle at `ctrl`
+      raise ConfigError(
+        f"env.robot.mjcf={mjcf}: the actuator {name} has gear={gear:g}, and an action is its joint's target: "
+        "leave gear out, with kp and kv times gear², and forcerange times gear."
       )
