@@ -6,6 +6,7 @@ of a batch one after another on one core, so it is for evaluation, not for train
 
 import copy
 import threading
+from typing import Any
 
 import jax
 import mujoco
@@ -36,6 +37,10 @@ class CPhysics(Physics):
       for name in (*STATE_FIELDS, *derived)
       if (value := getattr(example, name)) is not None
     }
+
+  def __deepcopy__(self, memo: dict[int, Any]) -> "CPhysics":
+    """Returns a simulator of its own, for Python cannot copy a lock."""
+    return CPhysics(copy.deepcopy(self.mj_model, memo), derived=self.derived)
 
   def forward(self, model: mjx.Model, data: PhysicsData) -> PhysicsData:
     return self._call(model, data, 0)

@@ -1,5 +1,7 @@
 """C MuJoCo behind a task: one control step as MJX takes it, batches, and what it refuses."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +53,13 @@ def test_a_batch_is_its_environments_one_after_another() -> None:
     one = env.jitted[1](env.jitted[0](keys[i], {}, {}), actions[i], {}, {})
     np.testing.assert_array_equal(batch.data.qpos[i], one.data.qpos)
     np.testing.assert_array_equal(jnp.asarray(batch.obs)[i], one.obs)
+
+
+def test_a_deep_copy_simulates_alone() -> None:
+  env = on_c("CartpoleBalance")
+  other = copy.deepcopy(env)
+  assert other.physics.mj_model is other.mj_model is not env.mj_model
+  np.testing.assert_array_equal(rolled(other, 2).data.qpos, rolled(env, 2).data.qpos)
 
 
 def test_an_unstable_simulation_shows_its_numbers() -> None:
