@@ -128,6 +128,7 @@ def test_a_changed_task_is_not_pickled():
     ("CartpoleBalance", {"episode_lenth": 1}, r"env\.episode_lenth does not exist.*'env\.episode_length'"),
     ("Go1JoystickFlatTerrain", {"rewards.joint_powr_l1.weight": 1}, "Did you mean 'joint_power_l1'"),
     ("CartpoleBalance", {"ctrl_dt": "slow"}, r"env\.ctrl_dt=slow .* must be a number"),
+    ("CartpoleBalance", {"vision.brightness": {}}, r"^env\.vision\.brightness=\{\}: Cannot merge"),
     ("CartpoleBalance", {"episode_length": 0}, r"env\.episode_length=0 must be a whole number from 1"),
   ],
 )

@@ -65,7 +65,7 @@ from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.learning.hyperparameters import config_class
 from playground.pretrained import locate
 from playground.settings import Plain, Section, build, defaults
-from playground.text import first_line, join
+from playground.text import first_line, format_value, join
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ in a resumed run
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that define the keys, in this order
@@ -151,7 +151,8 @@ def register_options(roots: Sequence[Path] | None = None) -> None:
 def override_section(section: str, default: Section | ConfigDict, overrides: Section) -> dict[str, Plain]:
   """Returns a section, e.g. env, with values replaced by dotted key (`action_scale`), checked as in `compose`."""
   schema = {section: _plain(default)}
-  parsed = [Override(f"{section}.{key}", value, False, "") for key, value in overrides.items()]
+  given = {f"{section}.{key}": value for key, value in overrides.items()}
+  parsed = [Override(key, value, False, f"{key}={format_value(value)}") for key, value in given.items()]
   resolved = _apply(_literal(schema), parsed, schema)
   check_limits(resolved)
   return resolved[section]
