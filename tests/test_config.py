@@ -457,7 +457,7 @@ def test_resume_of_a_folder_of_runs_names_the_newest(tmp_path: Path):
 
 def test_resume_of_a_sweep_names_its_command(tmp_path: Path):
   (tmp_path / "sweep.yaml").touch()
-  with pytest.raises(ConfigError, match=r"is the folder of a sweep: `playground sweep retry \S+` continues it, resume="):
+  with pytest.raises(ConfigError, match=r"folder of a sweep: `playground sweep retry \S+` continues it, resume="):
     compose([f"resume={tmp_path}"])
 
 
