@@ -6,7 +6,6 @@ of a batch one after another on one core, so it is for evaluation, not for train
 
 import copy
 import threading
-from typing import Any
 
 import jax
 import mujoco
@@ -38,7 +37,7 @@ class CPhysics(Physics):
       if (value := getattr(example, name)) is not None
     }
 
-  def __deepcopy__(self, memo: dict[int, Any]) -> "CPhysics":
+  def __deepcopy__(self, memo: dict[int, object]) -> "CPhysics":
     """Returns a simulator of its own, for Python cannot copy a lock."""
     return CPhysics(copy.deepcopy(self.mj_model, memo), derived=self.derived)
 
