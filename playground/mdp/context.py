@@ -72,7 +72,7 @@ class Robot:
 
     Raises:
       UnknownNameError: one matches no joint.
-      ConfigError: one is no regular expression.
+      ConfigError: one is no regular expression, or there is none.
     """
     found: set[int] = set()
     for name in (joints,) if isinstance(joints, str) else joints:
@@ -86,6 +86,8 @@ class Robot:
         no_group = "and is no group of joints in its YAML"
         raise UnknownNameError(f"{key}={name!r} matches no joint of the robot {no_group}.{nearest(name, known)}")
       found |= matches
+    if not found:
+      raise ConfigError(f"{key}=[] must name one joint or more.")
     return np.array(sorted(found))
 
   def check_names(self, params: Mapping[str, Any], key: str) -> None:
