@@ -342,6 +342,7 @@ ERRORS = {
   "learning_rate=1": ["learning_rate does not exist", "Did you mean 'agent.learning_rate'?"],
   "num_envs=1": ["num_envs does not exist", "Did you mean 'agent.num_envs'?"],
   "lr=1": ["lr does not exist", "Did you mean 'agent.learning_rate'?"],
+  "env.cuda_impl=wrap": ["env.cuda_impl=wrap is unknown: choose from jax, warp. Did you mean 'warp'?"],
   "agent.num_steps_per_env=24": ["Did you mean 'agent.unroll_length'?"],
   "env=T1JoystickFlatTerrain agent.num_steps_per_env=24": [
     "agent.num_steps_per_env is agent.unroll_length, which does not exist for agent=fast_sac, only for agent=ppo",

@@ -263,7 +263,10 @@ class Long(Cartpole):
     ("rewards.feet_clearance.params.targt=1", r"takes target\. Did you mean 'target'"),
     ("rewards.feet_clearance.params.target=-1", r"params\.target=-1 must be a number above 0 and at most"),
     ("rewards.joint_deviation_l1={weight: 1, params: {joints: knee}}", "'knee' matches no joint of the robot and is"),
-    ("rewards.joint_deviation_l1={weight: 1, params: {joints: []}}", r"params\.joints=\[\] must name one joint or more"),
+    (
+      "rewards.joint_deviation_l1={weight: 1, params: {joints: []}}",
+      r"params\.joints=\[\] must name one joint or more",
+    ),
     ("rewards.feet_slip_l2.when={command_abve: 1}", r"when\.command_abve does not exist.*'command_above'"),
     ("rewards.mine={func: 'math:sqrt', weight: 1}", r"env\.rewards\.mine\.func=math:sqrt is refused"),
     ("rewards.action_rate_l2.func=3", r"env\.rewards\.action_rate_l2\.func=3 must be text"),

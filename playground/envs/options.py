@@ -41,7 +41,7 @@ class EnvConfig:
   episode_length: Annotated[int, count(1, 2**24), "control steps"] = 1000
   action_repeat: Annotated[int, count(1, 1000), "control steps that take the same action"] = 1
   impl: Annotated[Literal["auto", "jax", "warp"], "physics; auto: cuda_impl on an NVIDIA GPU, else jax"] = "auto"
-  cuda_impl: Annotated[str, "what auto is on an NVIDIA GPU: the faster backend as measured"] = "jax"
+  cuda_impl: Annotated[Literal["jax", "warp"], "what auto is on an NVIDIA GPU: the faster backend as measured"] = "jax"
   naconmax_per_env: Annotated[int, count(0), "Warp: contacts of one environment, on average over the batch"] = 0
   naccdmax_per_env: Annotated[int | None, count(0), "Warp: of these, by convex collision; null: as many"] = None
   njmax: Annotated[int, count(0), "Warp: constraint rows of one environment"] = 0
