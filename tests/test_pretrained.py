@@ -76,6 +76,13 @@ def test_a_copy_is_made_once_and_again_for_another_policy(policies: Path) -> Non
   assert sorted(path.name for path in copied.parent.iterdir()) == [".lock", TASK, f"{TASK}_old"]
 
 
+def test_a_copy_that_is_there_is_only_read(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  """Its folder may be one that cannot be written to."""
+  copied = working_copy(TASK, [TASK])
+  monkeypatch.setattr(pretrained, "locking", None)
+  assert working_copy(TASK, [TASK]) == copied
+
+
 def test_processes_that_start_together_share_a_copy(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   begun, copytree = threading.Barrier(2), shutil.copytree
 

@@ -72,9 +72,11 @@ def working_copy(name: str, tasks: Container[str]) -> str:
   source = Path(locate(name))
   copy = _COPIES / source.name
   try:
+    if _is_copy(copy, source):
+      return str(copy)
     _COPIES.mkdir(parents=True, exist_ok=True)
     with locking(_COPIES / ".lock", _PATIENCE_S):  # else processes that start together move each other's copy away
-      if not copy.is_dir() or (copy / CARD).read_bytes() != (source / CARD).read_bytes():
+      if not _is_copy(copy, source):
         with tempfile.TemporaryDirectory(dir=_COPIES) as scratch:
           shutil.copytree(source, Path(scratch) / source.name)
           if copy.exists():  # with the user's results
@@ -84,6 +86,14 @@ def working_copy(name: str, tasks: Container[str]) -> str:
   except OSError as error:
     raise CheckpointError(f"{copy} cannot be written: {error.strerror}.") from error
   return str(copy)
+
+
+def _is_copy(folder: Path, source: Path) -> bool:
+  """Whether a folder is a copy of this policy; not while another process replaces it."""
+  try:
+    return (folder / CARD).read_bytes() == (source / CARD).read_bytes()
+  except FileNotFoundError:
+    return False
 
 
 def check_task(task: str, saved: Section, today: Section) -> None:
