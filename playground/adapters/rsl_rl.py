@@ -132,9 +132,7 @@ def vec_env(
     UnknownNameError: the task has no such observation group.
   """
   batch = AutoReset(wrap_for_evaluation(env), keep_final_obs=True)
-  groups = dict(groups or group_entries(env))
-  for group, entry in groups.items():
-    lookup(_entries(env), entry, f"groups[{group!r}]")
+  groups = group_entries(env, groups)
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
   randomizer = Randomizer(env.mj_model, events) if events else None
   model = jax.jit(randomizer.sample_batch)(jax.random.split(model_key, num_envs)) if randomizer else {}
@@ -143,18 +141,19 @@ def vec_env(
   return VecEnv(env, state, lambda state, action: step(state, action, model), groups)
 
 
-def group_entries(env: Env) -> dict[str, str]:
-  """Returns the observation groups of the policy and of the critic.
+def group_entries(env: Env, groups: Mapping[str, str] | None = None) -> dict[str, str]:
+  """Returns the task's observation group for each RSL-RL group; the default is those of the policy and of the critic.
 
   Raises:
     ConfigError: the task has images, which the adapter does not pass on.
+    UnknownNameError: the task has no such observation group.
   """
-  entries = _entries(env)
+  sizes = env.observation_size
+  entries = sizes if isinstance(sizes, Mapping) else {"state": sizes}
+  for group, entry in (groups or {}).items():
+    lookup(entries, entry, f"groups[{group!r}]")
+  if groups:
+    return dict(groups)
   if any(entry.startswith(PIXELS) for entry in entries):
     raise ConfigError("RSL-RL gets no images from here: leave env.vision.enable=false.")
   return {"policy": "state", "critic": PRIVILEGED if PRIVILEGED in entries else "state"}
-
-
-def _entries(env: Env) -> dict[str, object]:
-  sizes = env.observation_size
-  return dict(sizes) if isinstance(sizes, Mapping) else {"state": sizes}

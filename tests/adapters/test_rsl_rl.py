@@ -127,12 +127,12 @@ def test_groups_of_go1() -> None:
   assert {name: tuple(group.shape) for name, group in obs.items()} == {"policy": (2, 48), "critic": (2, 123)}
 
 
-@pytest.mark.slow  # compiles a task's physics
 def test_a_group_that_the_task_lacks_is_named() -> None:
   with pytest.raises(UnknownNameError, match=r"groups\['policy'\]: 'stat' is unknown; .* Did you mean 'state'"):
     vec_env(Point(episode_length=LENGTH), NUM_ENVS, groups={"policy": "stat"})
 
 
+@pytest.mark.slow  # compiles a task's physics
 def test_each_environment_has_a_model_of_its_own() -> None:
   params = {"field": "dof_damping", "target": "all", "operation": "set", "range": [0.0, 5.0]}
   events = {"damping": {"mode": "startup", "func": "model_field", "params": params}}
