@@ -65,8 +65,8 @@ def test_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch):
   theirs = [Curve("PPO (some)", "mode", [(10e6, 1.0), (90e6, 5.0)]), Curve("REPPO (x)", "sampled", [(50e6, 4.0)])]
   monkeypatch.setattr(tasks, "public_curves", lambda: {TASK: theirs})
   entry = entries()[TASK]
-  in_c = {"c_mujoco_return": "90", "c_mujoco_falls": "0.25"}
-  runs = [run(100, final_mode_return="110", **in_c), run(300, seed="2", c_mujoco_return="92", c_mujoco_falls="0.5")]
+  in_c = lambda value, falls: {"c_mujoco_return": value, "c_mujoco_falls_per_episode": falls}
+  runs = [run(100, final_mode_return="110", **in_c("90", "0.25")), run(300, seed="2", **in_c("92", "0.5"))]
   (row,) = table([entry], runs).rows
   assert row == [
     *(TASK, entry.status, "ppo", "60", f"{entry.budget / 1e6:.3g}", "2 (2)", "200 ± 1271", "110", "91, 0.38 falls"),

@@ -37,7 +37,7 @@ def table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
       continue
     name, steps, *returns = _cells(runs)
     public = [_public(entry.task, float(runs[0]["steps"]), ppo_only) for ppo_only in (True, False)]
-    cells.append([entry.task, entry.status, name, steps, budget, *returns, in_c_mujoco(runs), *public])
+    cells.append([entry.task, entry.status, name, steps, budget, *returns, _in_c_mujoco(runs), *public])
   if not any(row[-1] for row in cells):
     return Table(_HEADER, [row[: -len(_PUBLIC)] for row in cells])
   return Table([*_HEADER, *_PUBLIC], cells)
@@ -71,26 +71,20 @@ def _cells(runs: Sequence[Row]) -> list[str]:
   return [run_name(runs[0]), millions(float(runs[0]["steps"])), count, sampled, mode]
 
 
-def ended(runs: Sequence[Row]) -> str:
+def ended(runs: Sequence[Row], prefix: str = "") -> str:
   """Returns the fraction of successes, the turns of a cube or the falls an episode, means; "" if no run logged one."""
-  return _ended(runs, ("success", "turns", "falls_per_episode"))
-
-
-def _ended(runs: Sequence[Row], columns: Sequence[str]) -> str:
-  """Formats the first of the columns of successes, turns and falls that a run has."""
-  for column, text in zip(columns, ("success {:.2f}", "{:.1f} turns", "{:.2f} falls"), strict=True):
-    if values := _returns(runs, column):
+  for column, text in (("success", "success {:.2f}"), ("turns", "{:.1f} turns"), ("falls_per_episode", "{:.2f} falls")):
+    if values := _returns(runs, prefix + column):
       return text.format(fmean(values))
   return ""
 
 
-def in_c_mujoco(runs: Sequence[Row]) -> str:
-  """Returns the mean return and successes or falls an episode in C MuJoCo, in brackets without pushes; "" without."""
+def _in_c_mujoco(runs: Sequence[Row]) -> str:
+  """Returns the mean return and how episodes ended in C MuJoCo, in brackets without pushes; "" if no run was played."""
   texts = []
-  for kind in ("c_mujoco_", "c_mujoco_calm_"):
-    if values := _returns(runs, f"{kind}return"):
-      end = _ended(runs, (f"{kind}success", f"{kind}turns", f"{kind}falls"))
-      texts.append(", ".join(filter(None, (short(fmean(values)), end))))
+  for prefix in ("c_mujoco_", "c_mujoco_calm_"):
+    if values := _returns(runs, f"{prefix}return"):
+      texts.append(", ".join(filter(None, (short(fmean(values)), ended(runs, prefix)))))
   return f"{texts[0]} ({texts[1]})" if len(texts) > 1 else "".join(texts)
 
 
