@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import yaml
 
 from playground.config import format_value
 from playground.deploy.graph import OUTPUT, input_names
@@ -86,6 +88,15 @@ def describe_policy(
     "env": env_config,
   }
   return plain(contract)
+
+
+def read_contract(file: Path) -> Contract | None:
+  """Returns the mapping in a YAML file, unchecked; None if there is none. Raises OSError if it cannot be read."""
+  try:
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+  except (yaml.YAMLError, ValueError, RecursionError):  # such as an invalid date
+    return None
+  return content if isinstance(content, dict) else None
 
 
 def check_contract(contract: Contract) -> None:

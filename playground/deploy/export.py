@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 from rich.console import Console
 
-from playground.deploy.contract import Contract
+from playground.deploy.contract import Contract, read_contract
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.trained import export_policy, load_exact, record
 from playground.errors import ConfigError, PlaygroundError
@@ -70,11 +70,11 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
 def _check_task(folder: Path, task: str) -> None:
   """Raises ConfigError where a folder holds the policy of another task, which an export would replace."""
   try:
-    there = yaml.safe_load((folder / "policy.yaml").read_text(encoding="utf-8"))["task"]
-  except (OSError, yaml.YAMLError, ValueError, RecursionError, TypeError, KeyError):  # none, or no contract
+    there = read_contract(folder / "policy.yaml") or {}
+  except OSError:  # none
     return
-  if there != task:
-    raise ConfigError(f"{folder} holds a policy of {there}, not of {task}: give another folder, --out=<folder>.")
+  if (other := there.get("task", task)) != task:
+    raise ConfigError(f"{folder} holds a policy of {other}, not of {task}: give another folder, --out=<folder>.")
 
 
 def check_parity(exported: ExportedPolicy, obs: Mapping[str, np.ndarray], actions: np.ndarray) -> float:

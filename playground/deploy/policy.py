@@ -8,9 +8,8 @@ from typing import Protocol
 
 import jax
 import numpy as np
-import yaml
 
-from playground.deploy.contract import FORMAT, Contract, check_contract
+from playground.deploy.contract import FORMAT, Contract, check_contract, read_contract
 from playground.envs.base import Observation
 from playground.errors import CheckpointError
 from playground.extras import need
@@ -74,11 +73,8 @@ class ExportedPolicy:
       if not file.is_file():
         raise CheckpointError(f"{file} does not exist: `playground export <run>` writes a policy and its contract.")
     model = path.read_bytes()  # before its contract, which is written first: this detects a concurrent export
-    try:
-      contract = yaml.safe_load(path.with_suffix(".yaml").read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError):  # such as an invalid date
-      contract = None
-    if not isinstance(contract, dict) or contract.get("format") != FORMAT:
+    contract = read_contract(path.with_suffix(".yaml"))
+    if contract is None or contract.get("format") != FORMAT:
       raise CheckpointError(f"{path.with_suffix('.yaml')} is not a policy's contract ({FORMAT}): export the run again.")
     try:
       check_contract(contract)
