@@ -409,11 +409,12 @@ def _check_path(key: str, value: object) -> None:
   path = Path(os.path.expanduser(str(value)))
   wanted, what = (path / "config.yaml", "run directory") if key == "resume" else (path, "run directory or checkpoint")
   if not os.path.lexists(wanted):  # `find_checkpoints` reports a broken link
-    if key == "resume" and (path / "sweep.yaml").is_file():
-      how = f"`playground sweep retry {value}` continues it, resume={path / 'jobs' / '<job>'} one of its runs"
-      raise ConfigError(f"resume={value} is the folder of a sweep: {how}.")
-    if key == "resume" and (runs := sorted(run for run in path.glob("*/") if (run / "config.yaml").is_file())):
-      raise ConfigError(f"resume={value} is a folder of runs: name one, such as the newest, resume={runs[-1]}.")
+    if key == "resume":
+      if (path / "sweep.yaml").is_file():
+        how = f"`playground sweep retry {value}` continues it, resume={path / 'jobs' / '<job>'} one of its runs"
+        raise ConfigError(f"resume={value} is the folder of a sweep: {how}.")
+      if runs := sorted(run for run in path.glob("*/") if (run / "config.yaml").is_file()):
+        raise ConfigError(f"resume={value} is a folder of runs: name one, such as the newest, resume={runs[-1]}.")
     siblings = [p.name for p in path.parent.glob("*/") if p.name != path.name]
     raise ConfigError(f"{key}={value} is no {what}: {wanted} does not exist.{nearest(path.name, siblings)}")
 
