@@ -75,8 +75,8 @@ def test_env_and_agent_alone_pick_the_tuned_set():
   [
     ("env=HumanoidWalk", None),
     ("experiment=humanoid_run", None),
-    ("experiment=g1_joystick", "fast_sac/biped_joystick"),
-    ("env=T1JoystickRoughTerrain", "fast_sac/biped_joystick"),
+    ("experiment=g1_joystick", "fast_sac/G1JoystickFlatTerrain"),
+    ("env=T1JoystickRoughTerrain", "fast_sac/T1JoystickFlatTerrain"),
   ],
 )
 def test_a_task_chooses_the_agent_that_learns_it_best(chosen: str, tuned: str | None):
