@@ -223,6 +223,9 @@ class PPOConfig(OnPolicyConfig):
   ] = None
   entropy_cost: Annotated[float, at_least_0(), "factor on the entropy bonus"] = 1e-2
   clipping_epsilon: Annotated[float, positive(), "clip range of the ratio of probabilities"] = 0.3
+  dual_clip: Annotated[
+    float | None, positive(), "largest ratio of probabilities that a negative advantage counts with; null: any"
+  ] = None
   clipping_epsilon_value: Annotated[
     float | None, positive(), "clip range of the value loss; null: it is not clipped"
   ] = None
@@ -272,6 +275,10 @@ class PPOConfig(OnPolicyConfig):
       raise ConfigError(
         f"agent.num_envs={self.num_envs} does not divide {product} = {self.batch_size * self.num_minibatches}: choose "
         "sizes so that every environment gives the same number of trajectories."
+      )
+    if self.dual_clip is not None and self.dual_clip <= 1 + self.clipping_epsilon:
+      raise ConfigError(
+        f"agent.dual_clip={self.dual_clip:g} must be above 1 + agent.clipping_epsilon = {1 + self.clipping_epsilon:g}."
       )
     low, high = self.min_learning_rate, self.max_learning_rate
     if self.desired_kl is not None and not low <= self.learning_rate <= high:

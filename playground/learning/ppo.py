@@ -252,13 +252,16 @@ def ppo_loss(
   if (limit := config.clip_advantages) is not None:
     advantages = jnp.clip(advantages, -limit, limit)
 
-  def surrogate_loss(ratio: jax.Array) -> jax.Array:
+  def surrogate_loss(log_ratio: jax.Array) -> jax.Array:
+    if config.dual_clip is not None:  # else the gradient of a negative advantage grows with the ratio, without limit
+      log_ratio = jnp.minimum(log_ratio, jnp.log(config.dual_clip))
+    ratio = jnp.exp(log_ratio)
     clipped_ratio = jnp.clip(ratio, 1 - config.clipping_epsilon, 1 + config.clipping_epsilon)
     return -jnp.minimum(ratio * advantages, clipped_ratio * advantages).mean()
 
   log_ratio = networks.distribution.log_prob(logits, batch.raw_action) - batch.log_prob
   ratio = jnp.exp(log_ratio)
-  policy_loss = surrogate_loss(ratio)
+  policy_loss = surrogate_loss(log_ratio)
 
   def squared(error: jax.Array) -> jax.Array:
     error = error if value_scale is None else error / value_scale
@@ -278,7 +281,7 @@ def ppo_loss(
     assert batch.mirrored_action is not None
     mirrored_logits = networks.logits(params.policy, batch.mirrored_obs)
     mirrored_log_prob = networks.distribution.log_prob(mirrored_logits, batch.mirrored_action)
-    policy_loss = (policy_loss + surrogate_loss(jnp.exp(mirrored_log_prob - batch.log_prob))) / 2
+    policy_loss = (policy_loss + surrogate_loss(mirrored_log_prob - batch.log_prob)) / 2
     value_loss = (value_loss + critic_loss(networks.value(params.value, batch.mirrored_obs))) / 2
 
   entropy = networks.distribution.entropy(logits, key).mean()

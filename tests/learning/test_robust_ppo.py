@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.sharding import PartitionSpec as P
 
@@ -19,6 +20,7 @@ from tests.learning.test_trainer import run
 ROBUST = dataclasses.replace(
   SMALL_PPO, targets="epoch", clip_advantages=5.0, normalize_value_targets=True, value_huber_delta=1.0,
   desired_kl=0.01, max_learning_rate=1e-2, max_kl=0.1, bootstrap_on_timeout=True, max_grad_norm=1.0,
+  dual_clip=3.0,
 )  # fmt: skip
 
 
@@ -116,6 +118,29 @@ def test_advantages_are_clipped(networks: ActorCritic) -> None:
   )[1]["policy_loss"]  # fmt: skip
   assert float(loss(advantages, clip_advantages=1.0)) == pytest.approx(float(loss(jnp.clip(advantages, -1, 1))))
   assert float(loss(advantages, clip_advantages=1.0)) != pytest.approx(float(loss(advantages)))
+
+
+def test_a_far_ratio_counts_no_more_with_dual_clip(networks: ActorCritic) -> None:
+  """A ratio of e^30 with a negative advantage has that much of the gradient, and one of e^100 is not finite."""
+  params, data = networks.init(jax.random.PRNGKey(0)), batch(networks)
+  now = networks.distribution.log_prob(networks.logits(params.policy, data.obs), data.raw_action)
+
+  def gradient(far: float, advantage: float = -1.0, dual_clip: float | None = None) -> float:
+    """Norm of the policy's gradient on a batch whose first sample was `far` less likely when it was drawn."""
+    advantages = jnp.ones((6, 4)).at[0, 0].set(advantage)
+    known = data.replace(targets=advantages, advantages=advantages, log_prob=now.at[0, 0].add(-far))
+    config = dataclasses.replace(SMALL_PPO, dual_clip=dual_clip)
+    loss = lambda policy: ppo_loss(
+      params.replace(policy=policy), known, jax.random.PRNGKey(1), networks, config
+    )[1]["policy_loss"]  # fmt: skip
+    return float(optax.global_norm(jax.grad(loss)(params.policy)))
+
+  assert gradient(30.0) > 1e9 * gradient(0.0)
+  assert not np.isfinite(gradient(100.0))
+  assert gradient(100.0, dual_clip=3.0) == gradient(30.0, dual_clip=3.0) == pytest.approx(gradient(0.0), rel=2)
+  near = 0.05  # of the ratio below the limit, and of a positive advantage, the gradient is the same
+  assert gradient(near, dual_clip=3.0) == gradient(near)
+  assert gradient(30.0, advantage=1.0, dual_clip=3.0) == gradient(30.0, advantage=1.0)
 
 
 def test_the_mirror_image_counts_as_much_as_what_was_experienced(networks: ActorCritic) -> None:
