@@ -162,6 +162,7 @@ def run_name(row: dict[str, str]) -> str:
     + chain
     + (f", from {start.group(1)}" if start else "")
     + ", mirrored data" * ("agent.mirror_augmentation=true" in setting)
+    + ", without mirrored data" * ("agent.mirror_augmentation=false" in setting)
     + ", no pushes, nothing randomised" * (_NO_PUSHES in setting)
   )
 

@@ -43,7 +43,7 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   """Exports a run's newest policy, measures it in C MuJoCo and copies it, with its card, into the package.
 
   Args:
-    path: a run directory.
+    path: a run directory, or that of a chain.
     note: a remark on the training for the card, such as that the run was stopped early.
     replace: whether the policy of the same task is replaced.
 
@@ -55,7 +55,7 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
     ConfigError: the run has not been evaluated, its task is not one of `playground list`, the package has a policy of
       it, or a folder cannot be written.
   """
-  newest = find_checkpoints(path)[0]  # of a chain, that of its last stage
+  started, newest = RunDirectory.open(path), find_checkpoints(path)[0]  # of a chain, that of its last stage
   run, steps = RunDirectory.open(newest.parents[1]), int(newest.name)
   path = str(run.path)
   for name in ("overrides.yaml", "manifest.json", "metrics.csv"):
@@ -90,7 +90,7 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
     "status": _status(scores),
     "steps": steps,
     "seed": config["seed"],
-    "command": " ".join(["playground-run", *(o for o in run.overrides if not o.startswith("run_dir="))]),
+    "command": " ".join(["playground-run", *(o for o in started.overrides if not o.startswith("run_dir="))]),
     "commit": git.get("commit"),
     "versions": {name: manifest["versions"][name] for name in ("jax", "mujoco", "mujoco-mjx", "warp-lang")},
     "device": manifest["device"],
