@@ -143,7 +143,9 @@ class FastSAC(OffPolicy[FastSACConfig, FastSACNetworks]):
       actor, actor_opt, norm, good_actor, actor_loss = jax.lax.cond(turn, move, stay, actor, actor_opt)
       target += config.tau * (critic - target)
       finite = good & good_alpha & good_actor
-      log = jnp.stack([loss, actor_loss, mean, edge, -next_log_prob.mean(), alpha, critic_norm, norm])
+      # The actor's values are 0 where it stays: n times those of every n-th update have the right mean.
+      n = config.policy_frequency
+      log = jnp.stack([loss, n * actor_loss, mean, edge, -next_log_prob.mean(), alpha, critic_norm, n * norm])
       carry = (actor, critic, log_alpha, target, (actor_opt, critic_opt, alpha_opt))
       return carry, jnp.append(jnp.where(finite, log, 0.0), 1.0 - finite)
 
@@ -151,7 +153,7 @@ class FastSAC(OffPolicy[FastSACConfig, FastSACNetworks]):
     carry, log = jax.lax.scan(update, carry, (batches, jax.random.split(key, count), jnp.arange(count)))
     actor, critic, log_alpha, target, opt_state = carry
     learned = FastSACParams(unravel_actor(actor), unravel_critic(critic), log_alpha[0])
-    return (learned, unravel_critic(target), opt_state), log.mean(axis=0)  # also of steps without an actor update
+    return (learned, unravel_critic(target), opt_state), log.mean(axis=0)
 
 
 def critic_loss(

@@ -108,14 +108,16 @@ class FastTD3(OffPolicy[FastTD3Config, FastTD3Networks]):
       actor, actor_opt, norm, good_too, actor_loss = jax.lax.cond(turn, move, stay, actor, actor_opt)
       target += config.tau * (critic - target)
       finite = good & good_too
-      log = jnp.where(finite, jnp.stack([loss, actor_loss, mean, edge, critic_norm, norm]), 0.0)
+      # The actor's values are 0 where it stays: n times those of every n-th update have the right mean.
+      n = config.policy_frequency
+      log = jnp.where(finite, jnp.stack([loss, n * actor_loss, mean, edge, critic_norm, n * norm]), 0.0)
       return (actor, critic, target, (actor_opt, critic_opt)), jnp.append(log, 1.0 - finite)
 
     carry = (actor, critic, ravel_pytree(target_q)[0], opt_state)
     carry, log = jax.lax.scan(update, carry, (batches, jax.random.split(key, count), jnp.arange(count)))
     actor, critic, target, opt_state = carry
     learned = FastTD3Params(unravel_actor(actor), unravel_critic(critic))
-    return (learned, unravel_critic(target), opt_state), log.mean(axis=0)  # also of steps without an actor update
+    return (learned, unravel_critic(target), opt_state), log.mean(axis=0)
 
 
 def critic_loss(

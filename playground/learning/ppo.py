@@ -170,7 +170,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
       return (*learned, stopped), (log, runs)
 
     epochs = jax.random.split(update_key, config.num_updates_per_batch)
-    (flat, opt_state, stopped), (log, runs) = jax.lax.scan(epoch, (flat, state.opt_state, jnp.array(False)), epochs)
+    (flat, opt_state, _), (log, runs) = jax.lax.scan(epoch, (flat, state.opt_state, jnp.array(False)), epochs)
     params = unravel(flat)
 
     names = (*self.losses, "grad_norm", "nonfinite_updates")
@@ -186,7 +186,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     if config.desired_kl is not None:
       metrics["learning_rate"] = opt_state[1].hyperparams["learning_rate"]
     if config.max_kl is not None:
-      metrics["stopped_early"] = stopped.astype(jnp.float32)
+      metrics["stopped_early"] = 1.0 - runs.all()
     normalizer = state.normalizer if normalizer is None else normalizer
     learned = {"params": params, "opt_state": opt_state, "targets_seen": seen}
     return state.replace(**learned, normalizer=normalizer), envs, metrics

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.scipy.stats import norm
 from jax.sharding import PartitionSpec as P
@@ -117,6 +118,13 @@ def test_critics_and_temperature_move_in_each_update_and_the_actor_in_every_nth(
   (learned, target, (actor, critic, alpha)), log = learn(start, batches, jax.random.PRNGKey(0), np.int32(0))
   assert [int(part[0].count) for part in (actor, critic, alpha)] == [2, 8, 8]
   assert np.isfinite(log).all() and log[-1] == 0
+  slope = jax.grad(policy_loss)(
+    params.policy, params.q, 0.001, batch(algorithm.networks), jax.random.PRNGKey(0), algorithm.networks
+  )
+  logged = dict(zip(algorithm.logged, log, strict=False))
+  assert logged["grad_norm"] == pytest.approx(float(optax.global_norm(slope)), rel=0.4), (
+    "a mean over the actor's updates"
+  )
   assert float(jnp.abs(learned.log_alpha - params.log_alpha)) <= 8 * config.alpha_learning_rate * 1.01
   for now, before, slow in zip(*map(jax.tree.leaves, (learned.q, params.q, target)), strict=True):
     assert 0 < jnp.abs(slow - before).max() < jnp.abs(now - before).max()

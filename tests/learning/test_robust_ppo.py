@@ -203,6 +203,12 @@ def test_an_epoch_that_goes_too_far_is_the_last() -> None:
   assert not same(*first), "with room all three epochs count"
 
 
+def test_an_update_that_goes_too_far_in_its_last_epoch_is_not_cut_short() -> None:
+  trainer = point_trainer(dataclasses.replace(SMALL_PPO, num_updates_per_batch=1, learning_rate=0.05, max_kl=1e-6))
+  _, log = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings), {}, np.int32(1))
+  assert float(log["gradient_steps"]) == SMALL_PPO.num_minibatches and float(log["stopped_early"]) == 0
+
+
 def test_all_of_them_learn_and_resume_bit_for_bit() -> None:
   whole, first, second = Recorder(), Recorder(stop_after=2), Recorder()
   expected, _ = run(ROBUST, whole, updates=60)
