@@ -113,6 +113,10 @@ class Algorithm(abc.ABC, Generic[ConfigT, NetworksT, StateT]):
 AnyAlgorithm = Algorithm[AgentConfig, Actor, AlgorithmState]
 
 
+class TracedSetting:
+  """Stands in an algorithm's constructor for a number of `traced`, whose value only `init` and `train_step` know."""
+
+
 def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None) -> AnyAlgorithm:
   """Imports and builds the algorithm of a config.
 
@@ -122,7 +126,11 @@ def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None
   check(config, "agent")
   module, _, name = config.algorithm.partition(":")
   make: Callable[..., AnyAlgorithm] = getattr(importlib.import_module(module), name)
-  return make(env, config, network_precision)
+  # A number that the constructor reads would be a constant, the same for all agents of the program.
+  unknown = dict.fromkeys(config.traced, TracedSetting())
+  algorithm = make(env, dataclasses.replace(config, **unknown), network_precision)
+  algorithm.config = config
+  return algorithm
 
 
 def with_settings(algorithm: AnyAlgorithm, values: Mapping[str, jax.Array]) -> AnyAlgorithm:

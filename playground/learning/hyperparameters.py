@@ -39,7 +39,7 @@ class AgentConfig:
   Attributes:
     algorithm: the class of the algorithm, `module:name`.
     traced: numbers that are arguments of the compiled program, not constants: another value needs no compilation, and
-      agents of one program may differ in them. No Python branch may depend on one.
+      agents of one program may differ in them. No Python branch may depend on one, and a constructor cannot read it.
     schedule: keys of how often the compiled functions are called, which none of the functions reads: another value
       needs no compilation.
   """
@@ -236,9 +236,9 @@ class PPOConfig(OnPolicyConfig):
   targets: Annotated[
     Literal["minibatch", "epoch"], "when targets and advantages are computed; advantages are then normalised"
   ] = "minibatch"
-  clip_advantages: Annotated[float | None, positive(), "largest normalised advantage; null: they are not clipped"] = (
-    None
-  )
+  clip_advantages: Annotated[
+    float | None, positive(), "largest advantage, after any normalisation; null: they are not clipped"
+  ] = None
   normalize_value_targets: Annotated[
     bool, "whether errors of the critic are divided by the running standard deviation of its targets"
   ] = False

@@ -19,7 +19,9 @@ from playground.envs.wrappers import PRESERVE_INFO
 from playground.hardware.mesh import make_mesh
 from playground.learning.algorithm import Algorithm, other_acts
 from playground.learning.evaluation import make_evaluator
+from playground.learning.hyperparameters import PPOConfig
 from playground.learning.loop import CompiledFunctions, Loop, compile_program, schedule
+from playground.learning.ppo import PPO
 from playground.learning.trainer import Trainer, trainer_settings
 from playground.mdp.context import StepContext
 from playground.mdp.managers import RewardManager
@@ -204,6 +206,23 @@ class Weighted(PointTask):
   def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     state, c = super().post_step(data, info, action), StepContext(cast(Any, self), data, info, action)
     return state.replace(reward=sum(self.rewards.compute(c).values(), state.reward))
+
+
+class Constant(PPO):
+  """Reads an argument of the program where it would be a constant."""
+
+  def __init__(self, env: Any, config: PPOConfig, network_precision: str | None = None):
+    super().__init__(env, config, network_precision)
+    self.rate = 2 * config.learning_rate
+
+
+class ConstantConfig(PPOConfig):
+  algorithm = "tests.learning.test_trainer:Constant"
+
+
+def test_a_constructor_cannot_read_an_argument_of_the_program() -> None:
+  with pytest.raises(TypeError, match="TracedSetting"):
+    point_trainer(ConstantConfig())
 
 
 @algorithms("ppo")

@@ -18,7 +18,10 @@ class Reinforce(Algorithm[ReinforceConfig, ActorCritic, AlgorithmState]):
 
   def __init__(self, env: Env, config: ReinforceConfig, network_precision: str | None = None):
     super().__init__(config, ActorCritic(env.observation_size, env.action_size, config.network, network_precision))
-    self.optimizer = optax.adam(config.learning_rate)
+
+  @property
+  def optimizer(self) -> optax.GradientTransformation:
+    return optax.adam(self.config.learning_rate)
 
   def init(self, key: jax.Array, policy: Policy | None) -> AlgorithmState:
     policy = policy or self.new_policy(key)

@@ -12,6 +12,7 @@ class ReinforceConfig(AgentConfig):
   """Hyperparameters of REINFORCE."""
 
   algorithm = "reinforce.algorithm:Reinforce"
+  traced = ("learning_rate", "discounting")
 
   unroll_length: Annotated[int, count(1, 100_000), "policy steps of a trajectory"] = 50
   learning_rate: Annotated[float, positive(1), "of Adam"] = 1e-3
