@@ -250,9 +250,9 @@ class PPOConfig(OnPolicyConfig):
   ] = None
   min_learning_rate: Annotated[float, positive(1), "of the adapted learning rate"] = 1e-5
   max_learning_rate: Annotated[float, positive(1), "of the adapted learning rate"] = 1e-2
-  max_kl: Annotated[float | None, positive(), "KL divergence of an epoch after which no other follows; null: any"] = (
-    None
-  )
+  max_kl: Annotated[
+    float | None, positive(), "mean KL divergence of an epoch after which no other follows; null: any"
+  ] = None
   normalize_advantage: Annotated[bool, "whether advantages are normalised in each minibatch"] = True
   bootstrap_on_timeout: Annotated[
     bool, "whether a time-out adds the discounted value of its state; else it is masked out"
