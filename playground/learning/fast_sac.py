@@ -75,12 +75,6 @@ class FastSACNetworks(C51Networks):
     log_alpha = jnp.log(jnp.float32(self._initial_temperature))
     return FastSACParams(self.init_policy(policy), self.init_q(q), log_alpha)
 
-  def sample(self, policy: PyTree, obs: dict[str, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Samples actions, [..., action_size], and their log-probabilities, [...]; gradients flow through the actions."""
-    logits = self.logits(policy, obs)
-    raw = self.distribution.sample_no_postprocessing(logits, key)
-    return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
-
 
 class FastSAC(OffPolicy[FastSACConfig, FastSACNetworks]):
   """FastSAC for one task."""
@@ -121,7 +115,7 @@ class FastSAC(OffPolicy[FastSACConfig, FastSACNetworks]):
       batch, key, i = x
       next_key, actor_key = jax.random.split(key)
 
-      next_action, next_log_prob = networks.sample(unravel_actor(actor), batch.next_obs, next_key)
+      next_action, next_log_prob = networks.sample(networks.logits(unravel_actor(actor), batch.next_obs), next_key)
       grads, (loss, mean, edge) = jax.grad(critic_loss, has_aux=True)(
         *(unravel_critic(critic), unravel_critic(target)),
         *(batch, next_action, next_log_prob, jnp.exp(log_alpha[0]), networks, config),
@@ -193,6 +187,6 @@ def policy_loss(
   policy: PyTree, q_params: PyTree, alpha: jax.Array, batch: Transition, key: jax.Array, networks: FastSACNetworks
 ) -> jax.Array:
   """Mean of the temperature times the log-probability of a sampled action, minus its value by both critics."""
-  action, log_prob = networks.sample(policy, batch.obs, key)
+  action, log_prob = networks.sample(networks.logits(policy, batch.obs), key)
   values = networks.atoms.mean(jax.nn.softmax(networks.q(q_params, batch.obs, action)))
   return (alpha * log_prob - values.mean(axis=0)).mean()

@@ -177,6 +177,11 @@ class Actor:
     logits = self.logits(policy, normalize(self.select(obs), normalizer))
     return self.distribution.mode(logits) if deterministic else self.distribution.sample(logits, key)
 
+  def sample(self, logits: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Samples actions, [..., action_size], and their log-probabilities, [...]; gradients flow through the actions."""
+    raw_action = self.distribution.sample_no_postprocessing(logits, key)
+    return self.distribution.postprocess(raw_action), self.distribution.log_prob(logits, raw_action)
+
   def kl(self, old: jax.Array, new: jax.Array) -> jax.Array:
     """KL(old || new), [...], of the Gaussians before squashing, which is that of the actions."""
     before, after = self.distribution.create_dist(old), self.distribution.create_dist(new)
@@ -328,12 +333,6 @@ class SoftActorCritic(Actor):
     if not self.batched:
       return tuple(self.q(*evaluation) for evaluation in evaluations)
     return tuple(jax.vmap(self.q)(*jax.tree.map(lambda *x: jnp.stack(x), *evaluations)))
-
-  def sample(self, logits: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Samples actions in [-1, 1] and their log-probabilities, [...]; `noise` is standard normal, [..., action_size]."""
-    normal = self.distribution.create_dist(logits)
-    raw_action = normal.loc + normal.scale * noise
-    return self.distribution.postprocess(raw_action), self.distribution.log_prob(logits, raw_action)
 
 
 def refuse_images(obs_size: ObservationSize, agent: str) -> None:

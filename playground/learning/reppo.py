@@ -146,12 +146,6 @@ class REPPONetworks(Actor):
     with self.at_precision():
       return self._critic.apply(q_params, obs[self.value_obs_key], action)  # pyright: ignore[reportReturnType]
 
-  def sample(self, logits: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Samples actions, [..., action_size], and their log-probabilities, [...]; gradients flow through the actions."""
-    normal = self.distribution.create_dist(logits)
-    raw = normal.loc + normal.scale * jax.random.normal(key, normal.loc.shape)
-    return self.distribution.postprocess(raw), self.distribution.log_prob(logits, raw)
-
 
 class REPPO(Algorithm[REPPOConfig, REPPONetworks, AlgorithmState]):
   """REPPO for one task."""

@@ -98,7 +98,10 @@ def sac_loss(
 
   both = jax.tree.map(lambda *x: jnp.stack(x), batch.obs, batch.next_obs)
   logits = networks.logits(params.policy, both)
-  (action, next_action), (log_prob, next_log_prob) = networks.sample(logits, noise)
+  normal = networks.distribution.create_dist(logits)
+  raw_action = normal.loc + normal.scale * noise
+  action, next_action = networks.distribution.postprocess(raw_action)
+  log_prob, next_log_prob = networks.distribution.log_prob(logits, raw_action)
 
   # The critics on the action taken, the target critics on the next one, and the critics on what the actor would do.
   q, next_q, actor_q = networks.q_each(

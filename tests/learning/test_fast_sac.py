@@ -71,7 +71,7 @@ def test_log_probabilities_are_those_of_the_squashed_actions() -> None:
 def test_each_critic_learns_soft_values_from_its_own_target(networks: FastSACNetworks) -> None:
   data = batch(networks, discount=jnp.tile(jnp.array([0.0, 1.0]), 8))
   params, target = (jax.jit(networks.init)(jax.random.PRNGKey(seed)) for seed in (0, 9))
-  action, log_prob = jax.jit(networks.sample)(params.policy, data.next_obs, jax.random.PRNGKey(1))
+  action, log_prob = jax.jit(networks.sample)(networks.logits(params.policy, data.next_obs), jax.random.PRNGKey(1))
   alpha = 0.2
   following = np.asarray(jax.nn.softmax(networks.q(target.q, data.next_obs, action)), np.float64)
   log = np.asarray(jax.nn.log_softmax(networks.q(params.q, data.obs, data.action)), np.float64)
@@ -98,7 +98,7 @@ def test_the_temperature_follows_the_entropy() -> None:
 
 def test_the_actor_climbs_the_mean_of_both_critics_and_keeps_its_entropy(networks: FastSACNetworks) -> None:
   params, data, key = jax.jit(networks.init)(jax.random.PRNGKey(0)), batch(networks), jax.random.PRNGKey(1)
-  action, log_prob = jax.jit(networks.sample)(params.policy, data.obs, key)
+  action, log_prob = jax.jit(networks.sample)(networks.logits(params.policy, data.obs), key)
   values = networks.atoms.mean(jax.nn.softmax(jax.jit(networks.q)(params.q, data.obs, action)))
   loss = jax.jit(lambda policy, alpha: policy_loss(policy, params.q, alpha, data, key, networks))
   expected = float((0.5 * log_prob - values.mean(axis=0)).mean())
