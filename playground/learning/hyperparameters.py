@@ -251,7 +251,7 @@ class PPOConfig(OnPolicyConfig):
   min_learning_rate: Annotated[float, positive(1), "of the adapted learning rate"] = 1e-5
   max_learning_rate: Annotated[float, positive(1), "of the adapted learning rate"] = 1e-2
   max_kl: Annotated[
-    float | None, positive(), "mean KL divergence of an epoch after which no other follows; null: any"
+    float | None, positive(), "KL divergence of a minibatch from which on an update makes no gradient step; null: any"
   ] = None
   normalize_advantage: Annotated[bool, "whether advantages are normalised in each minibatch"] = True
   bootstrap_on_timeout: Annotated[

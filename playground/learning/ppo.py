@@ -143,40 +143,38 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     # Learn: several epochs, each over its own shuffle of the trajectories.
     flat, unravel = ravel_pytree(state.params)
 
-    def epoch(carry: tuple[jax.Array, PyTree, jax.Array], key: jax.Array) -> tuple[PyTree, PyTree]:
-      *start, stopped = carry
-      runs = ~stopped
+    def epoch(carry: tuple[jax.Array, PyTree, jax.Array], key: jax.Array) -> tuple[PyTree, jax.Array]:
       shuffle_key, loss_key = jax.random.split(key)
       columns = jax.random.permutation(shuffle_key, batch.reward.shape[1]).reshape(config.num_minibatches, -1)
       data = self._with_targets(batch, unravel(carry[0])) if config.targets == "epoch" else batch
 
-      def update(carry: tuple[jax.Array, PyTree], x: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
-        flat, opt_state = carry
+      def update(
+        carry: tuple[jax.Array, PyTree, jax.Array], x: tuple[jax.Array, jax.Array]
+      ) -> tuple[PyTree, jax.Array]:
+        flat, opt_state, stopped = carry
         minibatch, key = self._minibatch(data, *x)
         grads, parts = jax.grad(ppo_loss, has_aux=True)(unravel(flat), minibatch, key, networks, config, scale)
-        if config.desired_kl is not None:
-          opt_state = self._adapt(opt_state, jax.lax.pmean(parts[KL], AXIS))
-        flat, opt_state, norm, finite = gradient_step(self.optimizer, grads, flat, opt_state)
+        kl = jax.lax.pmean(parts[KL], AXIS) if self.bounds_kl else jnp.zeros(())
+        adapted = opt_state if config.desired_kl is None else self._adapt(opt_state, kl)
+        *learned, norm, finite = gradient_step(self.optimizer, grads, flat, adapted)
         log = jnp.stack([*(parts[name] for name in self.losses), norm])
-        return (flat, opt_state), jnp.append(jnp.where(finite, log, 0.0), 1.0 - finite)
+        log = jnp.append(jnp.where(finite, log, 0.0), jnp.stack([1.0 - finite, 1.0]))
+        if config.max_kl is not None:  # no step from here on
+          stopped |= kl > config.max_kl
+          learned = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), learned, [flat, opt_state])
+          log = jnp.where(stopped, 0.0, log)
+        return (*learned, stopped), log
 
-      keys = jax.random.split(loss_key, config.num_minibatches)
-      learned, log = jax.lax.scan(update, tuple(start), (columns, keys))
-      if config.max_kl is not None:  # an epoch beyond the KL limit is the last one
-        learned = jax.tree.map(lambda new, old: jnp.where(runs, new, old), learned, tuple(start))
-        log = jnp.where(runs, log, 0.0)
-        kl = jax.lax.pmean(log[:, self.losses.index(KL)].mean(), AXIS)
-        stopped |= kl > config.max_kl
-      return (*learned, stopped), (log, runs)
+      return jax.lax.scan(update, carry, (columns, jax.random.split(loss_key, config.num_minibatches)))
 
     epochs = jax.random.split(update_key, config.num_updates_per_batch)
-    (flat, opt_state, _), (log, runs) = jax.lax.scan(epoch, (flat, state.opt_state, jnp.array(False)), epochs)
+    (flat, opt_state, stopped), log = jax.lax.scan(epoch, (flat, state.opt_state, jnp.array(False)), epochs)
     params = unravel(flat)
 
+    *total, steps = jax.lax.pmean(log.sum((0, 1)), AXIS)
     names = (*self.losses, "grad_norm", "nonfinite_updates")
-    metrics: Metrics = dict(zip(names, jax.lax.pmean(log.mean(1).sum(0), AXIS) / runs.sum(), strict=True))
-    metrics["gradient_steps"] = jnp.float32(config.num_minibatches) * runs.sum()
-    metrics["nonfinite_updates"] *= metrics["gradient_steps"]
+    metrics: Metrics = {name: value / steps for name, value in zip(names, total, strict=True)}
+    metrics |= {"gradient_steps": steps, "nonfinite_updates": total[-1]}
     if vectors := jax.tree.leaves(networks.vectors(obs)):
       farthest = jnp.stack([jnp.abs(entry).max() for entry in vectors]).max()
       metrics["obs_farthest"] = jax.lax.pmax(farthest, AXIS)  # largest distance from the mean, in standard deviations
@@ -186,7 +184,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     if config.desired_kl is not None:
       metrics["learning_rate"] = opt_state[1].hyperparams["learning_rate"]
     if config.max_kl is not None:
-      metrics["stopped_early"] = 1.0 - runs.all()
+      metrics["stopped_early"] = stopped.astype(jnp.float32)
     normalizer = state.normalizer if normalizer is None else normalizer
     learned = {"params": params, "opt_state": opt_state, "targets_seen": seen}
     return state.replace(**learned, normalizer=normalizer), envs, metrics
