@@ -1,5 +1,6 @@
 """Composition: which file's value wins, what is refused and in which words."""
 
+import contextlib
 import io
 import json
 import math
@@ -551,6 +552,30 @@ def test_a_key_that_only_a_file_sets_is_refused(configs: Path):
   (configs / "experiment/typo.yaml").write_text("# @package _global_\nagent: {lerning_rate: 1}\n")
   with pytest.raises(UnknownNameError, match=r"agent\.lerning_rate, set by a chosen file.*'agent\.learning_rate'"):
     compose(["experiment=typo"], configs)
+
+
+def test_a_file_may_remove_only_a_term_that_exists(configs: Path):
+  task = configs / "env" / "MyOp3.yaml"
+  whole = "defaults: [Op3Joystick, _self_]\n"
+  for text, said in {
+    "rewards: {is_terminated: null, feet_slip_l2: null}": None,
+    "rewards: {is_terminated: null, feet_slipp_l2: null}": "env.rewards.feet_slipp_l2 does not exist: .*'env",
+    "observations: {state: {gyr: null}}": "env.observations.state.gyr does not exist: .*'env.observations.state.gyro'",
+    "observations: {privileged: null}": "env.observations.privileged does not exist: ",
+  }.items():
+    task.write_text(whole + text)
+    with pytest.raises(UnknownNameError, match=said) if said else contextlib.nullcontext():
+      assert compose(["env=MyOp3"], configs).env.rewards.feet_slip_l2 is None
+  task.write_text(whole)
+  experiment = configs / "experiment" / "mine.yaml"
+  experiment.write_text(
+    "# @package _global_\ndefaults: [override /env: MyOp3, override /randomization: go1, _self_]\n"
+    "env: {events: {base_com: null}, rewards: {alive: {weight: 2}}}\n"
+  )
+  assert compose(["experiment=mine"], configs).env.events.base_com is None, "randomization has it"
+  (configs / "debug" / "mine.yaml").write_text("# @package _global_\nenv: {rewards: {alive: null, alife: null}}\n")
+  with pytest.raises(UnknownNameError, match=r"env.rewards.alife does not exist: .*Did you mean 'env.rewards.alive'\?"):
+    compose(["experiment=mine", "debug=mine"], configs)
 
 
 def test_files_that_do_not_compose(configs: Path):

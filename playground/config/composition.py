@@ -1,11 +1,12 @@
 """Composes a configuration: Hydra composes the files, the command line wins over them, everything is checked."""
 
+import contextlib
 import copy
 import dataclasses
 import functools
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from typing import NamedTuple
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from ml_collections import ConfigDict
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -44,10 +46,11 @@ from playground.config.files import (
   groups,
   lineage,
   options,
+  read,
   search_path_override,
   task_experiments,
 )
-from playground.config.limits import check_limits, check_vision
+from playground.config.limits import check_limits, check_vision, nodes
 from playground.config.overrides import (
   Override,
   canonical,
@@ -58,13 +61,13 @@ from playground.config.overrides import (
   with_default_experiment,
 )
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, from_dict, load
-from playground.config.schema import check_key, check_removed, fit, is_terms
+from playground.config.schema import check_key, check_removed, fit, is_term, is_terms
 from playground.config.sweep_options import SweepSettings
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.learning.hyperparameters import config_class
 from playground.pretrained import locate
-from playground.settings import Plain, Section, build, defaults
+from playground.settings import Plain, Section, build, defaults, select
 from playground.text import first_line, format_value, join
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ in a resumed run
@@ -234,7 +237,34 @@ def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
     raise ConfigError(
       f"env={choices['env']} needs a robot: add robot=<name>, one of {', '.join(options('robot', roots))}."
     )
+  _check_removed_in_files(config, str(choices["env"]), [*groups, *group_overrides(added)], roots)
   return _Files(config, choices, _schema(config, choices, changes, roots), added)
+
+
+def _check_removed_in_files(config: DictConfig, task: str, overrides: Sequence[str], roots: Sequence[Path]) -> None:
+  """Raises UnknownNameError if a file removes a term, or a group of observations, that no file has."""
+  left = [key for key, value in nodes({"env": OmegaConf.to_container(config.env)}) if value is None and is_term(key)]
+
+  def files() -> Iterator[tuple[str, Section]]:
+    """Yields package and content of the task's files, which mostly suffice, then of all files."""
+    yield from (("env", read("env", name, roots)) for name in lineage("env", task, roots))
+    with _initialized(roots):
+      lines = [*overrides, *search_path_override(roots)]
+      listed = GlobalHydra.instance().config_loader().compute_defaults_list("config", lines, RunMode.RUN).defaults
+    for default in listed:
+      group, _, option = str(default.config_path).partition("/")
+      yield default.package, read(group, option, roots)
+
+  for package, content in files() if left else ():
+    inside = lambda key, package=package: key.removeprefix(f"{package}." if package else "")
+    left = [key for key in left if select(content, inside(key)) is None]
+    if not left:
+      return
+  values = copy.deepcopy(config)
+  for key in left:
+    del OmegaConf.select(values, key.rpartition(".")[0])[key.rpartition(".")[2]]
+  for key in left:
+    check_removed(key, values)
 
 
 def _changes(groups: Iterable[str], choices: Mapping[str, str | None], roots: Sequence[Path]) -> Delta:
@@ -294,23 +324,31 @@ def _compose_stage(
   return from_dict({**stage.resolved, **own}, stage.overrides)
 
 
-def _hydra(
-  overrides: Sequence[str], roots: Sequence[Path], name: str = "config"
-) -> tuple[DictConfig, dict[str, str | None]]:
-  """Returns Hydra's composition of `<name>.yaml`, and the option of each group."""
+@contextlib.contextmanager
+def _initialized(roots: Sequence[Path]) -> Iterator[None]:
+  """Initialises Hydra during the block."""
   outer = GlobalHydra.instance().hydra  # the app's instance, if this is called within it: Hydra allows one at a time
   GlobalHydra.instance().clear()
   register_options(roots)
   try:
     with hydra.initialize_config_dir(str(roots[0]), version_base="1.3"):
+      yield
+  finally:
+    GlobalHydra.instance().hydra = outer
+
+
+def _hydra(
+  overrides: Sequence[str], roots: Sequence[Path], name: str = "config"
+) -> tuple[DictConfig, dict[str, str | None]]:
+  """Returns Hydra's composition of `<name>.yaml`, and the option of each group."""
+  try:
+    with _initialized(roots):
       lines = [*overrides, *search_path_override(roots)]
       config = hydra.compose(name, overrides=lines, return_hydra_config=True)
       chosen = dict(config.hydra.runtime.choices)
   except (HydraException, YAMLError, OmegaConfBaseException, ValueError, OSError, RecursionError) as error:
     files = " ".join(o for o in overrides if not o.startswith("~"))
     raise ConfigError(f"The files of {files or f'{name}.yaml'} do not compose: {first_line(error)}.") from None
-  finally:
-    GlobalHydra.instance().hydra = outer
   OmegaConf.set_struct(config, False)
   del config["hydra"]
   if "observations" in (env := config.get("env") or {}):

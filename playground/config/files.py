@@ -69,7 +69,7 @@ def task_experiments(roots: Sequence[Path]) -> dict[str, str]:
 
 def lineage(group: str, option: str, roots: Iterable[Path]) -> list[str]:
   """Returns the option and those that its file is built on (the first of each defaults list), nearest first."""
-  defaults = _read(group, option, roots).get("defaults", [])
+  defaults = read(group, option, roots).get("defaults", [])
   named = [entry.removeprefix(f"/{group}/").partition("@")[0] for entry in defaults if isinstance(entry, str)]
   bases = [name for name in named if name != "_self_"]
   return [option, *(lineage(group, bases[0], roots) if bases else [])]
@@ -94,7 +94,7 @@ def delta(group: str, option: str, roots: Sequence[Path]) -> Delta:
   file = find_file(group, option, roots)
   if file is None:
     return Delta(is_known=group == "experiment" and option in task_experiments(roots))
-  content = _read(group, option, roots)
+  content = read(group, option, roots)
   known = "# @package _global_" in file.read_text().splitlines()[:1]
   found = Delta(frozenset(map(str, content)) - {"defaults"}, frozenset(), known)
   for entry in content.get("defaults", []):
@@ -128,7 +128,7 @@ def find_file(group: str, option: str, roots: Iterable[Path]) -> Path | None:
   return next((path for root in roots if (path := root / group / f"{option}.yaml").is_file()), None)
 
 
-def _read(group: str, option: str, roots: Iterable[Path]) -> dict[str, Plain]:
+def read(group: str, option: str, roots: Iterable[Path]) -> dict[str, Plain]:
   """Returns the content of an option's file; empty for an option without one."""
   file = find_file(group, option, roots)
   return (yaml.safe_load(file.read_text()) if file else None) or {}

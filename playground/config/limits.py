@@ -24,7 +24,7 @@ def check_limits(resolved: Section) -> None:
     ConfigError: the first invalid value.
   """
   names = chosen_names(resolved)
-  for key, value in _nodes(resolved):
+  for key, value in nodes(resolved):
     is_leaf = value is not None and not (isinstance(value, Mapping) and value)
     if is_leaf and not is_of_terms(key):
       _check(key, value, names)
@@ -48,7 +48,7 @@ def _check(key: str, value: object, names: Mapping[str, object]) -> None:
 
 def _check_robot(robot: Plain) -> None:
   """Checks `env.robot`, all of which is of a robot's file: no default says which values are mappings, lists or null."""
-  for key, value in _nodes({"env.robot": robot}):
+  for key, value in nodes({"env.robot": robot}):
     if (setting := definition(key, {})) is None or (value is None and setting.nullable):
       continue
     if setting.mapping and not isinstance(value, Mapping):
@@ -92,9 +92,9 @@ def _numbers(value: object) -> list[float]:
   return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
-def _nodes(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
+def nodes(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
   """Yields all dotted keys with their values, a mapping before its own keys."""
   for name, value in node.items():
     yield join(prefix, name), value
     if isinstance(value, Mapping):
-      yield from _nodes(value, join(prefix, name))
+      yield from nodes(value, join(prefix, name))

@@ -65,8 +65,8 @@ def is_open(parts: Sequence[str], schema: Section) -> bool:
 
 def check_removed(key: str, values: Section) -> None:
   """Raises UnknownNameError if `key` is a term or a group of observations that `values` do not have to remove."""
-  *parents, name = parts = key.split(".")
-  if not is_of_terms(key) or len(parts) > (4 if parts[1] == "observations" else 3):
+  *parents, name = key.split(".")
+  if not is_term(key):
     return
   node: Plain = values
   for part in parents:
@@ -81,6 +81,11 @@ def is_of_terms(key: str) -> bool:
   """Whether a dotted key is in a mapping of terms (`env.rewards`, ...), which may have entries of any name."""
   parts = key.split(".")
   return len(parts) > 2 and parts[0] == "env" and parts[1] in OPTIONS
+
+
+def is_term(key: str) -> bool:
+  """Whether a dotted key is that of a term or of a group of observations, not of something inside a term."""
+  return is_of_terms(key) and key.count(".") <= (3 if key.startswith("env.observations.") else 2)
 
 
 def is_terms(key: str) -> bool:
