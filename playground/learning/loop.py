@@ -34,6 +34,7 @@ from playground.text import first_line
 Metrics = dict[str, float]
 Draw = Callable[[], tuple[ModelFields, ModelFields]]  # randomised models, of the training and of the evaluation
 SAVE_EVERY_S = 300.0  # s: a state is saved at every evaluation, and at events when this long has passed since the last
+CALL_S = 5.0  # s: a call of `train` takes about as long at most, because a request to stop waits for its end
 COMPILER = "compiler"  # name of the threads that compile
 
 
@@ -90,7 +91,7 @@ class Callbacks(Protocol):
     ...
 
   def should_stop(self) -> bool:
-    """Whether to save and exit at the next event."""
+    """Whether to save and exit, at the next event if that is near."""
     ...
 
 
@@ -284,6 +285,7 @@ class Loop:
   def __post_init__(self) -> None:
     keys = self.trainer.join([np.asarray(jax.random.split(jax.random.PRNGKey(seed), 3)) for seed in self.seeds])
     self._init_key, self._eval_key, self._reset_key = (jnp.asarray(keys[..., i, :]) for i in range(3))
+    self._max_updates = 1  # of a call; it at most doubles from call to call, since training steps may become slower
 
   def init(self, policy: Policy | None = None) -> TrainState:
     """Returns the state of a new run, which starts from a policy (host arrays) if there is one."""
@@ -310,12 +312,12 @@ class Loop:
           initial = event, self.trainer.place_policy(self.trainer.policy(state)), self._place(self.trainer.settings)
           continue
         state, done = self._work(state, event, event.update - at)
-        results, at = [done], event.update
+        results, at = [done], done.event.update
         if initial:
           results, initial = [self._evaluate_initial(*initial), done], None
         if reported:
           reported.result()  # one row is in flight; its error is raised here
-        stop = any_process(all(each.should_stop() for each in self.callbacks)) and event is not events[-1]
+        stop = any_process(self._should_stop()) and at != events[-1].update
         if stop and done.snapshot is None:
           done.snapshot = jax.device_get(self.functions.gather(state))
         reported = reports.submit(lambda results=results: [self._report(each) for each in results])
@@ -326,17 +328,19 @@ class Loop:
     return state, at == self.events[-1].update
 
   def _work(self, state: TrainState, event: ScheduleEvent, num_updates: int) -> tuple[TrainState, SegmentResult]:
-    """Trains up to an event and performs its actions, each of which has ended before the next begins."""
-    done = SegmentResult(event, num_updates * self.trainer.steps_per_update)
+    """Trains up to an event and performs its actions, each of which has ended before the next begins.
+
+    If the callbacks ask to stop long before the event, the result is that of an earlier event without actions.
+    """
+    done = SegmentResult(event, 0)
     if num_updates:
       start = time.perf_counter()
-      state, trained = self.functions.train(state, self.functions.model, np.int32(num_updates))
-      trained = done.trained = jax.device_get(trained)
+      state, trained, count = self._train(state, num_updates)
+      if count < num_updates:
+        event = done.event = ScheduleEvent(event.update - num_updates + count)
+      done.steps, done.trained = count * self.trainer.steps_per_update, trained
       done.train_s = time.perf_counter() - start
       self.train_s += done.train_s
-      if self.first_update_s is None:
-        self.first_update_s = done.train_s / num_updates
-        self.first_update_at = start + self.first_update_s
       if np.any(trained["nonfinite"] > 0):
         capture = jax.device_get(self.functions.gather(state).capture)
         shapes = self.trainer.shapes((state.env_state, self.functions.model))
@@ -357,6 +361,31 @@ class Loop:
       done.snapshot = jax.device_get(self.trainer.without_data(saved) if last else saved)
       self._last_save = time.perf_counter()
     return state, done
+
+  def _train(self, state: TrainState, num_updates: int) -> tuple[TrainState, dict[str, np.ndarray], int]:
+    """Trains in calls of about `CALL_S`; fewer training steps if the callbacks ask to stop and the rest takes longer.
+
+    Returns:
+      The state, the metrics of all calls, and the number of training steps.
+    """
+    done = 0
+    while True:
+      start = time.perf_counter()
+      # Several processes would have to agree on the numbers.
+      count = num_updates if is_multiprocess() else min(self._max_updates, num_updates - done)
+      state, trained = self.functions.train(state, self.functions.model, np.int32(count))
+      sums, trained, done = trained.pop("sums"), jax.device_get(trained), done + count
+      update_s = (time.perf_counter() - start) / count
+      if self.first_update_s is None:
+        self.first_update_s, self.first_update_at = update_s, start + update_s
+      self._max_updates = max(1, min(2 * self._max_updates, int(CALL_S / update_s)))
+      left = num_updates - done
+      if not left or (left * update_s > CALL_S and self._should_stop()):
+        return state, trained, done
+      state = state.replace(sums=sums)
+
+  def _should_stop(self) -> bool:
+    return all(each.should_stop() for each in self.callbacks)
 
   def _evaluate_initial(self, event: ScheduleEvent, policy: Policy, settings: PyTree) -> SegmentResult:
     """The evaluation before training; no agent has anything to learn from another one yet."""

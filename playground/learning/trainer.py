@@ -36,6 +36,8 @@ class TrainState(struct.PyTreeNode):
     env_state: a batch.
     capture: the first non-finite step.
     settings: of `trainer_settings`; a checkpoint stores them as plain numbers.
+    sums: of the metrics so far, [MAX_METRICS], where several calls of `train` make one row; else zeros. No checkpoint
+      has them.
   """
 
   algorithm: AlgorithmState
@@ -44,8 +46,10 @@ class TrainState(struct.PyTreeNode):
   env_state: State
   capture: NonfiniteCapture
   settings: dict[str, jax.Array]
+  sums: jax.Array
 
 
+MAX_METRICS = 1024  # numbers of a training step; its own number is known only when it has been traced
 Settings = Mapping[str, PyTree]
 
 
@@ -73,7 +77,8 @@ class Trainer:
     steps_per_update: environment steps of one training step, over all devices.
     settings: the values of the settings that the programs take as arguments, by name.
     init: (key, model fields, policy or None, settings) -> state of a new run.
-    train: (state, model fields, number of training steps) -> (state, metrics); donates the state's buffers.
+    train: (state, model fields, number of training steps) -> (state, metrics); donates the state's buffers. `sums` of
+      the metrics, put into the state, makes the next call's metrics those of both calls.
     reset: (state, key, model fields) -> state with all environments reset, except entries that outlast a full reset;
       donates the state's buffers.
     gather: (state) -> the part that a checkpoint holds, in full in each process.
@@ -113,7 +118,8 @@ class Trainer:
     self._buffer = self.algorithm.replay
     if is_multiprocess() and self._buffer and self._buffer.saved:
       raise ConfigError("agent.checkpoint_replay=true needs one process for all devices: set it to false.")
-    specs: dict[str, PyTree] = {"algorithm": P(), "key": P(), "env_state": P(AXIS), "capture": P(AXIS), "settings": P()}
+    specs: dict[str, PyTree] = {"algorithm": P(), "key": P(), "env_state": P(AXIS), "capture": P(AXIS)}
+    specs |= {"settings": P(), "sums": P()}
     spec = self._spec = TrainState(**specs, replay=REPLAY_SPEC if self._buffer else None)
     self.init = jit_on_mesh(self._init, mesh, (P(), P(AXIS), P(), P()), spec)
     self.reset = jit_on_mesh(self._reset, mesh, (spec, P(), P(AXIS)), spec, donate_argnums=0)
@@ -172,7 +178,7 @@ class Trainer:
 
   def split(self, state: TrainState) -> tuple[Policy, TrainState]:
     """Returns the items `policy` and `state` of a checkpoint, which together are all but the replay buffer's data."""
-    rest = state.replace(algorithm=state.algorithm.replace(params=None, normalizer=None), settings={})
+    rest = state.replace(algorithm=state.algorithm.replace(params=None, normalizer=None), settings={}, sums=None)
     return self.policy(state), self.without_data(rest)
 
   def experience(self, state: TrainState) -> np.ndarray | None:
@@ -213,7 +219,8 @@ class Trainer:
 
   def place(self, state: TrainState) -> TrainState:
     """Puts a state's host arrays on the devices, each its share, with the trainer's settings."""
-    return put(state.replace(settings=self.settings), self.mesh, self._spec)
+    sums = self.join([np.zeros(MAX_METRICS, np.float32)] * max(self.num_agents, 1))
+    return put(state.replace(settings=self.settings, sums=sums), self.mesh, self._spec)
 
   def inherit(self, state: TrainState, parents: np.ndarray, settings: Settings) -> TrainState:
     """Returns a state of several agents in which each has the learned state of its parent.
@@ -261,7 +268,7 @@ class Trainer:
     algorithm = with_settings(self.algorithm, below("agent", settings)).init(algorithm_key, policy)
     env_state = self._reset_environments(env_key, model, settings)
     capture = NonfiniteCapture.empty(env_state, self.env.action_size, model)
-    return _train_state(algorithm, key, env_state, capture, settings)
+    return _train_state(algorithm, key, env_state, capture, settings, jnp.zeros(MAX_METRICS))
 
   def _reset(self, state: TrainState, key: jax.Array, model: ModelFields) -> TrainState:
     fresh = self._reset_environments(key, model, state.settings)
@@ -283,15 +290,16 @@ class Trainer:
     """`num_updates` training steps; the number is an argument, so any number of them is one compiled program."""
     train_step = jax.jit(self._train_step)  # so that asking for its shapes and calling it is one trace
     shapes = jax.eval_shape(train_step, state, model)[1]
-    total, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+    zeros, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
 
     def body(_: int, carry: tuple[TrainState, jax.Array]) -> tuple[TrainState, jax.Array]:
       state, total = carry
       state, metrics = train_step(state, model)
       return state, total + ravel_pytree(metrics)[0]  # one vector: an addition each costs a kernel each
 
-    state, total = jax.lax.fori_loop(0, num_updates, body, (state, total))
-    return state, _means(unravel(total))
+    state, total = jax.lax.fori_loop(0, num_updates, body, (state, state.sums[: zeros.size]))
+    sums = jnp.zeros_like(state.sums)
+    return state.replace(sums=sums), _means(unravel(total)) | {"sums": sums.at[: zeros.size].set(total)}
 
   def _train_step(self, state: TrainState, model: ModelFields) -> tuple[TrainState, Metrics]:
     key, shared = jax.random.split(state.key)
@@ -301,7 +309,7 @@ class Trainer:
       state.algorithm.replace(replay=state.replay), envs, jax.random.fold_in(shared, jax.lax.axis_index(AXIS))
     )
     metrics = {"learned": jnp.ones(())} | metrics | jax.lax.psum(envs.sums, AXIS)
-    return _train_state(algorithm, key, envs.state, envs.capture, state.settings), metrics
+    return _train_state(algorithm, key, envs.state, envs.capture, state.settings, state.sums), metrics
 
 
 def _train_state(
@@ -310,8 +318,9 @@ def _train_state(
   env_state: State,
   capture: NonfiniteCapture,
   settings: dict[str, jax.Array],
+  sums: jax.Array,
 ) -> TrainState:
-  return TrainState(algorithm.replace(replay=None), algorithm.replay, key, env_state, capture, settings)
+  return TrainState(algorithm.replace(replay=None), algorithm.replay, key, env_state, capture, settings, sums)
 
 
 _COUNTS = ("episodes", "nonfinite", "gradient_steps", "nonfinite_updates", "overflows")

@@ -17,6 +17,7 @@ import pytest
 from playground.envs.base import State
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.hardware.mesh import make_mesh
+from playground.learning import loop as loop_module
 from playground.learning.algorithm import Algorithm, other_acts
 from playground.learning.evaluation import make_evaluator
 from playground.learning.hyperparameters import PPOConfig
@@ -117,6 +118,26 @@ def test_an_interrupted_run_goes_on_bit_for_bit(config: Config) -> None:
     np.testing.assert_array_equal(a, b)
   kept = [row for row in first.rows if row[0] <= update * trainer.steps_per_update]
   np.testing.assert_equal([*kept, *second.rows], whole.rows)
+
+
+@two_of_them
+def test_long_training_calls_are_divided_and_end_when_the_run_is_to_stop(
+  config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  whole, divided, first, second = Recorder(), Recorder(), Recorder(stop_after=0), Recorder()
+  expected = numbers(run(config, whole)[0])
+  monkeypatch.setattr(loop_module, "CALL_S", 0.0)
+  for a, b in zip(expected, numbers(run(config, divided)[0]), strict=True):
+    np.testing.assert_array_equal(a, b)
+  np.testing.assert_equal(divided.rows, whole.rows, "the rows do not depend on the calls")
+  _, completed = run(config, first)
+  (update, saved), trainer = first.saved[-1], built(config)[0]
+  assert not completed and update == 1, "the first event is after five training steps"
+  assert [step for step, _ in first.rows] == [0, trainer.steps_per_update]
+  got, completed = run(config, second, resumed=(trainer.place(saved), update))
+  assert completed and [step for step, _ in second.rows] == [step for step, _ in whole.rows[1:]]
+  for a, b in zip(expected, numbers(got), strict=True):
+    np.testing.assert_array_equal(a, b)
 
 
 @every_algorithm
