@@ -94,7 +94,7 @@ def build(cls: type[T], values: Section, key: str = "") -> T:
   all_fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
   known = [field.name for field in all_fields]
   if key and (unknown := [name for name in values if name not in known]):
-    raise UnknownNameError(f"{key}.{unknown[0]} does not exist.{nearest(unknown[0], known)}")
+    raise UnknownNameError(f"{key}.{unknown[0]} does not exist.{nearest(str(unknown[0]), known)}")
   fields = {name: values[name] for name in known if name in values}
   needed = [field.name for field in all_fields if field.default is field.default_factory is dataclasses.MISSING]
   if missing := [name for name in needed if name not in fields]:
@@ -174,9 +174,15 @@ def plain(value: Plain, finite: bool = False) -> Plain:
 
 
 def config_dict(values: Section | ConfigDict) -> Plain:
-  """Returns a ConfigDict whose keys keep their order, in which terms apply; ConfigDict itself sorts them."""
+  """Returns a ConfigDict whose keys keep their order, in which terms apply; ConfigDict itself sorts them.
+
+  Raises:
+    ConfigError: a key that is no text or has a dot.
+  """
   config: Plain = ConfigDict(sort_keys=False)
   for key, value in values.items():
+    if not isinstance(key, str) or "." in key:
+      raise ConfigError(f"{key!r} cannot be the name of a key or a term: write text without a dot.")
     config[key] = config_dict(value) if isinstance(value, Mapping | ConfigDict) else value
   return config
 

@@ -578,6 +578,30 @@ def test_a_file_may_remove_only_a_term_that_exists(configs: Path):
     compose(["experiment=mine", "debug=mine"], configs)
 
 
+@pytest.mark.parametrize(
+  ("text", "said"),
+  {
+    "env: null": "env=null has the wrong type: it must be a mapping",
+    "agent: 5": "agent=5 has the wrong type: it must be a mapping",
+    "agent: {5: 3}": "agent.5, set by a chosen file or mapping, does not exist.",
+    "env: {rewards: {5: null}}": "env.rewards.5 does not exist: env.rewards is empty.",
+    "env: {rewards: {a.b: null}}": "'a.b' cannot be the name of a key or a term",
+    "env: {terminations: {1: {}}}": "1 cannot be the name of a key or a term",
+  }.items(),
+)
+def test_sections_of_a_file_are_mappings_and_keys_are_text(configs: Path, text: str, said: str):
+  (configs / "experiment/wrong.yaml").write_text(f"# @package _global_\n{text}\n")
+  with pytest.raises(ConfigError, match=re.escape(said)):
+    compose(["experiment=wrong"], configs)
+
+
+def test_a_saved_key_that_is_no_text_is_refused(run: Path):
+  saved = OmegaConf.to_container(OmegaConf.load(run / "config.yaml"))
+  (run / "config.yaml").write_text(config.values_to_yaml({**saved, "agent": {**saved["agent"], 5: 3}}))  # pyright: ignore
+  with pytest.raises(ConfigError, match=r"agent\.5 does not exist"):
+    compose([f"resume={run}"])
+
+
 def test_files_that_do_not_compose(configs: Path):
   (configs / "experiment/broken.yaml").write_text("# @package _global_\ndefaults:\n  - override /env: Gone\n")
   with pytest.raises(ConfigError, match=r"experiment=broken do not compose.*env/Gone"):

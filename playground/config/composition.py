@@ -61,17 +61,18 @@ from playground.config.overrides import (
   with_default_experiment,
 )
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, from_dict, load
-from playground.config.schema import check_key, check_removed, fit, is_term, is_terms
+from playground.config.schema import check_key, check_removed, fit, is_term, is_terms, unknown_term
 from playground.config.sweep_options import SweepSettings
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.learning.hyperparameters import config_class
 from playground.pretrained import locate
 from playground.settings import Plain, Section, build, defaults, select
-from playground.text import first_line, format_value, join
+from playground.text import first_line, format_value, join, wrong_type
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ in a resumed run
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that define the keys, in this order
+SWEEP_SECTIONS = ("launcher", "search")
 _CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
@@ -118,7 +119,7 @@ def compose_settings(overrides: Sequence[str]) -> SweepSettings:
   config, _ = _hydra(group_overrides(parsed), roots, "sweep")
   resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], _plain(config))
   check_limits(resolved)
-  chosen = {key: resolved[key] for key in ("launcher", "search")}
+  chosen = {key: resolved[key] for key in SWEEP_SECTIONS}
   sections = {key: build(defined()[key][section["name"]], section) for key, section in chosen.items()}
   return SweepSettings(**resolved | sections, resolved=resolved)
 
@@ -243,7 +244,8 @@ def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
 
 def _check_removed_in_files(config: DictConfig, task: str, overrides: Sequence[str], roots: Sequence[Path]) -> None:
   """Raises UnknownNameError if a file removes a term, or a group of observations, that no file has."""
-  left = [key for key, value in nodes({"env": OmegaConf.to_container(config.env)}) if value is None and is_term(key)]
+  terms = {key: value for key, value in nodes({"env": OmegaConf.to_container(config.env)}) if is_term(key)}
+  left = [key for key, value in terms.items() if value is None]
 
   def files() -> Iterator[tuple[str, Section]]:
     """Yields package and content of the task's files, which mostly suffice, then of all files."""
@@ -260,11 +262,9 @@ def _check_removed_in_files(config: DictConfig, task: str, overrides: Sequence[s
     left = [key for key in left if select(content, inside(key)) is None]
     if not left:
       return
-  values = copy.deepcopy(config)
-  for key in left:
-    del OmegaConf.select(values, key.rpartition(".")[0])[key.rpartition(".")[2]]
-  for key in left:
-    check_removed(key, values)
+  if left:
+    beside = {key.rpartition(".")[2]: key for key in terms if key.rpartition(".")[0] == left[0].rpartition(".")[0]}
+    raise unknown_term(left[0], [name for name, key in beside.items() if key not in left])
 
 
 def _changes(groups: Iterable[str], choices: Mapping[str, str | None], roots: Sequence[Path]) -> Delta:
@@ -351,6 +351,9 @@ def _hydra(
     raise ConfigError(f"The files of {files or f'{name}.yaml'} do not compose: {first_line(error)}.") from None
   OmegaConf.set_struct(config, False)
   del config["hydra"]
+  for section in (key for key in (*SECTIONS, *SWEEP_SECTIONS) if key in config):
+    if not isinstance(config[section], DictConfig):
+      raise wrong_type(section, config[section], "a mapping, also in the files that are chosen")
   if "observations" in (env := config.get("env") or {}):
     env.update({key: value for key, value in defaults(TermsConfig).items() if key not in env})
   choices = {group: chosen.get(group) for group in groups(roots)}

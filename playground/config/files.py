@@ -129,9 +129,10 @@ def find_file(group: str, option: str, roots: Iterable[Path]) -> Path | None:
 
 
 def read(group: str, option: str, roots: Iterable[Path]) -> dict[str, Plain]:
-  """Returns the content of an option's file; empty for an option without one."""
+  """Returns the content of an option's file; empty for an option without one, and for a file that is no mapping."""
   file = find_file(group, option, roots)
-  return (yaml.safe_load(file.read_text()) if file else None) or {}
+  content = yaml.safe_load(file.read_text(encoding="utf-8")) if file else None
+  return content if isinstance(content, dict) else {}
 
 
 @functools.cache

@@ -72,9 +72,14 @@ def check_removed(key: str, values: Section) -> None:
   for part in parents:
     node = (node.get(part) if isinstance(node, Mapping) else None) or {}
   if name not in node:
-    has = f"has {', '.join(node)}" if node else "is empty"
-    near = nearest_in(".".join(parents), name, node)
-    raise UnknownNameError(f"{key} does not exist: {'.'.join(parents)} {has}.{near}")
+    raise unknown_term(key, list(node))
+
+
+def unknown_term(key: str, known: Sequence[str]) -> UnknownNameError:
+  """Returns the error for a term that is to be removed, where the task has those that are `known`."""
+  parent, _, name = key.rpartition(".")
+  has = f"has {', '.join(known)}" if known else "is empty"
+  return UnknownNameError(f"{key} does not exist: {parent} {has}.{nearest_in(parent, name, known)}")
 
 
 def is_of_terms(key: str) -> bool:
