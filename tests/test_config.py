@@ -394,6 +394,8 @@ ERRORS = {
   "agent=[1": ["'agent=[1' is not an override: its value does not parse; a list is [1, 2], "],
   "agent.num_envs": ["'agent.num_envs' is not an override: write key=value, such as env=CartpoleBalance"],
   "hardware.xla_flags=--a=b": ["quote its value, in a shell 'hardware.xla_flags=\"--a=b\"'."],
+  "=3": ["'=3' is not an override: write key=value"],
+  "~env.terminations.nonfinite_state": ["env.terminations.nonfinite_state=null removes the term."],
   "Go1JoystickFlatTerrain": ["is not an override: write env=Go1JoystickFlatTerrain."],
   "algo=sac": ["algo does not exist", "Did you mean 'agent'?"],
   "agent.lr=1": ["agent.lr does not exist", "Did you mean 'agent.learning_rate'?"],

@@ -1,5 +1,6 @@
 """Parses the command line, one `key=value` or `group=option` at a time."""
 
+import contextlib
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -73,23 +74,21 @@ def parse_with_hydra(text: str) -> HydraOverride:
   first.
   """
   key, _, value = text.partition("=")
-  try:
+  with contextlib.suppress(HydraException):
     parsed = OverridesParser.create().parse_override(text)
-    if key not in _PATHS or parsed.is_sweep_override() or not isinstance(parsed.value(), list | dict):
+    if key and (key not in _PATHS or parsed.is_sweep_override() or not isinstance(parsed.value(), list | dict)):
       return parsed
-  except HydraException:
-    pass
-  try:
-    return OverridesParser.create().parse_override(f"{key}={quoted(value)}" if key in _PATHS else text)
-  except HydraException:
-    if group := next((group for group in ("env", "experiment") if text in options(group)), None):
-      raise ConfigError(f"{text!r} is not an override: write {group}={text}.") from None
-    if re.fullmatch(r"[\w.@/+~]+", key) and value:
-      forms = "its value does not parse; a list is [1, 2], a mapping {a: 1, b: 2}, other text stands in quotes"
-      how = forms if set(value) & set("[]{}()'\"") else f"quote its value, in a shell '{key}=\"{value}\"'"
-      raise ConfigError(f"{text!r} is not an override: {how}.") from None
-    example = "such as env=CartpoleBalance or agent.num_envs=1024"
-    raise ConfigError(f"{text!r} is not an override: write key=value, {example}.") from None
+  if key in _PATHS:
+    with contextlib.suppress(HydraException):
+      return OverridesParser.create().parse_override(f"{key}={quoted(value)}")
+  if group := next((group for group in ("env", "experiment") if text in options(group)), None):
+    raise ConfigError(f"{text!r} is not an override: write {group}={text}.")
+  if re.fullmatch(r"[\w.@/+~]+", key) and value:
+    forms = "its value does not parse; a list is [1, 2], a mapping {a: 1, b: 2}, other text stands in quotes"
+    how = forms if set(value) & set("[]{}()'\"") else f"quote its value, in a shell '{key}=\"{value}\"'"
+    raise ConfigError(f"{text!r} is not an override: {how}.")
+  example = "such as env=CartpoleBalance or agent.num_envs=1024"
+  raise ConfigError(f"{text!r} is not an override: write key=value, {example}.")
 
 
 def parse(text: str, roots: Sequence[Path]) -> Override:
@@ -110,7 +109,8 @@ def parse(text: str, roots: Sequence[Path]) -> Override:
   value = parsed.value()
   if parsed.is_delete():
     if not is_group:
-      raise ConfigError(f"{text}: a key cannot be removed, set another value.")
+      instead = f"{key}=null removes the term" if is_of_terms(key) else "set another value"
+      raise ConfigError(f"{text}: a key cannot be removed, {instead}.")
     value = None
   if is_group and (value is not None or key not in ("robot", *DELTAS)):
     for option in value if isinstance(value, list) and key in DELTAS else [value]:
