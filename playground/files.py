@@ -61,6 +61,9 @@ def replacing(path: Path) -> Iterator[Path]:
     os.umask(umask)
     temporary.chmod(0o666 & ~umask)
     os.replace(temporary, path)
+  except OSError as error:
+    error.filename = error.filename or str(path)  # a write to a full disk names no file
+    raise
   finally:
     temporary.unlink(missing_ok=True)
 

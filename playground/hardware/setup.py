@@ -12,6 +12,7 @@ from playground.errors import HardwareError
 from playground.hardware.distributed import init_distributed
 from playground.hardware.mesh import make_mesh
 from playground.hardware.options import HardwareConfig, Platform
+from playground.text import first_line
 
 CACHE = Path("~/.cache/playground")
 # Flags by the first version of JAX without them: XLA ends the process over a flag that it does not know.
@@ -41,7 +42,14 @@ def setup(config: HardwareConfig) -> Hardware:
   init_distributed(config)
   jax.config.update("jax_default_matmul_precision", config.matmul_precision)
   cache = _caches(config)
-  devices = jax.local_devices()
+  try:
+    devices = jax.local_devices()
+  except (RuntimeError, AssertionError) as error:
+    named, why = os.environ.get("JAX_PLATFORMS"), str(error) and f" ({first_line(error)})"
+    raise HardwareError(
+      f"JAX finds no device {f'of JAX_PLATFORMS={named}' if named else 'here'}{why}: `playground doctor` says what is "
+      "missing, hardware=cpu runs without a GPU."
+    ) from error
   if config.platform == "gpu" and devices[0].platform != "gpu":
     raise HardwareError(
       "hardware.platform=gpu, but JAX sees no GPU: `playground doctor` says what is missing, hardware=cpu runs without."

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -91,6 +92,19 @@ def test_what_cannot_be_had_is_one_sentence(changes: dict[str, Any], error: type
   with pytest.raises(error) as caught:
     setup(hardware(**changes))
   assert all(word in str(caught.value) for word in words)
+
+
+@pytest.mark.parametrize(
+  ("error", "said"),
+  [(AssertionError(), ""), (RuntimeError("Unable to initialize: no driver."), " .Unable to .*no driver.")],
+)
+def test_platforms_that_jax_has_not_are_one_sentence(
+  error: Exception, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+  monkeypatch.setattr("jax.local_devices", Mock(side_effect=error))
+  with pytest.raises(HardwareError, match=f"JAX finds no device of JAX_PLATFORMS=cuda{said}: .*hardware=cpu"):
+    setup(hardware())
 
 
 def test_flags_that_this_jax_has_no_more_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

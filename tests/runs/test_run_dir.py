@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from playground.errors import CheckpointError
+from playground.errors import CheckpointError, one_sentence
 from playground.files import is_locked, lock_holder, replacing
 from playground.runs.provenance import git_state
 from playground.runs.run_dir import RunDirectory
@@ -171,6 +171,13 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path):
     temporary.write_text("half")
     raise RuntimeError
   assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_of_a_full_disk_names_the_file(tmp_path: Path):
+  path = tmp_path / "status.json"
+  with pytest.raises(OSError) as error, replacing(path):
+    raise OSError(errno.ENOSPC, "No space left on device")
+  assert one_sentence(error.value) == f"error: {path}: No space left on device."
 
 
 def test_git_state_is_of_this_checkout_only(tmp_path: Path):
