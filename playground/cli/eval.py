@@ -8,7 +8,6 @@ from rich.console import Console
 from rich.table import Table
 
 from playground.envs.locomotion.gait_metrics import with_gait_metrics
-from playground.errors import ConfigError
 from playground.files import unwritable, write_json
 from playground.learning.evaluation import make_evaluator
 from playground.paper import paper_table
@@ -49,8 +48,6 @@ def evaluate_run(
   trained = load_policy(path)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
   count = run.agent.num_eval_envs if episodes is None else episodes
-  if count < 1:
-    raise ConfigError(f"--episodes={count} must be above 0.")
   drawn = drawn_model(env, run.video.visuals)
   need_camera(drawn, camera, "--camera")
   _, model = model_sampler(env, run, 1, count)(run.seed)

@@ -13,6 +13,7 @@ from playground.config import RunConfig, compose, compose_settings, config_roots
 from playground.config.comments import keys_and_comments, meaning
 from playground.config.definitions import chosen_names, definition
 from playground.config.files import find_file, groups, lineage, listed_options
+from playground.config.overrides import SHORT_KEYS
 from playground.config.schema import check_key
 from playground.errors import UnknownNameError, nearest
 from playground.mdp.options import OPTIONS
@@ -46,7 +47,7 @@ def show_keys(prefix: str, overrides: Sequence[str]) -> int:
   roots = config_roots()
   console = Console()
   console = console if console.is_terminal else Console(width=_WIDE)
-  prefix = prefix.strip(".")
+  prefix = SHORT_KEYS.get(prefix.strip("."), prefix.strip("."))
   if prefix in groups(roots):
     names = [name for name in listed_options(prefix, roots) if not name.split("/")[-1].startswith("_")]
     console.print(Text(f"{prefix}=<option>", style="bold"), Text(f"one of {', '.join(names)}"), sep=": ")

@@ -19,7 +19,7 @@ from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
 from playground.envs.locomotion.gait_metrics import with_gait_metrics
-from playground.errors import CheckpointError, ConfigError, PlaygroundError
+from playground.errors import CheckpointError, PlaygroundError
 from playground.extras import need
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
@@ -75,10 +75,6 @@ def play(
     PlaygroundError: no such run, policy or camera, no display for the viewer, or no port for the browser.
   """
   console = console or Console()
-  if episodes < 1:
-    raise ConfigError(f"--episodes={episodes} must be above 0.")
-  if seed < 0:
-    raise ConfigError(f"--seed={seed} must not be negative.")
   film = need_place(video, camera)
   if viewer:
     from playground.deploy.viewer import need_display

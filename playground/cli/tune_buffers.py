@@ -38,8 +38,6 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   Raises:
     PlaygroundError: no such task or run, or one that does not fit; Warp is not installed.
   """
-  if envs < 1 or steps < 1:
-    raise ConfigError(f"--envs={envs} and --steps={steps} must be above 0.")
   config = compose([f"env={task}", *overrides]).env
   policies: dict[str, Act | None] = {"random": None}
   if run is not None:

@@ -164,6 +164,7 @@ def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
     (["robot"], ["robot=<option>: one of aero_hand,"]),
     (["launcher", "launcher=slurm"], ["one of local, ray, slurm", "launcher.partition"]),
     (["debug"], ["debug=<option>: one of fast, profile"]),
+    (["visuals"], ["video.visuals primitives primitives, menagerie"]),
   ],
 )
 def test_keys(command: Command, capsys: pytest.CaptureFixture[str], args: list[str], shown: list[str]):
