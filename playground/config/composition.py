@@ -263,8 +263,9 @@ def _check_removed_in_files(config: DictConfig, task: str, overrides: Sequence[s
     if not left:
       return
   if left:
-    beside = {key.rpartition(".")[2]: key for key in terms if key.rpartition(".")[0] == left[0].rpartition(".")[0]}
-    raise unknown_term(left[0], [name for name, key in beside.items() if key not in left])
+    parent = left[0].rpartition(".")[0]
+    beside = [key for key in terms if key.rpartition(".")[0] == parent and key not in left]
+    raise unknown_term(left[0], [key.removeprefix(f"{parent}.") for key in beside])
 
 
 def _changes(groups: Iterable[str], choices: Mapping[str, str | None], roots: Sequence[Path]) -> Delta:

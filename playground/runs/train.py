@@ -45,7 +45,7 @@ from playground.runs.run_dir import RunDirectory
 from playground.runs.scaling import describe_division, scale_envs
 from playground.text import first_line
 
-ROWS = 100  # approximate rows of metrics.csv in a run; each call to the device makes one row
+ROWS = 100  # approximate rows of metrics.csv in a run
 
 
 def train(config: RunConfig) -> int:
