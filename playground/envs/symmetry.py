@@ -86,7 +86,9 @@ def augmentation(env: Env) -> Mirror:
       raise ConfigError("images are not mirrored.")
     return mirror_of(env)
   except ConfigError as error:
-    raise ConfigError(f"agent.mirror_augmentation=true: {error} agent.mirror_augmentation=false trains without.") from None
+    raise ConfigError(
+      f"agent.mirror_augmentation=true: {error} agent.mirror_augmentation=false trains without."
+    ) from None
 
 
 def joint_reflection(robot: LeggedRobot) -> Reflection:
