@@ -13,7 +13,7 @@ from playground.config import task_names
 from playground.deploy.export import export_run
 from playground.errors import ConfigError
 from playground.files import need_folder, read_json
-from playground.learning.checkpoints import find_checkpoints
+from playground.learning.checkpoints import find_checkpoints, find_stages
 from playground.pretrained import add, cards
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, newest_evaluation
 from playground.runs.run_dir import RunDirectory
@@ -55,8 +55,10 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
     ConfigError: the run has not been evaluated, its task is not one of `playground list`, the package has a policy of
       it, or a folder cannot be written.
   """
-  started, newest = RunDirectory.open(path), find_checkpoints(path)[0]  # of a chain, that of its last stage
+  newest = find_checkpoints(path)[0]  # of a chain, that of its last stage
   run, steps = RunDirectory.open(newest.parents[1]), int(newest.name)
+  chain = RunDirectory(run.path.parent)
+  started = chain if run.path in find_stages(chain.path) else run  # by the command of the card
   path = str(run.path)
   for name in ("overrides.yaml", "manifest.json", "metrics.csv"):
     if not (run.path / name).is_file():

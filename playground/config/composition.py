@@ -72,7 +72,7 @@ from playground.text import first_line, format_value, join, wrong_type
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ in a resumed run
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that define the keys, in this order
-SWEEP_SECTIONS = ("launcher", "search")
+_SWEEP_SECTIONS = ("launcher", "search")
 _CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
@@ -119,7 +119,7 @@ def compose_settings(overrides: Sequence[str]) -> SweepSettings:
   config, _ = _hydra(group_overrides(parsed), roots, "sweep")
   resolved = _apply(copy.deepcopy(config), [o for o in parsed if not o.is_group], _plain(config))
   check_limits(resolved)
-  chosen = {key: resolved[key] for key in SWEEP_SECTIONS}
+  chosen = {key: resolved[key] for key in _SWEEP_SECTIONS}
   sections = {key: build(defined()[key][section["name"]], section) for key, section in chosen.items()}
   return SweepSettings(**resolved | sections, resolved=resolved)
 
@@ -352,7 +352,7 @@ def _hydra(
     raise ConfigError(f"The files of {files or f'{name}.yaml'} do not compose: {first_line(error)}.") from None
   OmegaConf.set_struct(config, False)
   del config["hydra"]
-  for section in (key for key in (*SECTIONS, *SWEEP_SECTIONS) if key in config):
+  for section in (key for key in (*SECTIONS, *_SWEEP_SECTIONS) if key in config):
     if not isinstance(config[section], DictConfig):
       raise wrong_type(section, config[section], "a mapping, also in the files that are chosen")
   if "observations" in (env := config.get("env") or {}):

@@ -49,7 +49,12 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
     add_policy(str(run))
   assert add_policy(str(run), replace=True) == 0
   assert yaml.safe_load((folder / "card.yaml").read_text())["training"]["steps"] == 0
-  metrics.write_text(header)
+  chain = RunDirectory.create(tmp_path / "chain", {}, ["experiment=my_chain", "run_dir=chain"]).path
+  run = run.rename(chain / "1_stage")
+  for given in (chain, run, run / "checkpoints" / checkpoint.path.name):
+    assert add_policy(str(given), replace=True) == 0
+    assert yaml.safe_load((folder / "card.yaml").read_text())["command"] == "playground-run experiment=my_chain"
+  (run / "metrics.csv").write_text(header)
   with pytest.raises(ConfigError, match="was not evaluated before its newest checkpoint"):
     add_policy(str(run), replace=True)
 
