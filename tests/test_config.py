@@ -140,7 +140,7 @@ def test_debug_fast_is_small_for_every_task(env: str):
   run = compose([*f"env={env}".split(), "debug=fast"])
   agent = run.agent
   assert run.env.episode_length == 20
-  assert agent.num_timesteps / agent.steps_per_update == (40 if run.choices["agent"] == "fast_sac" else 4)
+  assert agent.num_timesteps / agent.steps_per_update == (40 if run.choices["agent"] in ("fast_sac", "fast_td3") else 4)
 
 
 @pytest.mark.parametrize("agent", config.options("agent"))
