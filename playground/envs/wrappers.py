@@ -111,6 +111,7 @@ class FiniteGuard(Wrapper):
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
     after = self.env.step(state, action, model)
     bad = ~_is_finite(after) | state.info["nonfinite_reset"]
+    bad |= (state.info["nonfinite"] > 0) & (state.done > 0)  # a repeat of the action that gave such numbers
     zeros = jax.tree.map(jnp.zeros_like, (after.reward, after.metrics))
     reward, metrics = where_done(bad, zeros, (after.reward, after.metrics))
     obs, info = where_done(bad, (state.obs, state.info), (after.obs, after.info))

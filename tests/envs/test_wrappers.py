@@ -230,6 +230,19 @@ def test_an_absurd_velocity_counts_as_not_finite() -> None:
   np.testing.assert_array_equal(jnp.abs(states[2].data.qvel) < wrappers.MAX_VELOCITY, True)
 
 
+def test_a_repeat_that_slows_down_again_does_not_hide_an_absurd_velocity() -> None:
+  class Spike(Counting):
+    def step(self, state: State, action: jax.Array, model: Any = None) -> State:
+      after = super().step(state, action, model)
+      speed = jnp.where(state.data.qvel == 0, 2 * wrappers.MAX_VELOCITY, 1.0)  # in the step from rest
+      return after.replace(data=after.data.replace(qvel=speed))
+
+  env = wrappers.wrap_for_training(Spike(episode_length=LENGTH, action_repeat=2))
+  state = jax.jit(env.step)(env.reset(jax.random.split(jax.random.PRNGKey(0), N)), jnp.full((N, 2), 0.1))
+  np.testing.assert_array_equal(state.info["nonfinite"], 1)
+  np.testing.assert_array_equal(state.reward, 0)
+
+
 def test_a_property_that_fails_is_not_answered_by_the_task() -> None:
   class Broken(wrappers.Wrapper):
     @property
