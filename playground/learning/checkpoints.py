@@ -69,11 +69,19 @@ class DamagedCheckpointError(CheckpointError):
   """A checkpoint whose bytes differ from the saved ones, or that holds NaN or infinite values."""
 
 
+_quiet: list[set[threading.Thread]] = []  # for each block of `_quiet_threads`, the threads that were there before it
+_quiet_lock = threading.Lock()
+
+
 @contextlib.contextmanager
 def _quiet_threads() -> Iterator[None]:
-  """Silences Orbax's threads, whose first error Orbax raises, until they have ended."""
-  before, hook = set(threading.enumerate()), threading.excepthook
-  threading.excepthook = lambda args: hook(args) if args.thread in before else None
+  """Silences Orbax's threads, whose first error Orbax raises, until they have ended; blocks may overlap."""
+  global _hook
+  before = set(threading.enumerate())
+  with _quiet_lock:
+    if not _quiet:
+      _hook, threading.excepthook = threading.excepthook, _report_others
+    _quiet.append(before)
   try:
     yield
   except Exception:
@@ -81,7 +89,18 @@ def _quiet_threads() -> Iterator[None]:
       thread.join(10)
     raise
   finally:
-    threading.excepthook = hook
+    with _quiet_lock:
+      _quiet.remove(before)
+      if not _quiet:
+        threading.excepthook = _hook
+
+
+_hook = threading.excepthook  # that of the process
+
+
+def _report_others(args: threading.ExceptHookArgs) -> None:
+  if all(args.thread in before for before in _quiet):
+    _hook(args)
 
 
 def _ignore_late_results() -> None:

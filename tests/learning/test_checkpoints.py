@@ -7,6 +7,7 @@ import math
 import os
 import resource
 import shutil
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -493,6 +494,18 @@ def test_those_of_a_chain(tmp_path: Path) -> None:
   (tmp_path / "config.yaml").touch()
   assert find_checkpoints(tmp_path) == expected
   assert [path.name for path in checkpoints.find_stages(tmp_path)] == ["2_near", "10_far"]
+
+
+def test_saves_that_overlap_silence_no_thread_afterwards() -> None:
+  """Runs that train together save at the same time."""
+  hook = threading.excepthook
+  first, second = checkpoints._quiet_threads(), checkpoints._quiet_threads()
+  with contextlib.ExitStack() as outer:
+    with contextlib.ExitStack() as inner:
+      inner.enter_context(first)
+      outer.enter_context(second)
+    assert threading.excepthook is not hook
+  assert threading.excepthook is hook
 
 
 def test_an_unfinished_save_is_cleaned_away(tmp_path: Path) -> None:
