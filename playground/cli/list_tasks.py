@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from playground.catalog import Entry, entries
+from playground.catalog import entries
 from playground.errors import UnknownNameError, nearest
-from playground.settings import Plain, Section
+from playground.settings import Section
 from playground.text import millions
 
 FILTERS = ("suite", "robot", "status", "backend")
@@ -36,7 +36,7 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
     values = sorted({getattr(entry, name) for entry in known.values()} - {""})
     if value not in values:
       raise UnknownNameError(f"--{name}={value}: choose from {', '.join(values)}.{nearest(value, values)}")
-  rows = [_row(name, known.get(name)) for name in names]
+  rows: list[Section] = [dataclasses.asdict(known[name]) if name in known else {"task": name} for name in names]
   rows = [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
   if as_json:
     print(json.dumps(rows, indent=1))
@@ -48,10 +48,6 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   count = f"{len(rows)} task{'s' * (len(rows) != 1)}"
   console.print(f"{count}. Train one with playground train env=<task>.", soft_wrap=True)
   return 0
-
-
-def _row(name: str, entry: Entry | None) -> dict[str, Plain]:
-  return dataclasses.asdict(entry) if entry else {"task": name}
 
 
 def _table(rows: Iterable[Section]) -> Table:

@@ -47,7 +47,6 @@ def play(
   web: bool = False,
   host: str = "127.0.0.1",
   port: int = 8080,
-  console: Console | None = None,
 ) -> int:
   """Runs a policy with ONNX Runtime in C MuJoCo, with the task's rate, noise, pushes and delays, on the nominal model.
 
@@ -66,7 +65,6 @@ def play(
     web: whether to show it in the browser instead.
     host: address that the page in the browser is served at.
     port: port of that address.
-    console: for the output.
 
   Returns:
     The exit code, 0.
@@ -74,7 +72,7 @@ def play(
   Raises:
     PlaygroundError: no such run, policy or camera, no display for the viewer, or no port for the browser.
   """
-  console = console or Console()
+  console = Console()
   film = need_place(video, camera)
   if viewer:
     from playground.deploy.viewer import need_display

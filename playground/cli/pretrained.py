@@ -34,7 +34,8 @@ def show_policies(console: Console | None = None) -> int:
     score = trained["sampled"] if trained["mode"] is None else trained["mode"]
     falls = f"{plain['falls']}/{plain['episodes']}"
     steps = millions(card["steps"])
-    table.add_row(task, card["agent"], card["status"], steps, f"{score:.1f}", _interval(plain), falls)
+    measured = f"{plain['return']:.1f} ± {plain['return_std']:.1f}"
+    table.add_row(task, card["agent"], card["status"], steps, f"{score:.1f}", measured, falls)
   (console or Console()).print(table)
   return 0
 
@@ -131,7 +132,3 @@ def _status(scores: dict[str, float]) -> catalog.Status:
   measured = {"falls_per_episode": "episode_fall", "success": "episode_success"}
   row = {column: str(scores[name]) for column, name in measured.items() if name in scores}
   return catalog.status({"note": "", "final_return": str(scores["episode_reward"]), **row})
-
-
-def _interval(measured: dict[str, Plain]) -> str:
-  return f"{measured['return']:.1f} ± {measured['return_std']:.1f}"

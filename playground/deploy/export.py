@@ -23,7 +23,7 @@ class ParityError(PlaygroundError):
   """The actions of an exported policy differ from those of the trained one."""
 
 
-def export_run(path: str, *, out: str | None = None, console: Console | None = None) -> int:
+def export_run(path: str, *, out: str | None = None) -> int:
   """Exports a run's newest checkpoint, or the one at `path`.
 
   The exported policy must return the trained policy's actions on 1000 observations in C MuJoCo.
@@ -31,7 +31,6 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   Args:
     path: a run directory, or one of its checkpoints.
     out: the folder to write to; by default `export/` in the run directory.
-    console: for the output.
 
   Returns:
     The exit code, 0.
@@ -41,7 +40,6 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
     PlaygroundError: no such run or checkpoint, a policy without an ONNX form, or a folder that is not writable or holds
       the policy of another task.
   """
-  console = console or Console()
   need("deploy", "onnx", "onnxruntime")
   folder = Path(os.path.expanduser(out)) if out else None
   if folder:
@@ -60,6 +58,7 @@ def export_run(path: str, *, out: str | None = None, console: Console | None = N
   write_text(folder / "policy.yaml", _yaml(exported.contract))
   with replacing(folder / "policy.onnx") as temporary:
     temporary.write_bytes(exported.model)
+  console = Console()
   console.print(
     _summary(exported.contract, len(actions), error, 1e6 * exported.latency(obs)), soft_wrap=True, markup=False
   )

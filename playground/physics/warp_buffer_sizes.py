@@ -49,7 +49,6 @@ def measure_buffers(
   act: Act | None,
   num_envs: int,
   num_steps: int,
-  seed: int = 0,
   on_try: Callable[[str], None] = lambda sizes: None,
   on_steps: Callable[[int], None] = lambda steps: None,
 ) -> BufferSizes:
@@ -61,7 +60,6 @@ def measure_buffers(
     act: the policy; uniformly random actions if None.
     num_envs: environments.
     num_steps: policy steps; episodes that end are reset.
-    seed: of starts and actions.
     on_try: is called with the sizes of the buffers before each rollout compiles.
     on_steps: is called with the number of policy steps that the rollout has done.
 
@@ -73,7 +71,7 @@ def measure_buffers(
     sizes: dict[str, int | str] = {"njmax": rows, "naconmax_per_env": pairs, "naccdmax_per_env": convex}
     env = build({"impl": "warp", **sizes})
     on_try(" ".join(f"{key}={size}" for key, size in sizes.items()))
-    use = _roll(env, act, num_envs, num_steps, seed, on_steps)
+    use = _roll(env, act, num_envs, num_steps, on_steps)
     if not use.overflow:
       return BufferSizes(int(use.constraints), int(use.contacts) / num_envs, convex)
     rows = _rows(int(use.constraints)) if use.constraints > rows else rows
@@ -90,10 +88,8 @@ def measure_buffers(
   )
 
 
-def _roll(
-  env: Batch, act: Act | None, num_envs: int, num_steps: int, seed: int, on_steps: Callable[[int], None]
-) -> BufferUse:
-  reset_key, act_key = jax.random.split(jax.random.PRNGKey(seed))
+def _roll(env: Batch, act: Act | None, num_envs: int, num_steps: int, on_steps: Callable[[int], None]) -> BufferUse:
+  reset_key, act_key = jax.random.split(jax.random.PRNGKey(0))
   uniform = lambda obs, key: jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0, maxval=1.0)
   keys = jax.random.split(act_key, num_steps)
 

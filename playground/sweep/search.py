@@ -105,7 +105,7 @@ class Search:
     state = folder.state().status
     if state == "preempted":
       return
-    value = _value(folder, self._config.metric) if state == "finished" else None
+    value = folder.run.summary.get(self._config.metric) if state == "finished" else None
     trials = [t for t in self._study.get_trials(deepcopy=False) if t.user_attrs.get("job") == job.name]
     if not trials:
       self._notify(f"{job.name} is left out of the search: study.log was removed since it began.")
@@ -176,7 +176,3 @@ def first_values(lines: Sequence[str], inside: bool = False) -> list[str]:
     example = "agent.learning_rate='tag(log,interval(1e-4,1e-2))'"
     raise ConfigError(f"search=optuna needs something to draw, such as {example}.")
   return overrides
-
-
-def _value(folder: JobFolder, metric: str) -> float | None:
-  return folder.run.summary.get(metric)

@@ -58,7 +58,7 @@ def simulated(monkeypatch):
   tried = []
 
   def simulate(rows: int, pairs: int, convex: int = 0, stubborn: int = 0):
-    def roll(env, act, num_envs, num_steps, seed, on_steps):
+    def roll(env, act, num_envs, num_steps, on_steps):
       tried.append((env.njmax, env.naconmax_per_env * num_envs, env.naccdmax_per_env * num_envs))
       assert env.naccdmax_per_env <= env.naconmax_per_env, "Warp refuses this"
       have = dict(zip((1, 8, 16), tried[-1], strict=True))
@@ -96,7 +96,7 @@ def test_a_rollout_reports_its_steps_and_keeps_the_most():
 
   for num_steps, stride in ((7, 1), (125, 2)):
     reported: list[int] = []
-    found = warp_buffer_sizes._roll(wrap_for_training(Counting()), None, 2, num_steps, 0, reported.append)
+    found = warp_buffer_sizes._roll(wrap_for_training(Counting()), None, 2, num_steps, reported.append)
     assert (found.constraints, found.contacts, found.overflow) == (num_steps, 3, 1)
     assert reported == [*range(stride, num_steps, stride), num_steps]
 
