@@ -1,5 +1,6 @@
 """Stores lowered functions on disk: a later start traces nothing, and finds their executables in JAX's cache."""
 
+import contextlib
 import dataclasses
 import hashlib
 import os
@@ -125,9 +126,10 @@ class StoredProgram:
       return
     with replacing(self.path) as temporary:
       temporary.write_bytes(hashlib.sha256(body).digest() + body)
-    programs = sorted(folder.glob(f"*{self.path.suffix}"), key=lambda path: path.stat().st_mtime, reverse=True)
-    for path in programs[KEPT:]:
-      path.unlink(missing_ok=True)
+    with contextlib.suppress(FileNotFoundError):  # another process has removed one
+      programs = sorted(folder.glob(f"*{self.path.suffix}"), key=lambda path: path.stat().st_mtime, reverse=True)
+      for path in programs[KEPT:]:
+        path.unlink(missing_ok=True)
 
 
 def _is_private(folder: Path) -> bool:

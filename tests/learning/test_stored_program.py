@@ -102,6 +102,11 @@ assert result["empty"].shape == (4, 0) and result["empty"].sharding.spec == P(AX
 """
 
 
+def test_a_program_that_another_process_removes_meanwhile_is_no_error(stored: StoredProgram):
+  stored.path.with_name("gone.program").symlink_to("nowhere")  # it is listed, and is not there
+  stored.save({"scale": lowered()})
+
+
 def test_over_several_devices_empty_arrays_stay_divided():
   env = os.environ | WITHOUT_WARP | {"JAX_NUM_CPU_DEVICES": "2", "JAX_PLATFORMS": "cpu"}
   done = subprocess.run([sys.executable, "-c", TWO_DEVICES], cwd=ROOT, env=env, capture_output=True, text=True)
