@@ -49,6 +49,11 @@ def need_file(path: Path, suffix: str, option: str) -> None:
   need_folder(path.parent, option)
 
 
+# Of the process, read once: to read it is to change it, for the files that other threads make meanwhile, too.
+_UMASK = os.umask(0o077)
+os.umask(_UMASK)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
   """Yields a temporary sibling of `path` (same suffix) that takes its place only if the block succeeds."""
@@ -57,9 +62,7 @@ def replacing(path: Path) -> Iterator[Path]:
   temporary = Path(name)
   try:
     yield temporary
-    umask = os.umask(0)  # mkstemp makes files private; a shared results folder wants the user's own default
-    os.umask(umask)
-    temporary.chmod(0o666 & ~umask)
+    temporary.chmod(0o666 & ~_UMASK)  # mkstemp makes files private, and results are shared
     os.replace(temporary, path)
   except OSError as error:
     error.filename = error.filename or str(path)  # a write to a full disk names no file

@@ -173,6 +173,15 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path):
   assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
+def test_a_write_gives_the_users_own_mode_and_leaves_that_of_other_threads(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+  (tmp_path / "own").touch()
+  with monkeypatch.context() as patch, replacing(tmp_path / "a.json"):
+    patch.setattr(os, "umask", lambda mask: pytest.fail("it is the whole process's"))
+  assert (tmp_path / "a.json").stat().st_mode == (tmp_path / "own").stat().st_mode
+
+
 def test_an_error_of_a_full_disk_names_the_file(tmp_path: Path):
   path = tmp_path / "status.json"
   with pytest.raises(OSError) as error, replacing(path):
