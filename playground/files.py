@@ -13,7 +13,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from playground.errors import CheckpointError, ConfigError
@@ -154,6 +154,16 @@ def numbered(path: Path) -> Path:
     number += 1
     free = path.with_name(f"{path.stem}_{number}{path.suffix}")
   return free
+
+
+def make_numbered(path: Path) -> Path:
+  """Makes the folder that `numbered` names; the operating system lets only one process make it."""
+  path.parent.mkdir(parents=True, exist_ok=True)
+  while True:
+    folder = numbered(path)
+    with suppress(FileExistsError):
+      folder.mkdir()
+      return folder
 
 
 def keep_copy(path: Path, stem: str) -> Path:

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 import yaml
 
 from playground.errors import CheckpointError, PlaygroundError, nearest
-from playground.files import lock_holder, locking, numbered, read_json, write_json, write_text
+from playground.files import lock_holder, locking, make_numbered, read_json, write_json, write_text
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
 from playground.settings import Plain, Section, plain
@@ -69,7 +69,7 @@ class RunDirectory:
       run.must_be_new()
     with _writing(run.path):
       if numbered:
-        run = cls(_make_new(run.path))
+        run = cls(make_numbered(run.path))
       run.path.mkdir(parents=True, exist_ok=True)
     return run
 
@@ -233,16 +233,6 @@ def _writing(path: Path) -> Iterator[None]:
     yield
   except OSError as error:
     raise CheckpointError(f"run_dir={path} cannot be written: {error.strerror}.") from error
-
-
-def _make_new(path: Path) -> Path:
-  """Makes a new folder; the operating system lets only one process make it."""
-  path.parent.mkdir(parents=True, exist_ok=True)
-  while True:
-    folder = numbered(path)
-    with contextlib.suppress(FileExistsError):
-      folder.mkdir()
-      return folder
 
 
 def now() -> str:

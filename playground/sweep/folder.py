@@ -16,7 +16,7 @@ import yaml
 from playground.config import RunConfig, format_value, is_of_command
 from playground.config.overrides import SHORT_KEYS
 from playground.errors import CheckpointError, ConfigError, nearest
-from playground.files import is_locked, lock_holder, locking, read_json, write_json, write_text
+from playground.files import is_locked, lock_holder, locking, make_numbered, read_json, write_json, write_text
 from playground.runs.csv_tracker import RETURN
 from playground.runs.run_dir import RunDirectory, now
 from playground.settings import Plain, select
@@ -209,12 +209,16 @@ class SweepDirectory:
   @classmethod
   def create(
     cls, path: str | Path, name: str, command: Sequence[str], settings: Sequence[str], lines: Sequence[str],
-    jobs: Sequence[Job],
+    jobs: Sequence[Job], numbered: bool = False,
   ) -> "SweepDirectory":  # fmt: skip
-    """Makes the folder and writes sweep.yaml; see the attributes. Raises CheckpointError if that fails."""
+    """Makes the folder and writes sweep.yaml; see the attributes. Raises CheckpointError if that fails.
+
+    With `numbered` it is a new folder, `<path>_2`, ... where the name is taken, as by a sweep of the same second.
+    """
     path = Path(os.path.expanduser(path))
-    sweep = cls(path, name, list(command), list(settings), list(lines), list(jobs), Path.cwd(), now())
     try:
+      path = make_numbered(path) if numbered else path
+      sweep = cls(path, name, list(command), list(settings), list(lines), list(jobs), Path.cwd(), now())
       sweep.path.mkdir(parents=True, exist_ok=True)
       sweep.save()
     except OSError as error:

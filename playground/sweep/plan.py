@@ -11,7 +11,6 @@ from playground import config as configs
 from playground.config import RunConfig
 from playground.config.sweep_options import GridConfig, SweepSettings
 from playground.errors import CheckpointError, ConfigError
-from playground.files import numbered
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.runner import launcher_class
 
@@ -64,9 +63,9 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
     found.command, found.settings = command, settings  # `run_sweep` saves them, for `playground sweep retry`
     return found, chosen
   launcher_class(chosen.launcher).check(chosen.launcher, jobs)
-  started = ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"  # another sweep may have the same name
-  path = chosen.sweep_dir or numbered(started)
-  return SweepDirectory.create(path, name, command, settings, lines, jobs), chosen
+  path = chosen.sweep_dir or ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
+  new = SweepDirectory.create(path, name, command, settings, lines, jobs, numbered=chosen.sweep_dir is None)
+  return new, chosen
 
 
 def _lines(overrides: Sequence[str]) -> tuple[list[str], SweepSettings, list[list[str]]]:

@@ -1,7 +1,9 @@
 """From a command line to a sweep on disk."""
 
 import sys
+from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -62,6 +64,21 @@ def test_the_same_command_finds_its_sweep_again(here: Path) -> None:
   assert plan(["seed=1,2", f"sweep_dir={first.path}"])[0].path == first.path, "unless its folder is named"
   with pytest.raises(ConfigError, match="holds a sweep of other jobs"):
     plan(["seed=4,5", f"sweep_dir={first.path}"])
+
+
+def test_sweeps_of_one_second_have_folders_of_their_own(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  started, other = datetime(2026, 1, 1), Path("results/sweeps/quickstart/2026-01-01_00-00-00")
+  monkeypatch.setattr("playground.sweep.plan.datetime", SimpleNamespace(now=lambda: started))
+  exists = Path.exists
+
+  def seen_too_early(path: Path, **kwargs: bool) -> bool:
+    there = exists(path, **kwargs)
+    if path == other and not there:  # another command makes it right after this one has looked
+      path.mkdir(parents=True)
+    return there
+
+  monkeypatch.setattr(Path, "exists", seen_too_early)
+  assert plan(["seed=1,2"])[0].path == other.with_name(f"{other.name}_2")
 
 
 def test_a_search_does_not_take_a_grid_for_its_own(here: Path) -> None:
