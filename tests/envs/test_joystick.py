@@ -340,7 +340,7 @@ def test_a_robot_without_a_free_joint_or_servos(ours: str, theirs: str, message:
   mjcf = find_mjcf("go1")
   robot.write_text(mjcf.read_text().replace(ours, theirs))
   with pytest.raises(ConfigError, match=re.escape(message)):
-    load_task(TASK, {"robot.mjcf": str(robot), "robot.pd": None})
+    load_task(TASK, {"robot.mjcf": str(robot)})
 
 
 @pytest.mark.parametrize(
