@@ -67,7 +67,8 @@ def read_mjcf(mjcf: str) -> mujoco.MjSpec:
   try:
     spec = mujoco.MjSpec.from_file(str(path))
   except ValueError as error:
-    raise ConfigError(f"env.robot.mjcf={mjcf} is not an MJCF that MuJoCo reads: {first_line(error)}.") from None
+    problem = ", ".join(str(error).strip().splitlines())  # the line of the file is on the second
+    raise ConfigError(f"env.robot.mjcf={mjcf} is not an MJCF that MuJoCo reads: {problem}.") from None
   if spec.worldbody.first_body() is None:
     raise ConfigError(f"env.robot.mjcf={mjcf} has no body: the robot must be the first body of its <worldbody>.")
   return spec
@@ -134,8 +135,15 @@ def build_scene(
       if geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER and (geom.contype or geom.conaffinity):
         geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
   geoms = {geom.name: geom for geom in spec.geoms if geom.name}
+  floor = geoms["floor"]
+  paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
   for name in floor_contacts:
-    lookup(geoms, name, "env.robot.floor_contacts")
+    geom = lookup(geoms, name, "env.robot.floor_contacts")
+    if not (name in paired or geom.contype & floor.conaffinity or floor.contype & geom.conaffinity):
+      raise ConfigError(
+        f"env.robot.mjcf={mjcf}: the geom {name} of env.robot.floor_contacts passes through the floor: "
+        'give it conaffinity="1", or a contact pair.'
+      )
   with added_to(mjcf):
     add_floor_contacts(spec, floor_contacts)
   return spec

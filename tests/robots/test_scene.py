@@ -102,8 +102,8 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
   other.write_text(other.read_text().replace("<body", '<geom name="floor" type="plane" size="1 1 1"/><body'))
   with pytest.raises(ConfigError, match=r"ball\.xml has a geom named floor: remove it, the scene adds the ground"):
     build_scene(str(other))
-  other.write_text("<mujoco><wordbody/></mujoco>")
-  with pytest.raises(ConfigError, match=r"ball\.xml is not an MJCF that MuJoCo reads: .*unrecognized element"):
+  other.write_text("<mujoco>\n<wordbody/></mujoco>")
+  with pytest.raises(ConfigError, match=r"ball\.xml is not an MJCF that MuJoCo reads: .*unrecognized element.*line 2"):
     build_scene(str(other))
 
 
@@ -127,6 +127,7 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
       '<asset><hfield name="terrain" nrow="2" ncol="2" size="1 1 1 1"/></asset><sensor>',
       "'terrain' in hfield",
     ),
+    ('<geom name="FR"', '<geom conaffinity="0" name="FR"', "FR of env.robot.floor_contacts passes through the floor"),
   ],
 )
 def test_a_model_that_is_no_robot_or_has_names_of_the_scene(
