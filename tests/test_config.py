@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -280,6 +281,9 @@ def test_foreign_configuration_is_refused(tmp_path: Path):
       config.load(tmp_path / "config.yaml")
   with pytest.raises(ConfigError, match="missing"):
     config.load(tmp_path / "missing")
+  os.mkfifo(tmp_path / "pipe")
+  with pytest.raises(ConfigError, match="pipe cannot be read: it is no file"):
+    config.load(tmp_path / "pipe")
 
 
 def test_null_keys_can_be_assigned():
