@@ -1,5 +1,6 @@
 """The joystick task on two legs: gait, pushes, starts and endings, on recorded states and without compiling physics."""
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ from playground.config import compose
 from playground.envs.base import State
 from playground.envs.task import InitialState
 from playground.errors import ConfigError
+from playground.robots.scene import find_mjcf
 from tests.envs.golden import load_task, recorded
 
 G1, T1, APOLLO = "G1JoystickFlatTerrain", "T1JoystickFlatTerrain", "ApolloJoystickFlatTerrain"
@@ -98,8 +100,11 @@ def test_noise_has_an_amplitude_for_each_joint() -> None:
   np.testing.assert_allclose(error, 2 * [0.03, 0.03, 0.03, 0.05, 0.08, 0.03], rtol=0.03)
 
 
-def test_restricted_joint_range() -> None:
-  model = load_task(G1, {"restricted_joint_range": True}).mj_model
+@pytest.mark.parametrize("unit", ["radian", "degree"])  # of the MJCF's angles
+def test_restricted_joint_range(unit: str, tmp_path: Path) -> None:
+  robot = tmp_path / "robot.xml"
+  robot.write_text(find_mjcf("g1").read_text().replace('angle="radian"', f'angle="{unit}"'))
+  model = load_task(G1, {"restricted_joint_range": True, "robot.mjcf": str(robot)}).mj_model
   np.testing.assert_allclose(model.joint("left_hip_yaw_joint").range, [-0.7, 0.7])
   np.testing.assert_allclose(model.actuator("left_hip_yaw_joint").ctrlrange, [-0.7, 0.7])
   with pytest.raises(ConfigError, match="robot=t1 has no restricted_range"):

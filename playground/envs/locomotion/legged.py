@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from playground.envs.task import InitialState, State, Task
 from playground.errors import ConfigError, lookup
@@ -58,8 +59,10 @@ class LeggedTask(Task):
       if "restricted_range" not in config.robot:
         raise ConfigError(f"env.restricted_joint_range: robot={config.robot.get('name')} has no restricted_range.")
       joints = {joint.name: joint for joint in spec.joints}
-      for name in config.robot.restricted_range:
-        lookup(joints, name, "env.robot.restricted_range").range = config.robot.restricted_range[name]
+      for name, limits in config.robot.restricted_range.items():
+        joint = lookup(joints, name, "env.robot.restricted_range")
+        in_degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE  # the unit of the MJCF's angles
+        joint.range = np.degrees(limits) if in_degrees else limits
     return spec
 
   def prepare_model(self, mj_model: mujoco.MjModel, config: Any) -> None:
