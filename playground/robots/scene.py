@@ -142,7 +142,7 @@ def build_scene(
     if not (name in paired or geom.contype & floor.conaffinity or floor.contype & geom.conaffinity):
       raise ConfigError(
         f"env.robot.mjcf={mjcf}: the geom {name} of env.robot.floor_contacts passes through the floor: "
-        'give it conaffinity="1", or a contact pair.'
+        'a foot needs conaffinity="1", and the default class floor contype="1", or they need a contact pair.'
       )
   with added_to(mjcf):
     add_floor_contacts(spec, floor_contacts)
@@ -162,9 +162,10 @@ def _check_qpos(spec: mujoco.MjSpec, mjcf: str) -> None:
 
 
 def _feet(spec: mujoco.MjSpec) -> None:
-  """The feet against the floor, as the MJCF has it; geoms that cannot collide would only cost time."""
+  """The feet against the floor, as the MJCF has it; geoms without mass that cannot collide would only cost time."""
   for geom in _full_geoms(spec):
-    spec.delete(geom)
+    if geom.mass == 0 or geom.parent.explicitinertial:
+      spec.delete(geom)
 
 
 def _full_self(spec: mujoco.MjSpec) -> None:

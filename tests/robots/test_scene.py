@@ -57,8 +57,18 @@ def test_a_fallen_robot_rests_on_its_body(collision: str) -> None:
   assert heights["feet"] < 0 < 0.03 < heights[collision] < 0.3
 
 
-def test_collision_variants_leave_the_dynamics_alone() -> None:
-  models = [build_scene("go1", collision=name).compile() for name in COLLISIONS]
+BALL = (
+  '<mujoco><default><default class="full"><geom contype="0" conaffinity="0"/></default></default><worldbody>'
+  '<body name="ball"><freejoint/><geom size="0.1"/><geom class="full" size="0.2"/></body></worldbody></mujoco>'
+)
+
+
+@pytest.mark.parametrize("mjcf", ["go1", BALL])
+def test_collision_variants_leave_the_dynamics_alone(mjcf: str, tmp_path: Path) -> None:
+  if mjcf == BALL:  # whose mass is that of its geoms
+    mjcf = str(tmp_path / "ball.xml")
+    Path(mjcf).write_text(BALL)
+  models = [build_scene(mjcf, collision=name).compile() for name in COLLISIONS]
   for model in models[1:]:
     np.testing.assert_array_equal(model.body_mass, models[0].body_mass)
     np.testing.assert_array_equal(model.body_inertia, models[0].body_inertia)
