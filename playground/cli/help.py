@@ -38,7 +38,7 @@ _GROUPS = {
 _MANY = 20  # groups of which only the number of options is shown
 _RUN_KEYS = ("seed", "run_dir", "resume", "init_from")
 _FLAGS = {
-  "-m, --multirun": "run a sweep: `key=a,b`, `seed=range(3)`, sweep=<file of sweeps/>",
+  "-m, --multirun": "run a sweep: `key=a,b`, `seed=range(3)`, sweep=<name or file.yaml>",
   "--cfg job": "print the configuration and do not train; --package KEY prints a part of it",
   "--help KEY": "explain a key or section: --help agent, --help env.rewards env=Go1Getup",
   "--verbose": "print the whole configuration before training",

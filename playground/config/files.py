@@ -1,4 +1,4 @@
-"""Finds the files of configs/ and sweeps/, ours and those of outside packages, and the options that they define."""
+"""Finds the files of configs/, ours and those of outside packages, and the options that they define."""
 
 import functools
 import importlib.metadata

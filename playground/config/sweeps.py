@@ -1,6 +1,6 @@
 """Sweeps, `playground-run -m`: expands sweep files and globs into jobs.
 
-A file of sweeps/ holds overrides in the syntax of the command line; a list is one job for each value:
+A sweep file, ours in sweeps/ or your own, holds overrides as on the command line; a list is one job for each value:
 
 ```yaml
 params:
@@ -40,7 +40,7 @@ _HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper
 
 
 def expand(overrides: Sequence[str]) -> list[str]:
-  """Expands the overrides of `-m`: `sweep=<name>` becomes the overrides of its file, a glob its options.
+  """Expands the overrides of `-m`: `sweep=<name or path>` becomes the overrides of its file, a glob its options.
 
   The command line wins over the file.
 
@@ -207,12 +207,18 @@ def _spell_out(override: HydraOverride, roots: Sequence[Path]) -> str:
 
 
 def _read(name: str) -> tuple[list[str], list[str]]:
-  """Reads a sweep file: `params` as overrides, and `jobs`."""
-  known = sweep_names()
-  if name not in known:
-    raise UnknownNameError(f"sweep={name} does not exist: choose from {', '.join(known)}.{nearest(name, known)}")
+  """Reads one of our sweep files, or the one at a path that ends in .yaml: `params` as overrides, and `jobs`."""
+  known, path = sweep_names(), Path(name).expanduser()
+  if path.suffix == ".yaml":
+    if not path.is_file():
+      raise UnknownNameError(f"sweep={name} does not exist, or is no file.")
+  elif name in known:
+    path = shipped("sweeps") / f"{name}.yaml"
+  else:
+    choices = f"choose from {', '.join(known)}, or give the path of a .yaml file"
+    raise UnknownNameError(f"sweep={name} does not exist: {choices}.{nearest(name, known)}")
   try:
-    content = OmegaConf.to_container(OmegaConf.load(shipped("sweeps") / f"{name}.yaml"))
+    content = OmegaConf.to_container(OmegaConf.load(path))
   except (YAMLError, OmegaConfBaseException, ValueError, RecursionError, OSError) as error:
     raise ConfigError(f"sweep={name}: its file cannot be read: {first_line(error)}.") from None
   if not isinstance(content, Mapping) or not content or not set(content) <= {"params", "jobs"}:

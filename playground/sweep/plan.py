@@ -88,7 +88,7 @@ def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
   """Returns the sweep file's name, or the names of the jobs' runs."""
   for text in overrides:
     if text.startswith("sweep="):
-      return text.partition("=")[2]
+      return Path(text.partition("=")[2]).stem
   names = list(dict.fromkeys(config.name for config in composed))
   return "_".join(names[:2]) + (f"_and_{len(names) - 2}_more" if len(names) > 2 else "")
 

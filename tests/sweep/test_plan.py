@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from playground.config import sweeps
 from playground.config.sweep_options import LocalConfig, SlurmConfig
 from playground.errors import ConfigError, PlaygroundError
 from playground.sweep import local
@@ -38,19 +37,21 @@ def test_jobs_are_named_after_what_they_differ_in(here: Path) -> None:
   assert isinstance(settings_of(sweep, ["launcher=slurm"]).launcher, SlurmConfig)
 
 
-def test_a_listed_job_is_named_after_what_it_says_itself(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_listed_job_is_named_after_what_it_says_itself(here: Path) -> None:
   jobs = ["env=CartpoleBalance agent.max_grad_norm=2.0", "experiment=cheetah_run seed=4,5"]
-  Path("these.yaml").write_text(f"params: {{debug: fast, tuned: null}}\njobs: {jobs}\n")
-  monkeypatch.setattr(sweeps, "shipped", lambda name: here)
-  sweep, _ = plan(["sweep=these"])
+  Path("my jobs").mkdir()
+  Path("my jobs/these.yaml").write_text(f"params: {{debug: fast, tuned: null}}\njobs: {jobs}\n")
+  line = "sweep='my jobs/these.yaml'"
+  sweep, _ = plan([line])
+  assert sweep.path.parent == Path("results/sweeps/these")
   assert [job.name for job in sweep.jobs] == [
     "000_CartpoleBalance_max_grad_norm=2", "001_cheetah_run_seed=4", "002_cheetah_run_seed=5",
   ]  # fmt: skip
   assert [job.varies["env"] for job in sweep.jobs] == ["CartpoleBalance", "CheetahRun", "CheetahRun"]
   assert [job.task for job in sweep.jobs] == ["CartpoleBalance", "CheetahRun", "CheetahRun"]
-  assert plan(["sweep=these"])[0].path == sweep.path  # the same command goes on with it
+  assert plan([line])[0].path == sweep.path  # the same command goes on with it
   with pytest.raises(ConfigError, match="its sweep file cannot list jobs"):
-    plan(["sweep=these", "search=optuna", "agent.learning_rate=interval(1e-4,1e-2)"])
+    plan([line, "search=optuna", "agent.learning_rate=interval(1e-4,1e-2)"])
 
 
 def test_the_same_command_finds_its_sweep_again(here: Path) -> None:
