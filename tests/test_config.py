@@ -164,6 +164,11 @@ def test_options_we_ship_compose(group: str, every: int):
     assert compose([f"{group}={option}"]).choices[group] == option
 
 
+def test_one_string_is_no_list_of_overrides():
+  with pytest.raises(ConfigError, match=r"compose takes a list of overrides: compose\(\['env=CartpoleBalance'\]\)"):
+    compose("env=CartpoleBalance")
+
+
 def test_several_debug_presets():
   run = compose(["debug=[fast,profile]"])
   assert run.profile.enable

@@ -88,6 +88,8 @@ def compose(overrides: Sequence[str] = (), config_dir: Path | None = None) -> Ru
     ConfigError: an invalid value, in one sentence.
     UnknownNameError: a group, option or key that does not exist.
   """
+  if isinstance(overrides, str):
+    raise ConfigError(f"compose takes a list of overrides: compose([{overrides!r}]).")
   return compose_all([overrides], config_dir)[0]
 
 
