@@ -16,7 +16,8 @@ from tests.dummy import PointTask
 
 TOUCHES = np.array([[1, 0], [1, 1], [1, 0], [0, 0]], np.float32)  # left and right foot, by step
 SPEEDS = np.array([[0.2, 9.0], [0.1, 0.5], [0.0, 9.0], [9.0, 9.0]], np.float32)
-ACTIONS = np.array([[0.3, -0.1], [0.3, 0.5], [-1.0, 1.0], [0.0, 0.0]], np.float32)
+ACTIONS = np.array([[0.3, -0.1], [0.3, 0.96], [-1.0, 1.0], [0.0, 0.0]], np.float32)
+SATURATION = 0.5  # of the second joint; 0.25 of the first
 
 
 class Walker(PointTask):
@@ -59,6 +60,7 @@ def test_the_gait_of_an_episode() -> None:
   slip = (TOUCHES * SPEEDS).sum(1) / np.maximum(TOUCHES.sum(1), 1)
   assert measured(GaitMetrics(Walker())) == {
     "gait/action_rate": pytest.approx(np.sqrt((change**2).mean(1)).mean(), rel=1e-5),
+    "gait/saturation": SATURATION,
     "gait/foot_slip": pytest.approx(slip.mean(), rel=1e-5),
     "gait/duty_asymmetry": pytest.approx(3 / 4 - 1 / 4),
   }
@@ -67,11 +69,14 @@ def test_the_gait_of_an_episode() -> None:
 def test_the_change_of_an_action_that_repeats() -> None:
   change = np.sqrt((np.diff(ACTIONS, axis=0, prepend=0) ** 2).mean(1)).mean()
   env = Walker(action_repeat=2, foot_linvel=[], left_to_right={})
-  assert measured(GaitMetrics(env)) == {"gait/action_rate": pytest.approx(change, rel=1e-5)}
+  assert measured(GaitMetrics(env)) == {
+    "gait/action_rate": pytest.approx(change, rel=1e-5),
+    "gait/saturation": SATURATION,
+  }
 
 
 def test_a_robot_without_sensors_or_a_mirror_has_the_others() -> None:
-  assert set(measured(GaitMetrics(Walker(foot_linvel=[], left_to_right={})))) == {"gait/action_rate"}
+  assert set(measured(GaitMetrics(Walker(foot_linvel=[], left_to_right={})))) == {"gait/action_rate", "gait/saturation"}
 
 
 def test_other_tasks_stay_as_they_are() -> None:
