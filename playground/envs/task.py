@@ -157,7 +157,7 @@ class Task(Env):
     data = self.start_physics(model, initial)
     nothing = jnp.zeros(self.action_size)
     info: dict[str, Any] = {"rng": rng, "last_act": nothing, "last_last_act": nothing, **redrawn}
-    info |= self.commands.reset(command_key) | self.events.reset(push_key, model)
+    info |= self.commands.reset(command_key) | self.events.reset(push_key, model) | self.terminations.start()
     info |= self.first_info(data, own_key, model)
     c = self.context(self, data, info | {"rng": obs_key}, nothing, dt=0.0)  # terms of the first step draw from `rng`
     obs, buffers = self.observations.compute(c, obs_key)
@@ -179,9 +179,10 @@ class Task(Env):
     after |= self.commands.step(c, command_key) | self.next_info(c, own_key)
     after |= {"observation_buffers": buffers} if buffers else {}
     reward = self.clipped(self.total(rewards))
+    done, ended = self.terminations.end(c)
     if self.events.groups["interval"]:  # whose forces, which add up, act in one step
       data = data.replace(xfrc_applied=jnp.zeros_like(data.xfrc_applied))
-    return State(data, obs, reward, c.terminated.astype(jnp.float32), self._metrics(c, rewards), after)
+    return State(data, obs, reward, done, self._metrics(c, rewards), after | ended)
 
   def total(self, rewards: Mapping[str, jax.Array]) -> jax.Array:
     """Returns the reward of a step from its weighted terms, before `reward_clip`: dt * total.
@@ -203,7 +204,7 @@ class Task(Env):
     ended = {name: value.astype(jnp.float32) for name, value in self.terminations.compute(c).items()}
     metrics = {f"reward/{name}": value for name, value in rewards.items()}
     metrics |= {f"termination/{name}": value for name, value in ended.items()}
-    failures = [ended[term.name] for term in self.terminations.terms if not term.options.success]
+    failures = [ended[t.name] for t in self.terminations.terms if not (t.options.success or t.options.time_out)]
     return metrics | {"fall": jnp.array(failures, jnp.float32).max(initial=0.0)} | self.measure(c)
 
   @property

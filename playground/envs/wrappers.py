@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.base import Env, State
+from playground.mdp.managers import TIME_OUT
 from playground.physics.backend import STATE_FIELDS, WORLDS, BufferUse, mjx
 
 ModelFields = Mapping[str, jax.Array]
@@ -152,8 +153,9 @@ class Episode(Wrapper):
   the reduction of the task's `summaries`; a non-finite step counts in sums only, with 0. A policy step has the metrics
   of its last repeat; those with a `max` have that of all repeats until the episode ends.
 
-  A time-out gives done = 1 with `info["truncation"]` = 1, kept apart from the task's own termination. With repeats an
-  episode that terminates in an earlier one stays done and earns nothing in the later ones.
+  A time-out, of this limit or of a termination term with `time_out`, gives done = 1 with `info["truncation"]` = 1, kept
+  apart from the task's own termination. With repeats an episode that ends in an earlier one stays done and earns
+  nothing in the later ones.
   """
 
   def __init__(self, env: Any, length: int, action_repeat: int = 1):
@@ -169,23 +171,30 @@ class Episode(Wrapper):
     return state.replace(info=state.info | info)
 
   def step(self, state: State, action: jax.Array, model: ModelFields | None = None) -> State:
-    def repeat(carry: tuple[State, jax.Array, jax.Array, Any, BufferUse | None], _: None) -> tuple[Any, None]:
-      state, reward, done, most, used = carry
+    def is_cut(state: State) -> jax.Array:
+      return state.info.get(TIME_OUT, jnp.zeros_like(state.done)) * (1 - state.info["nonfinite"])
+
+    def repeat(
+      carry: tuple[State, jax.Array, jax.Array, jax.Array, Any, BufferUse | None], _: None
+    ) -> tuple[Any, None]:
+      state, reward, done, cut, most, used = carry
       state = self.env.step(state, action, model)
+      cut = jnp.where(done > 0, cut, is_cut(state))
       used = None if used is None else used.join(state.data.buffers)
       most = {k: jnp.where(done > 0, old, jnp.maximum(old, state.metrics[k])) for k, old in most.items()}
-      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done), most, used), None
+      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done), cut, most, used), None
 
     was_done = state.info["episode_done"]
     kinds = {k: kind for k, kind in self.env.summaries.items() if k in state.metrics}
     if self.repeat == 1:
       after = self.env.step(state, action, model)
-      reward, ended = after.reward, after.done
+      reward, ended, cut = after.reward, after.done, is_cut(after)
     else:
       unused = jax.tree.map(jnp.zeros_like, state.data.buffers)
       least = {k: jnp.full_like(state.metrics[k], -jnp.inf) for k, kind in kinds.items() if kind == "max"}
-      start = (state, jnp.zeros_like(state.reward), jnp.zeros_like(state.done), least, unused)
-      (after, reward, ended, most, used), _ = jax.lax.scan(repeat, start, None, self.repeat)
+      zero = jnp.zeros_like(state.done)
+      start = (state, jnp.zeros_like(state.reward), zero, zero, least, unused)
+      (after, reward, ended, cut, most, used), _ = jax.lax.scan(repeat, start, None, self.repeat)
       after = after.replace(data=after.data.replace(buffers=used), metrics=after.metrics | most)
 
     steps = state.info["steps"] + self.repeat
@@ -198,7 +207,7 @@ class Episode(Wrapper):
     totals |= {k: jnp.where(after.info["nonfinite"] > 0, sums[k], totals[k]) for k in kinds}
     info = after.info | {
       "steps": steps,
-      "truncation": jnp.where(timed_out, 1 - ended, 0.0),
+      "truncation": jnp.where(timed_out, 1 - ended + cut, cut),
       "episode_done": done,
       "episode_metrics": totals,
     }

@@ -148,7 +148,7 @@ class StepContext:
 
   @functools.cached_property
   def terminated(self) -> jax.Array:
-    """Whether any termination term ends the episode in this step, bool."""
+    """Whether any termination term ends the episode in this step, those with `time_out` aside, bool."""
     return self.env.terminations.any(self)
 
   @property

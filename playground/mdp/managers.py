@@ -74,6 +74,9 @@ def _value(term: Term, c: StepContext) -> jax.Array:
   return value
 
 
+TIME_OUT = "time_out"  # entry of `info`: 1 where nothing but terms with `time_out` ends the episode; if there are any
+
+
 class TerminationManager(_Manager):
   """Reasons to end an episode."""
 
@@ -85,9 +88,22 @@ class TerminationManager(_Manager):
     """Returns whether each term ends the episode, by name, each a bool of shape []."""
     return {term.name: term.scalar(c).astype(bool) for term in self.terms}
 
-  def any(self, c: StepContext) -> jax.Array:
-    """Returns whether any term ends the episode, a bool of shape []."""
-    return jnp.array(list(self.compute(c).values()), bool).any()
+  def any(self, c: StepContext, time_out: bool = False) -> jax.Array:
+    """Returns whether any of the terms with that `time_out` ends the episode, a bool of shape []."""
+    values = self.compute(c)
+    return jnp.array([values[term.name] for term in self.terms if term.options.time_out == time_out], bool).any()
+
+  def start(self) -> Info:
+    """Returns the entries of `info` at the start of an episode."""
+    return {TIME_OUT: jnp.zeros(())} if any(term.options.time_out for term in self.terms) else {}
+
+  def end(self, c: StepContext) -> tuple[jax.Array, Info]:
+    """Returns whether the episode ends, 0 or 1, shape [], and the entries of `info` after the step."""
+    terminated = c.terminated
+    if not self.start():
+      return terminated.astype(jnp.float32), {}
+    cut = self.any(c, time_out=True) & ~terminated
+    return (terminated | cut).astype(jnp.float32), {TIME_OUT: cut.astype(jnp.float32)}
 
 
 class ObservationManager(_Manager):

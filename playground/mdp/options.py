@@ -43,9 +43,12 @@ class TerminationOptions(NamedTuple):
 
   Attributes:
     success: the term ends the episode because the task is done: the metric `fall` does not count it.
+    time_out: the term cuts the episode as the time limit does (a truncation): neither the metric `fall` nor the reward
+      `is_terminated` counts it.
   """
 
   success: bool = False
+  time_out: bool = False
 
 
 class CommandOptions(NamedTuple):

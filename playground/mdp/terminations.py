@@ -8,7 +8,7 @@ import numpy as np
 
 from playground.errors import ConfigError
 from playground.limits import AtLeast0, Limit, Share
-from playground.mdp.context import StepContext
+from playground.mdp.context import StepContext, root_qpos
 from playground.mdp.legged import LeggedContext
 from playground.mdp.manipulators import ArmContext, HandContext
 from playground.text import format_value
@@ -53,6 +53,18 @@ def joint_pos_out_of_target_range(c: LeggedContext, margin: AtLeast0 = 0.0) -> j
 def base_height_below(c: LeggedContext, limit: float) -> jax.Array:
   """The base site is less than the limit above the world's z = 0, m."""
   return c.base_height < limit
+
+
+def terrain_out_of_bounds(c: LeggedContext, distance_buffer: AtLeast0 = 1.0) -> jax.Array:
+  """The base is nearer to the edge of the terrain's height field than the buffer, m, or beyond; never on flat ground.
+
+  With `time_out: true` a robot that reaches the edge has not fallen (Isaac Lab).
+  """
+  model = c.robot.mj_model
+  field = model.geom_dataid[c.robot.find("geom", "floor")]
+  if field < 0:
+    return jnp.array(False)
+  return (jnp.abs(root_qpos(c)[:2]) > model.hfield_size[field, :2] - distance_buffer).any()
 
 
 def fatal_contact(c: LeggedContext, count: int = 0) -> jax.Array:

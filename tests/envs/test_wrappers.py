@@ -70,6 +70,29 @@ def test_a_task_that_ends_itself_is_not_truncated(full_reset: bool) -> None:
   np.testing.assert_array_equal(states[2].info["truncation"], 0)
 
 
+@pytest.mark.parametrize(
+  ("repeat", "cut_at", "die_at", "truncation"),
+  [(1, 1, None, [1]), (1, 2, None, [0, 1]), (2, 2, None, [1]), (2, 1, 2, [1]), (2, 2, 1, [0])],  # the first end counts
+)
+def test_a_term_with_time_out_truncates(repeat: int, cut_at: int, die_at: int | None, truncation: list[int]) -> None:
+  class Cut(Counting):
+    def reset(self, rng: jax.Array, model: Any = None) -> State:
+      state = super().reset(rng)
+      return state.replace(info=state.info | {"time_out": jnp.zeros(())})
+
+    def post_step(self, data: Any, info: Any, action: jax.Array) -> State:
+      state = super().post_step(data, info, action)
+      cut = (state.info["age"] == cut_at).astype(float)
+      return state.replace(done=jnp.maximum(state.done, cut), info=state.info | {"time_out": cut})
+
+  env = wrappers.wrap_for_training(Cut(episode_length=9, action_repeat=repeat, die_at=die_at))
+  state, step = env.reset(jax.random.split(jax.random.PRNGKey(0), N)), jax.jit(env.step)
+  for expected in truncation:
+    state = step(state, jnp.zeros((N, 2)))
+    np.testing.assert_array_equal(state.info["truncation"], expected)
+  np.testing.assert_array_equal(state.done, 1)
+
+
 def test_cached_reset_returns_to_the_first_state_and_keeps_info() -> None:
   states = roll(LENGTH + 1)
   np.testing.assert_array_equal(states[LENGTH].data.qpos, states[0].data.qpos)

@@ -92,6 +92,20 @@ def test_any_termination_ends_the_episode() -> None:
   assert not TerminationManager({}).any(c)
 
 
+def test_a_term_with_time_out_cuts_an_episode_unless_another_ends_it() -> None:
+  low, power = {"func": "base_height_below", "params": {"limit": 9.0}}, {"params": {"limit": 1}}
+  for sections, done, info in (
+    ({"low": low}, 1, {}),
+    ({"low": {**low, "time_out": True}}, 1, {"time_out": 1}),
+    ({"low": {**low, "time_out": True}, "power_above": power}, 1, {"time_out": 0}),
+    ({"low": {"func": "base_height_below", "params": {"limit": 0.2}, "time_out": True}}, 0, {"time_out": 0}),
+  ):
+    manager, c = TerminationManager(sections), context()
+    c.env.terminations = manager  # pyright: ignore[reportAttributeAccessIssue]
+    assert manager.end(c) == (done, info)
+    assert manager.start().keys() == info.keys()
+
+
 @pytest.mark.parametrize(
   ("manager", "half"),
   [

@@ -1,9 +1,11 @@
 """Each reward and termination term's formula on one case computed by hand."""
 
 import inspect
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -106,7 +108,8 @@ def not_of_manipulators(kind: str) -> set[str]:
 
 def test_every_term_has_a_case() -> None:
   assert {name for name, *_ in CASES} == not_of_manipulators("rewards")
-  assert {name for name, *_ in ENDINGS} == not_of_manipulators("terminations")
+  with_a_model = {"terrain_out_of_bounds"}  # has its own test
+  assert {name for name, *_ in ENDINGS} | with_a_model == not_of_manipulators("terminations")
 
 
 def reward(name: str, c: Any, **params: Any) -> float:
@@ -190,3 +193,19 @@ def test_pose_and_calm_are_for_the_upright_and_high() -> None:
   for name, low in (("action_exp_when_up", 0.29), ("action_exp_when_root_up", 0.19)):
     np.testing.assert_allclose(reward(name, upright, tilt=0.01, height=low), np.exp(-0.5 * 0.1), rtol=1e-5)
     assert reward(name, upright, tilt=0.01, height=low + 0.02) == 0
+
+
+@pytest.mark.parametrize(
+  ("ground", "place", "buffer", "ends"),
+  [("hfield", 8.9, 1.0, False), ("hfield", -9.1, 1.0, True), ("hfield", -9.1, 0.5, False), ("plane", 99.0, 1.0, False)],
+)
+def test_the_edge_of_the_terrain(ground: str, place: float, buffer: float, ends: bool) -> None:
+  shape = 'type="hfield" hfield="terrain"' if ground == "hfield" else 'type="plane" size="0 0 1"'
+  model = mujoco.MjModel.from_xml_string(
+    f"""<mujoco><asset><hfield name="terrain" nrow="2" ncol="2" size="10 10 1 1"/></asset><worldbody>
+    <geom name="floor" {shape}/><body><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
+  )
+  robot = SimpleNamespace(mj_model=model, find=lambda kind, name: getattr(model, kind)(name).id)
+  data = SimpleNamespace(qpos=jnp.array([0.0, place, 0.3, 1.0, 0.0, 0.0, 0.0]))
+  c: Any = SimpleNamespace(robot=robot, data=data, env=SimpleNamespace(mj_model=model))
+  assert terminations.terrain_out_of_bounds(c, buffer) == ends

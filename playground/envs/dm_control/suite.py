@@ -112,12 +112,13 @@ class SuiteTask(Env):
   def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     reward, terms = self.reward(data, action)
     c = StepContext(self, data, info, action)  # pyright: ignore[reportArgumentType]  # it has the parts that terms read
-    more, ended = self.rewards.compute(c), self.terminations.compute(c)
+    more, reasons = self.rewards.compute(c), self.terminations.compute(c)
     metrics = {f"reward/{name}": value for name, value in (terms | more).items()}
-    metrics |= {f"termination/{name}": value.astype(jnp.float32) for name, value in ended.items()}
+    metrics |= {f"termination/{name}": value.astype(jnp.float32) for name, value in reasons.items()}
+    done, ended = self.terminations.end(c)
     after = {**info, "last_act": action, "last_last_act": info["last_act"]} if self.rewards.terms else dict(info)
     reward = sum(more.values(), reward)
-    return State(data, self.observe(data), reward, c.terminated.astype(jnp.float32), metrics, after)
+    return State(data, self.observe(data), reward, done, metrics, after | ended)
 
 
 def draw_angle(key: jax.Array, shape: tuple[int, ...] = ()) -> jax.Array:
