@@ -41,13 +41,17 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   if as_json:
     print(json.dumps(rows, indent=1))
     return 0
-  console = Console()
-  if not console.is_terminal:  # one line a task, however long
-    console = Console(width=240)
+  console = wide_console()
   console.print(_table(rows))
   count = f"{len(rows)} task{'s' * (len(rows) != 1)}"
   console.print(f"{count}. Train one with playground train env=<task>.", soft_wrap=True)
   return 0
+
+
+def wide_console() -> Console:
+  """Returns a console for tables with a line for each task: however long the line where there is no terminal."""
+  console = Console()
+  return console if console.is_terminal else Console(width=240)
 
 
 def _table(rows: Iterable[Section]) -> Table:

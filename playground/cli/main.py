@@ -33,7 +33,7 @@ _PROGRAMS = {
   "bench": ("playground.cli.bench", "Measure speed and memory; the same as playground-bench."),
 }
 _RUN = "run directory, checkpoint, a task for its pretrained policy, or wandb:<entity>/<project>/<run>"
-_CAMERA = "camera of --video (default: one that shows the whole scene)"
+_CAMERA = "camera of --video (default: video.camera of the run, else one that shows the whole scene)"
 Command = Callable[[argparse.Namespace], int]  # returns the exit code
 
 

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from playground import catalog, pretrained
+from playground.cli.list_tasks import wide_console
 from playground.cli.play import play, result_name
 from playground.config import task_names
 from playground.deploy.export import export_run
@@ -28,7 +29,7 @@ def show_policies(console: Console | None = None) -> int:
   """Prints a table of the cards; returns the exit code, 0."""
   table = Table(*_COLUMNS, box=SIMPLE, padding=(0, 1, 0, 0), title="Pretrained policies")
   for column in table.columns:
-    column.no_wrap = True
+    column.no_wrap, column.overflow = column.header != "task", "fold"
   for task, card in cards().items():
     trained, plain = card["training"], card["c_mujoco"]
     score = trained["sampled"] if trained["mode"] is None else trained["mode"]
@@ -36,7 +37,7 @@ def show_policies(console: Console | None = None) -> int:
     steps = millions(card["steps"])
     measured = f"{plain['return']:.1f} ± {plain['return_std']:.1f}"
     table.add_row(task, card["agent"], card["status"], steps, f"{score:.1f}", measured, falls)
-  (console or Console()).print(table)
+  (console or wide_console()).print(table)
   return 0
 
 

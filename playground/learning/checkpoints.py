@@ -444,7 +444,7 @@ def round_policy(folder: str | Path, bits: int, chosen: Callable[[str], bool]) -
   Args:
     folder: the checkpoint.
     bits: significant bits that stay, of 24.
-    chosen: whether to round the array of that name, such as ".params.value['params']['hidden_0']['kernel']".
+    chosen: whether to round the array of that name, such as `.params.value['params']['hidden_0']['kernel']`.
 
   Raises:
     CheckpointError: as `Checkpoint` does.
