@@ -175,7 +175,7 @@ class Episode(Wrapper):
       return state.info.get(TIME_OUT, jnp.zeros_like(state.done)) * (1 - state.info["nonfinite"])
 
     def repeat(
-      carry: tuple[State, jax.Array, jax.Array, jax.Array, Any, BufferUse | None], _: None
+      carry: tuple[State, jax.Array, jax.Array, jax.Array, dict[str, jax.Array], BufferUse | None], _: None
     ) -> tuple[Any, None]:
       state, reward, done, cut, most, used = carry
       state = self.env.step(state, action, model)
