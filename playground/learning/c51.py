@@ -34,9 +34,15 @@ class Atoms:
     """
     moved = jnp.clip(reward[..., None] + discount[..., None] * self.values, self.low, self.high)
     place = (moved - self.low) / self.step  # in atoms, [..., K]
-    # Each atom's share goes to its two neighbours. One after the other: [..., K, K] would be gigabytes.
-    share = lambda atom: (probabilities * jax.nn.relu(1 - jnp.abs(place - atom))).sum(axis=-1)
-    return jnp.moveaxis(jax.lax.map(share, jnp.arange(len(self.values), dtype=jnp.float32)), 0, -1)
+    atoms = jnp.arange(len(self.values), dtype=jnp.float32)
+
+    def add(source: jax.Array, total: jax.Array) -> jax.Array:
+      """Adds the share that each atom gets of one atom of the value: its two neighbours get all of it."""
+      take = lambda x: jax.lax.dynamic_slice_in_dim(x, source, 1, axis=-1)
+      return total + take(probabilities) * jax.nn.relu(1 - jnp.abs(take(place) - atoms))
+
+    # One after the other: [..., K, K] would be gigabytes. Eight a pass, for each pass reads and writes the total.
+    return jax.lax.fori_loop(0, len(atoms), add, jnp.zeros_like(probabilities), unroll=8)
 
 
 class C51Networks(Actor):
