@@ -83,6 +83,7 @@ class TerminationManager(_Manager):
   def __init__(self, section: Mapping[str, Any]):
     """Binds `env.terminations`; raises as `terms.bind`."""
     self.groups = {"terminations": bind("terminations", section)}
+    self._has_time_out = any(term.options.time_out for term in self.terms)
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns whether each term ends the episode, by name, each a bool of shape []."""
@@ -95,12 +96,12 @@ class TerminationManager(_Manager):
 
   def start(self) -> Info:
     """Returns the entries of `info` at the start of an episode."""
-    return {TIME_OUT: jnp.zeros(())} if any(term.options.time_out for term in self.terms) else {}
+    return {TIME_OUT: jnp.zeros(())} if self._has_time_out else {}
 
   def end(self, c: StepContext) -> tuple[jax.Array, Info]:
     """Returns whether the episode ends, 0 or 1, shape [], and the entries of `info` after the step."""
     terminated = c.terminated
-    if not self.start():
+    if not self._has_time_out:
       return terminated.astype(jnp.float32), {}
     cut = self.any(c, time_out=True) & ~terminated
     return (terminated | cut).astype(jnp.float32), {TIME_OUT: cut.astype(jnp.float32)}
