@@ -56,7 +56,7 @@ def dump_yaml(values: object) -> str:
   return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
-def first_line(error: Exception) -> str:
+def first_line(error: BaseException) -> str:
   """Returns the first line of an error, to be put into a sentence; of YAML's the problem and its place."""
   if isinstance(error, yaml.MarkedYAMLError) and (mark := error.problem_mark):
     return f"{error.problem} in {mark.name}, line {mark.line + 1}"

@@ -22,6 +22,7 @@ from playground.hardware.gpus import query_gpus
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.runs.provenance import package_version
 from playground.runs.wandb_tracker import logged_in
+from playground.text import first_line
 
 REQUIRED = {  # distribution -> module whose import proves that it works
   "jax": "jax",
@@ -99,7 +100,7 @@ def _import_error(module: str) -> str:
     with contextlib.redirect_stdout(io.StringIO()):
       importlib.import_module(module)
   except Exception as error:  # a broken installation raises any type of error
-    return f"import fails: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
+    return f"import fails: {first_line(error)}"
   return ""
 
 
@@ -111,8 +112,7 @@ def _devices() -> Iterator[Finding]:
     devices = jax.devices()
     jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((8, 8))))
   except Exception as error:
-    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-    yield Finding("JAX backend", reason, False, "unset JAX_PLATFORMS, or set it to cpu")
+    yield Finding("JAX backend", first_line(error), False, "unset JAX_PLATFORMS, or set it to cpu")
     return
   kinds = ", ".join(sorted({d.device_kind for d in devices}))
   yield Finding("JAX backend", f"{jax.default_backend()}, {len(devices)} x {kinds}")

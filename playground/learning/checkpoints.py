@@ -37,6 +37,7 @@ from playground.errors import CheckpointError
 from playground.files import numbered
 from playground.pytree import PyTree
 from playground.settings import Plain, Section
+from playground.text import first_line
 
 FORMAT = "playground-run/1"
 BEST = "best"
@@ -529,7 +530,7 @@ def _not_about_files(error: BaseException | None) -> str | None:
       return os.strerror(int(number[1]))
     no_resource = isinstance(error, MemoryError | RuntimeError) and not isinstance(error, RecursionError)
     if no_resource or text.startswith(_TRANSIENT):
-      return text.splitlines()[0] if text else type(error).__name__
+      return first_line(error)
     error = error.__cause__ or error.__context__
   return None
 

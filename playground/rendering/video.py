@@ -26,6 +26,7 @@ from playground.errors import ConfigError, PlaygroundError, UnknownNameError, ne
 from playground.files import need_file, replacing
 from playground.interpreter import PYTHON
 from playground.rendering.gl import NO_GL_REMEDY, find_gl, gl_environment
+from playground.text import first_line
 
 if TYPE_CHECKING:
   import mujoco
@@ -284,4 +285,4 @@ if __name__ == "__main__":
   try:
     _work(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]))
   except Exception as error:  # the parent shows the last line
-    sys.exit(str(error).splitlines()[0] if str(error) else type(error).__name__)
+    sys.exit(first_line(error))

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playground.errors import CheckpointError, ConfigError
-from playground.runs.wandb_tracker import TYPE, logged_in, reason
+from playground.runs.wandb_tracker import TYPE, logged_in
+from playground.text import first_line
 
 if TYPE_CHECKING:
   import wandb
@@ -52,7 +53,7 @@ def local_path(name: str) -> str:
   except OSError as error:
     raise CheckpointError(f"{_DOWNLOADS} cannot be written: {error.strerror or error}.") from error
   except Exception as error:  # wandb raises errors of many kinds
-    raise ConfigError(f"{name} cannot be downloaded: {reason(error)}.") from error
+    raise ConfigError(f"{name} cannot be downloaded: {first_line(error)}.") from error
   return str(folder)
 
 

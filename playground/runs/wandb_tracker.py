@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 from playground.files import write_text
 from playground.pretrained import copy_policy
 from playground.settings import Section
+from playground.text import first_line
 
 if TYPE_CHECKING:
   import wandb
@@ -98,7 +99,7 @@ class WandbTracker:
     except Exception as error:
       if mode != "online":
         raise
-      self._notify(f"W&B cannot be reached ({reason(error)}): this run is recorded offline.")
+      self._notify(f"W&B cannot be reached ({first_line(error)}): this run is recorded offline.")
       wandb.teardown()  # its service still holds the id
       self._run = wandb.init(**start, mode="offline")
     if recorded := sorted(folder.glob("wandb/offline-run-*")):  # the names begin with the time
@@ -118,12 +119,7 @@ class WandbTracker:
       call()
     except Exception as error:  # training continues whatever a third-party service raises
       self._run = None
-      self._notify(f"W&B tracking is off for the rest of this run ({reason(error)}); metrics.csv goes on.")
-
-
-def reason(error: Exception) -> str:
-  """Returns the first line of an error's message."""
-  return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")
+      self._notify(f"W&B tracking is off for the rest of this run ({first_line(error)}); metrics.csv goes on.")
 
 
 def _upload(run: "wandb.Run", folder: Path) -> None:

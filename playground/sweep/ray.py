@@ -13,6 +13,7 @@ from playground.extras import install_command
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import MEMORY_FRACTION
 from playground.sweep.worker import COMMAND, Worker
+from playground.text import first_line
 
 try:
   import ray
@@ -50,7 +51,7 @@ class RayLauncher:
         with contextlib.chdir(_PACKAGES):
           ray.init(address=address, log_to_driver=False, include_dashboard=False)
       except (OSError, RuntimeError, ValueError) as error:
-        raise HardwareError(f"launcher=ray: no cluster at {address}: {str(error).splitlines()[0]}") from None
+        raise HardwareError(f"launcher=ray: no cluster at {address}: {first_line(error)}") from None
       RayLauncher._owned = True
     has = ray.cluster_resources()
     for job in jobs:
