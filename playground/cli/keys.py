@@ -18,7 +18,7 @@ from playground.config.schema import check_key
 from playground.errors import UnknownNameError, nearest
 from playground.mdp.options import OPTIONS
 from playground.settings import Plain, Section, Setting
-from playground.text import join
+from playground.text import first_docstring_line, join
 
 if TYPE_CHECKING:
   from playground.mdp.terms import Term
@@ -133,7 +133,7 @@ def _term(key: str, entry: Section) -> tuple[str, str]:
   term = _bound(key, entry)
   func = "" if term.func.__name__ == term.name else f"{term.func.__name__} "
   fields = {name: value for name, value in entry.items() if name != "func" and value not in (None, {})}
-  return f"{func}{format_value(fields)}", next(iter((inspect.getdoc(term.func) or "").splitlines()), "")
+  return f"{func}{format_value(fields)}", first_docstring_line(term.func)
 
 
 def _bound(key: str, entry: Section) -> "Term":

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from playground import __version__, registry
-from playground.cli.completion import commands_of
+from playground.cli.completion import SHELLS, commands_of
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest, one_sentence
 from playground.limits import SEED, count
 from playground.pretrained import working_copy
@@ -108,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
   keys.add_argument("prefix", help="such as agent, env.rewards, hardware.platform or tracking")
   keys.add_argument("overrides", nargs="*", help="as for playground-run, such as env=Go1Getup or agent=sac")
   completion = add("completion", _completion, "Print a script that completes our commands in a shell.")
-  completion.add_argument("shell", choices=("bash", "zsh", "fish", "query"), help="eval it in the shell's start file")
+  completion.add_argument("shell", choices=(*SHELLS, "query"), help="eval it in the shell's start file")
   completion.add_argument("line", nargs="?", default="", help=argparse.SUPPRESS)  # of query, which the scripts call
   add("doctor", "cli.doctor:doctor", "Check this machine: backend, versions, rendering, caches, missing packages.")
   evaluate = add("eval", "cli.eval:evaluate_run", "Evaluate a run's newest checkpoint, or the one given.")
