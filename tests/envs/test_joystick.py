@@ -333,6 +333,7 @@ SLIDES_AND_A_BALL = '<joint type="slide"/>' * 3 + '<joint type="ball"/>'  # as m
     ("<freejoint/>", SLIDES_AND_A_BALL, "needs <freejoint/> as its first joint, in the body trunk"),
     ("<position name=", '<position gear="2" name=', "the actuator FR_hip has gear=2, and an action is its joint's tar"),
     ("<position name=", '<motor ctrlrange="-1 1" name=', "the actuator FR_hip is no position servo"),
+    ("<position name=", '<intvelocity actrange="-1 1" name=', "the actuator FR_hip is no position servo"),
   ],
 )
 def test_a_robot_without_a_free_joint_or_servos(ours: str, theirs: str, message: str, tmp_path: Path) -> None:

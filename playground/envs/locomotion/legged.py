@@ -103,7 +103,8 @@ def _need_servos(mj_model: mujoco.MjModel, mjcf: str) -> None:
   for i in range(mj_model.nu):
     name, gear = mj_model.actuator(i).name or f"number {i}", mj_model.actuator_gear[i, 0]
     affine = mj_model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE  # a motor ignores the bias of `pd.kp`
-    if not (affine and mj_model.actuator_biasprm[i, 1] < 0):
+    integrates = mj_model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_INTEGRATOR  # <intvelocity>: `ctrl` is a velocity
+    if not (affine and mj_model.actuator_biasprm[i, 1] < 0) or integrates:
       raise ConfigError(
         f"env.robot.mjcf={mjcf}: the actuator {name} is no position servo, and an action is a joint's target: "
         'use <position inheritrange="1">, or a task with its own action_to_ctrl.'
