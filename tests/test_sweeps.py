@@ -113,7 +113,7 @@ def test_globs(glob: str, names: list[str]):
   ("line", "message"),
   {
     "sweep=mne": "sweep=mne does not exist: choose from mine, or give the path of a .yaml file. Did you mean 'mine'?",
-    "sweep=no/mine.yaml": "sweep=no/mine.yaml does not exist, or is no file.",
+    "sweep=no/mine.yaml": "sweep=no/mine.yaml does not exist, or is not a file.",
     "sweep=mine,mine": "sweep=mine,mine: one sweep at a time.",
     "sweep=mine sweep=mine": "sweep=mine sweep=mine: one sweep at a time.",
     "env=glob(Zebra*)": "env=glob(Zebra*) matches no option of env.",

@@ -130,7 +130,7 @@ def from_dict(resolved: Section, overrides: Sequence[str] = ()) -> RunConfig:
 def load(path: Path) -> RunConfig:
   """Reads a saved config.yaml; raises ConfigError if it is not one."""
   if path.exists() and not path.is_file():  # a read of a named pipe would wait for ever
-    raise ConfigError(f"{path} cannot be read: it is no file.")
+    raise ConfigError(f"{path} is not a file.")
   try:
     resolved = OmegaConf.to_container(OmegaConf.load(path))
   except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:

@@ -211,7 +211,7 @@ def _read(name: str) -> tuple[list[str], list[str]]:
   known, path = sweep_names(), Path(name).expanduser()
   if path.suffix == ".yaml":
     if not path.is_file():
-      raise UnknownNameError(f"sweep={name} does not exist, or is no file.")
+      raise UnknownNameError(f"sweep={name} does not exist, or is not a file.")
   elif name in known:
     path = shipped("sweeps") / f"{name}.yaml"
   else:
