@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from playground.cli.list_tasks import wide_console
 from playground.config import RunConfig, compose, compose_settings, config_roots, format_value, is_of_sweep
 from playground.config.comments import keys_and_comments, meaning
 from playground.config.definitions import chosen_names, definition
@@ -23,7 +24,6 @@ from playground.text import first_docstring_line, join
 if TYPE_CHECKING:
   from playground.mdp.terms import Term
 
-_WIDE = 160  # columns, without a terminal
 _SECTIONS = {"robot": "env.robot", "randomization": "env.events"}  # group -> section of env that it sets
 _FILES = ("env", "robot", "curriculum")  # groups whose files explain keys in comments
 
@@ -45,8 +45,7 @@ def show_keys(prefix: str, overrides: Sequence[str]) -> int:
   sweeps = compose_settings([text for text in overrides if is_of_sweep(text.partition("=")[0])])
   values = {**config.resolved, **sweeps.resolved}
   roots = config_roots()
-  console = Console()
-  console = console if console.is_terminal else Console(width=_WIDE)
+  console = wide_console(160)
   prefix = SHORT_KEYS.get(prefix.strip("."), prefix.strip("."))
   if prefix in groups(roots):
     names = [name for name in listed_options(prefix, roots) if not name.split("/")[-1].startswith("_")]

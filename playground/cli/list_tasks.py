@@ -48,10 +48,10 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   return 0
 
 
-def wide_console() -> Console:
-  """Returns a console for tables with a line for each task: however long the line where there is no terminal."""
+def wide_console(columns: int = 240) -> Console:
+  """Returns a console for tables: as wide as the terminal, or of so many columns where there is none."""
   console = Console()
-  return console if console.is_terminal else Console(width=240)
+  return console if console.is_terminal else Console(width=columns)
 
 
 def _table(rows: Iterable[Section]) -> Table:

@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from playground import registry
+from playground.cli.list_tasks import wide_console
 from playground.config import RunConfig, compose, format_value
 from playground.errors import ConfigError
 from playground.mdp.options import MODEL_FIELD, is_model_field
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
   from playground.envs.base import Env
   from playground.mdp.terms import Term
 
-_WIDE = 180  # columns, without a terminal
 Row = Section
 
 
@@ -40,8 +40,7 @@ def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_v
   Raises:
     PlaygroundError: no such task, or an invalid one.
   """
-  console = Console()
-  console = console if console.is_terminal else Console(width=_WIDE)
+  console = wide_console(180)
   if task.startswith("randomization=") and not overrides:
     if views:
       raise ConfigError("--views shows a task: playground show <task> randomization=<name> --views <file>.")
