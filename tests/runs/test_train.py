@@ -37,7 +37,8 @@ from tests.runs.helpers import TASK, resume, truncate
 
 BATCH = 80  # environment steps of one training step with debug=fast
 STEPS = 240_000  # seconds of training, so that a signal finds the run at work
-LONG = [*TASK, f"agent.num_timesteps={STEPS - 10}", "agent.num_evals=5"]  # a checkpoint every quarter
+# A checkpoint every quarter. XLA reads its flags when it starts, which may be long before this process resumes a run.
+LONG = [*TASK, f"agent.num_timesteps={STEPS - 10}", "agent.num_evals=5", "hardware.xla_flags="]
 COMMAND = [sys.executable, "-c", "from playground.cli.run import main; main()"]
 slow = functools.partial(pytest.param, marks=pytest.mark.slow)
 pytestmark = pytest.mark.stored_programs
