@@ -75,7 +75,7 @@ def collect(sweep: SweepDirectory) -> "pd.DataFrame":
     rows.append(row)
   keys = list(dict.fromkeys(key for job in sweep.jobs for key in job.varies))
   columns = ["job", *keys, "status", *FIGURES, "attempts", "reason", "overrides"]
-  return pd.DataFrame(rows, columns=pd.Index(columns))
+  return pd.DataFrame(rows, columns=pd.Index(columns), dtype=object)  # else a key that some jobs lack turns 5 into 5.0
 
 
 def group_keys(sweep: SweepDirectory) -> list[str]:
@@ -141,7 +141,7 @@ def _write_curves(sweep: SweepDirectory) -> list[Path]:
     folder = sweep.folder(job)
     table = read_metrics(folder.path / "metrics.csv")
     if RETURN in table and len(table := table.dropna(subset=[RETURN])):
-      name = ", ".join(f"{key.split('.')[-1]}={job.varies.get(key)}" for key in keys)
+      name = ", ".join(f"{key.split('.')[-1]}={_label(job.varies.get(key))}" for key in keys)
       task = job.task or str(job.varies.get(PANEL, sweep.name))
       tables[task][name or "mean"].append((folder.state().status == "finished", table))
   written = []

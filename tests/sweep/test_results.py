@@ -83,6 +83,20 @@ def test_a_list_of_texts_is_no_markup(tmp_path: Path, capsys: pytest.CaptureFixt
   assert "[hip]" in shown and "[knee]" in shown
 
 
+def test_a_whole_number_that_some_jobs_lack_stays_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  jobs = [Job(name, [], {"agent.half_life": value}) for name, value in (("ppo", None), ("mine", 5))]
+  sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], jobs)
+  for job in jobs:
+    sweep.folder(job).write(status="finished")
+    (sweep.folder(job).path / "metrics.csv").write_text("step,eval/episode_reward\n0,1\n")
+  drawn: list[str] = []
+  monkeypatch.setattr(figures, "curves", lambda panels, *_: drawn.extend(panels["mine"]) or b"")
+  write_result(sweep, lambda text: None)
+  assert (tmp_path / "sweep.csv").read_text().splitlines()[2].startswith("mine,5,finished")
+  assert [row.split(",")[0] for row in (tmp_path / "groups.csv").read_text().splitlines()[1:]] == ["null", "5"]
+  assert drawn[:2] == ["half_life=null", "half_life=5"]
+
+
 def test_a_task_has_a_panel_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   jobs = [
     Job(name, [f"experiment={name}"], {"experiment": name}, task=task)
