@@ -1,8 +1,10 @@
 """Hyperparameters of every task and agent against the paper's and those of Playground 0.2.0 (benchmarks/paper)."""
 
 import csv
+import dataclasses
 import functools
 from collections.abc import Iterator
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,10 @@ import yaml
 
 from playground import registry
 from playground.config import RunConfig, compose, options
+from playground.config.definitions import defined
 from playground.config.files import config_roots, lineage
-from playground.learning.hyperparameters import config_class
+from playground.learning import hyperparameters
+from playground.learning.hyperparameters import PPOConfig, config_class
 from playground.settings import defaults
 from tests.test_limits import leaves
 
@@ -174,6 +178,31 @@ def test_a_variant_can_do_without_a_tuned_set():
   untuned = compose(["agent=ppo_v020", "env=CartpoleBalance", "tuned=null"])
   assert untuned.choices["tuned"] is None
   assert untuned.agent.num_timesteps == 50_000_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OwnPPOConfig(PPOConfig):
+  """Settings of another package's variant of PPO."""
+
+  half_life: int = 100
+
+
+@pytest.fixture
+def own_ppo(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+  """Installs `agent=own_ppo` as another package would."""
+  point = EntryPoint("own_ppo", f"{__name__}:OwnPPOConfig", hyperparameters.ENTRY_POINTS)
+  monkeypatch.setattr(hyperparameters, "_entry_points", lambda: {"own_ppo": point})
+  defined.cache_clear()
+  yield
+  defined.cache_clear()
+
+
+@pytest.mark.usefixtures("own_ppo")
+def test_a_variant_of_our_algorithm_has_its_tuned_set():
+  run = compose(["env=CheetahRun", "agent=own_ppo", "agent.half_life=20"])
+  assert (run.choices["tuned"], run.agent.num_timesteps) == ("ppo/CheetahRun", 60_000_000)
+  assert run.resolved["agent"]["half_life"] == 20
+  assert compose(["env=CheetahRun", "agent=own_ppo", "tuned=null"]).agent.num_timesteps == 50_000_000
 
 
 @pytest.mark.parametrize("option", options("tuned"))

@@ -31,6 +31,7 @@ from playground.config.chains import (
 )
 from playground.config.definitions import (
   RunSettings,
+  base_agents,
   chosen_names,
   defined,
   register,
@@ -226,6 +227,7 @@ def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
   """Composes the files."""
   (config, choices), added = _hydra(groups, roots), ()
   agents, tasks = (lineage(group, str(choices[group]), roots) for group in ("agent", "env"))
+  agents += base_agents(str(config.agent.name))
   sets = [f"{agent}/{task}" for agent in agents for task in tasks]
   named = any(text.lstrip("~").partition("=")[0] == "tuned" for text in groups)
   if not named and choices["tuned"] is None and (there := [name for name in sets if name in options("tuned", roots)]):

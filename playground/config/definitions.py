@@ -69,6 +69,12 @@ def defined() -> dict[str, dict[str, type]]:
   }
 
 
+def base_agents(name: str) -> list[str]:
+  """Returns the agents whose settings class that of `agent.name` inherits from, nearest first."""
+  named = {cls: agent for agent, cls in defined()["agent"].items()}
+  return [named[cls] for cls in config_class(name).__mro__[1:] if cls in named]
+
+
 def register(group: str, names: Iterable[str]) -> None:
   """Registers with Hydra the options of a group that classes define and no file."""
   _replace(group, {name: functools.partial(_node, group, name) for name in names}, package=group)
