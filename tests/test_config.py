@@ -468,6 +468,15 @@ def test_resume_of_a_folder_of_runs_names_the_newest(tmp_path: Path):
     compose([f"resume={tmp_path}"])
 
 
+def test_resume_of_a_checkpoint_names_its_run(tmp_path: Path):
+  (tmp_path / "checkpoints" / "000000000320").mkdir(parents=True)
+  (tmp_path / "plots").mkdir()
+  (tmp_path / "status.json").touch()
+  for path in (tmp_path / "checkpoints", tmp_path / "checkpoints" / "000000000320"):
+    with pytest.raises(ConfigError, match=rf"is a part of a run: resume={tmp_path} continues it"):
+      compose([f"resume={path}"])
+
+
 def test_resume_of_a_sweep_names_its_command(tmp_path: Path):
   (tmp_path / "sweep.yaml").touch()
   with pytest.raises(ConfigError, match=r"folder of a sweep: `playground sweep retry \S+` continues it, resume="):

@@ -461,6 +461,8 @@ def _check_path(key: str, value: object) -> None:
         raise ConfigError(f"resume={value} is the folder of a sweep: {how}.")
       if runs := sorted(run for run in path.glob("*/") if (run / "config.yaml").is_file()):
         raise ConfigError(f"resume={value} is a folder of runs: name one, such as the newest, resume={runs[-1]}.")
+      if run := next((p for p in path.resolve().parents if (p / "status.json").is_file()), None):
+        raise ConfigError(f"resume={value} is a part of a run: resume={run} continues it from its newest checkpoint.")
     siblings = [p.name for p in path.parent.glob("*/") if p.name != path.name]
     raise ConfigError(f"{key}={value} is no {what}: {wanted} does not exist.{nearest(path.name, siblings)}")
 
