@@ -104,12 +104,17 @@ def check_task(task: str, saved: Section, today: Section) -> None:
     saved: the env section that it was trained with.
     today: the task's.
   """
-  for key in MEANING:  # not `action_repeat`, which may be an agent's own
-    if _without_noise(saved.get(key)) != _without_noise(today.get(key)):
-      raise CheckpointError(
-        f"The pretrained policy of {task} does not fit its task any more: env.{key} has changed since it was "
-        f"trained; train again with playground-run env={task}."
-      )
+  if changed := other_meaning(saved, today):
+    raise CheckpointError(
+      f"The pretrained policy of {task} does not fit its task any more: {changed[0]} has changed since it was "
+      f"trained; train again with playground-run env={task}."
+    )
+
+
+def other_meaning(saved: Section, today: Section) -> list[str]:
+  """Returns the keys of `env`, dotted, in which two env sections give a policy's numbers another meaning."""
+  # not `action_repeat`, which may be an agent's own
+  return [f"env.{key}" for key in MEANING if _without_noise(saved.get(key)) != _without_noise(today.get(key))]
 
 
 def _without_noise(value: object) -> object:

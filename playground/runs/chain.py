@@ -112,7 +112,7 @@ def _check(config: RunConfig) -> None:
       sizes |= {leaf: f"{dtype}{shape}" for leaf, shape, dtype in describe(trainer.policy_shape())}
       if before is None and config.init_from is not None:
         plan = RestorePlan(weights=weights_of(config.init_from))
-        plan.restore(trainer, stage.agent_name, lambda: ({}, {}))
+        plan.restore(trainer, stage, lambda: ({}, {}))
       if before is not None:
         _compare(f"env={stage.choices['env']}", sizes, *before)
       before = name, sizes

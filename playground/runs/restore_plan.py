@@ -17,7 +17,7 @@ from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import Checkpoint, DamagedCheckpointError, NoCheckpointError, find_checkpoints
 from playground.learning.loop import Draw
 from playground.learning.trainer import Settings, Trainer, TrainState
-from playground.pretrained import check_task, is_pretrained, locate
+from playground.pretrained import check_task, is_pretrained, locate, other_meaning
 from playground.pytree import PyTree
 from playground.runs.run_dir import RunDirectory
 from playground.settings import Section
@@ -133,7 +133,7 @@ class RestorePlan:
     noted = {key: np.asarray(value, np.float32) for key, value in self.settings.items() if key in own}
     return {**own, **noted}
 
-  def restore(self, trainer: Trainer, name: str, draw: Draw) -> None:
+  def restore(self, trainer: Trainer, config: RunConfig, draw: Draw) -> None:
     """Restores the state or weights, checked against the algorithm and its shapes, before compilation.
 
     Raises:
@@ -142,7 +142,7 @@ class RestorePlan:
     if not self.checkpoints and self.weights is None:
       return
     if self.weights is not None:
-      theirs = self.weights.meta["config"].get("agent", {})
+      theirs, name = self.weights.meta["config"].get("agent", {}), config.agent_name
       if theirs.get("name") != name:
         raise CheckpointError(
           f"{self.weights.path} was trained by {theirs.get('name')}: agent={name} cannot start from it."
@@ -157,6 +157,10 @@ class RestorePlan:
       self.policy = self.weights.restore("policy", trainer.policy_shape())
       source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
       self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is new.")
+      saved, env = self.weights.meta["config"].get("env", {}), config.resolved["env"]
+      if changed := other_meaning({**env, **saved}, env):  # an earlier version had fewer keys
+        what = "what the policy reads or does means something else now"
+        self.notices.append(f"These weights were trained with other values of {', '.join(changed)}: {what}.")
       return
     model, _ = jax.eval_shape(draw)
     template = trainer.template(model)

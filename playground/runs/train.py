@@ -177,7 +177,7 @@ def prepare(
     plan.notices.append(describe_division(agent, trainer.num_devices))
   for each, theirs in zip(plans, configs, strict=True):
     try:
-      each.restore(trainer, theirs.agent_name, draw)
+      each.restore(trainer, theirs, draw)
     except CheckpointError as error:
       if not together:
         raise

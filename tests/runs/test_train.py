@@ -502,6 +502,17 @@ def test_a_new_run_starts_from_weights(
   assert summary["params_sha256"] != checkpoint.meta["sha256"]["policy"], "it trained on"
 
 
+@pytest.mark.parametrize("ctrl_dt", ["0.01", "0.02"])
+def test_weights_of_another_meaning_are_announced(
+  ctrl_dt: str, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+  run = tmp_path / "run"
+  args = [*TASK, "agent.num_timesteps=320", f"init_from={whole}", f"env.ctrl_dt={ctrl_dt}", f"run_dir={run}"]
+  assert train(compose(args)) == 0
+  announced = "These weights were trained with other values of env.ctrl_dt:" in capsys.readouterr().out
+  assert announced == (ctrl_dt != "0.01")
+
+
 def test_weights_that_a_link_has_lost(copy: Path, refused: Callable[..., str]) -> None:
   best = copy / "checkpoints/best"
   shutil.rmtree(best)  # the fixture copied what it points to
