@@ -9,7 +9,7 @@ from playground.learning.checkpoints import BEST, find_checkpoints, find_stages
 from playground.runs.loaded_policy import LoadedPolicy
 
 # Keys of a run's config that define the meaning of an actor's inputs and outputs; its arrays define their sizes.
-_ENV = ("task", "robot", "vision", "action_repeat", *MEANING)
+_ENV = ("task", "robot", "vision", *MEANING)
 _MEANING = {"env": _ENV, "agent": ("name", "network", "normalize_observations")}
 
 

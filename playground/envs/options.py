@@ -12,7 +12,7 @@ from playground.limits import MOST, SHARE, VECTOR, Limit, at_least_0, count, pos
 
 TERMS = dict[str, Any]
 # Keys of `env`, of which a task may lack some, that define the numbers that a policy reads and what its actions do.
-MEANING = ("observations", "observation_order", "observation_frames", "ctrl_dt")
+MEANING = ("observations", "observation_order", "observation_frames", "ctrl_dt", "action_repeat")
 MEANING += ("action_base", "action_scale", "clip_targets", "ema_alpha", "max_torque")
 _NUMBERS = Limit(form="list")
 _DELAY = Limit(0, 1000, whole=True, form="list", length=2, rising=True)

@@ -113,7 +113,6 @@ def check_task(task: str, saved: Section, today: Section) -> None:
 
 def other_meaning(saved: Section, today: Section) -> list[str]:
   """Returns the keys of `env`, dotted, in which two env sections give a policy's numbers another meaning."""
-  # not `action_repeat`, which may be an agent's own
   return [f"env.{key}" for key in MEANING if _without_noise(saved.get(key)) != _without_noise(today.get(key))]
 
 

@@ -9,8 +9,7 @@ from typing import Self
 import jax
 import numpy as np
 
-from playground import registry
-from playground.config import RunConfig
+from playground.config import RunConfig, compose
 from playground.errors import CheckpointError
 from playground.hardware.distributed import is_main
 from playground.learning.algorithm import Policy
@@ -36,8 +35,9 @@ def weights_of(path: str | Path) -> Checkpoint:
   checkpoint = Checkpoint(find_checkpoints(locate(str(path)))[0])
   folder = checkpoint.path.parents[1]
   if is_pretrained(folder):
-    task = checkpoint.meta["env"]
-    check_task(task, checkpoint.meta["config"]["env"], registry.config(task).to_dict())
+    task, saved = checkpoint.meta["env"], checkpoint.meta["config"]
+    today = compose([f"env={task}", f"agent={saved['agent']['name']}"])  # an agent's set may change the task
+    check_task(task, saved["env"], today.resolved["env"])
   return checkpoint
 
 
