@@ -1,5 +1,6 @@
 """`playground eval <run>`: evaluates a trained policy on this machine."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from playground.runs.train import model_sampler
 
 def evaluate_run(
   path: str,
+  overrides: Sequence[str] = (),
   *,
   episodes: int | None = None,
   seed: int = 0,
@@ -31,6 +33,7 @@ def evaluate_run(
 
   Args:
     path: a run directory, or one of its checkpoints.
+    overrides: of the task, such as `env.episode_length=500`.
     episodes: number of episodes; None is the run's `agent.num_eval_envs`.
     seed: of the episodes.
     deterministic: True acts on the distribution's mode, False as the run's `agent.deterministic_eval` says.
@@ -41,11 +44,11 @@ def evaluate_run(
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run or checkpoint, or one that does not fit, or no such camera.
+    PlaygroundError: no such run or checkpoint, or one that does not fit, an invalid override, or no such camera.
   """
   console = Console()
   film = need_place(video, camera)
-  trained = load_policy(path)
+  trained = load_policy(path, overrides)
   run, env, checkpoint, hardware = trained.config, trained.env, trained.checkpoint, trained.hardware
   count = run.agent.num_eval_envs if episodes is None else episodes
   drawn = drawn_model(env, run.video.visuals)
@@ -57,7 +60,7 @@ def evaluate_run(
   scores, recording = evaluate(trained.policy, jax.random.PRNGKey(seed), model, {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
 
-  title = f"{trained.task}, {count} episodes, {checkpoint.step:,} steps trained"
+  title = f"{trained.task}, {count} episodes, {checkpoint.step:,} steps trained{described(overrides)}"
   real = [row for row in paper_table("hardware") if row["task"] == trained.task]
   console.print(_table(title, {name.removeprefix("episode_"): value for name, value in scores.items()}, real))
   for row in real:
@@ -65,9 +68,11 @@ def evaluate_run(
     console.print(f"hardware, {row['metric']}: {row['what']}; {median}{row['trials']} trials (paper, {row['where']})")
     console.print(f"simulation, {row['metric']}: by default {row['simulation']}")
   report = {"checkpoint": str(checkpoint.path), "episodes": count, "seed": seed, "deterministic": deterministic}
+  report |= {"overrides": list(overrides)} if overrides else {}
   report |= {"scores": scores} | hardware.machine
   report |= {"hardware_in_paper": real} if real else {}
-  name = f"step_{checkpoint.step:012d}_seed_{seed}_episodes_{count}{'_deterministic' * deterministic}.json"
+  settings = "_deterministic" * deterministic + suffix(overrides)
+  name = f"step_{checkpoint.step:012d}_seed_{seed}_episodes_{count}{settings}.json"
   save(trained.run_dir.path / "eval" / name, report, console, trained.run_dir.path)
   if film:
     render_video(
@@ -79,6 +84,16 @@ def evaluate_run(
       **episodes_of(recording, 1),
     )
   return 0
+
+
+def described(overrides: Sequence[str]) -> str:
+  """Returns the end of a title that names overrides, "" without any."""
+  return f", with {' '.join(overrides)}" if overrides else ""
+
+
+def suffix(overrides: Sequence[str]) -> str:
+  """Returns what distinguishes the file names of results with overrides, "" without any."""
+  return f"_{hashlib.sha256(' '.join(overrides).encode()).hexdigest()[:8]}" if overrides else ""
 
 
 def save(out: Path, report: Mapping[str, object], console: Console, run: Path | None = None) -> None:

@@ -34,6 +34,7 @@ _PROGRAMS = {
 }
 _RUN = "run directory, checkpoint, a task for its pretrained policy, or wandb:<entity>/<project>/<run>"
 _CAMERA = "camera of --video (default: video.camera of the run, else one that shows the whole scene)"
+_TASK_VALUES = "other values of the task, such as terrain=stairs or env.episode_length=500"
 Command = Callable[[argparse.Namespace], int]  # returns the exit code
 
 
@@ -113,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
   add("doctor", "cli.doctor:doctor", "Check this machine: backend, versions, rendering, caches, missing packages.")
   evaluate = add("eval", "cli.eval:evaluate_run", "Evaluate a run's newest checkpoint, or the one given.")
   evaluate.add_argument("path", metavar="run", help=_RUN)
+  evaluate.add_argument("overrides", nargs="*", help=_TASK_VALUES)
   evaluate.add_argument("--episodes", type=int, help="episodes to run (default: the run's agent.num_eval_envs)")
   evaluate.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
   evaluate.add_argument(
@@ -127,6 +129,7 @@ def _parser() -> argparse.ArgumentParser:
   export.add_argument("--out", metavar="FOLDER", help="folder to write to (default: <run>/export)")
   play = add("play", _play, "Run a policy in plain C MuJoCo: measure it, film it or watch it.")
   play.add_argument("policy", help=f"{_RUN}, or a policy.onnx beside its policy.yaml, or their folder")
+  play.add_argument("overrides", nargs="*", help=_TASK_VALUES)
   play.add_argument(
     "--agent", choices=("zero", "random"), help="zero or random actions on a task, in place of a policy"
   )

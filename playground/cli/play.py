@@ -10,7 +10,7 @@ from rich.table import Table
 
 from playground import config as configs
 from playground import registry
-from playground.cli.eval import save
+from playground.cli.eval import described, save, suffix
 from playground.deploy.contract import Contract
 from playground.deploy.menu import Menu
 from playground.deploy.policy import ActingPolicy, ExportedPolicy
@@ -54,7 +54,7 @@ def play(
     path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it, or their folder;
       with `agent` a task.
     agent: zero or random actions in place of a policy; None is the policy of `path`.
-    overrides: with `agent`: as for playground-run.
+    overrides: of the task, such as `terrain=stairs`; with `agent`: as for playground-run.
     randomize: with `agent`: whether the task's startup events draw the model.
     interval_events: whether pushes and other interval events act.
     episodes: number of episodes to measure.
@@ -85,7 +85,7 @@ def play(
     need_port(host, port)
   model_seed = seed if randomize else None
   if agent is None:
-    opened = open_policy(path, interval_events)
+    opened = open_policy(path, overrides, interval_events)
   else:
     _set_up_cpu()
     section = configs.compose([f"env={path}", *overrides]).env
@@ -110,10 +110,11 @@ def play(
   scores, recording = evaluate({}, jax.random.PRNGKey(seed), {}, {})
   scores = {name: float(value) for name, value in jax.device_get(scores).items()}
   origin = exported.contract["origin"]
-  console.print(_table(exported.contract, episodes, scores))
+  console.print(_table(exported.contract, episodes, scores, overrides))
   if opened.folder is not None:
-    out = opened.folder / result_name(origin["steps"], seed, episodes, interval_events)
+    out = opened.folder / result_name(origin["steps"], seed, episodes, interval_events, overrides)
     played = {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "interval_events": interval_events}
+    played |= {"overrides": list(overrides)} if overrides else {}
     run = opened.trained.run_dir.path if opened.trained else None
     save(out, played | {"scores": scores, "origin": origin}, console, run)
   if film:
@@ -128,9 +129,12 @@ def play(
   return 0
 
 
-def result_name(steps: int, seed: int, episodes: int, interval_events: bool = True) -> str:
+def result_name(
+  steps: int, seed: int, episodes: int, interval_events: bool = True, overrides: Sequence[str] = ()
+) -> str:
   """Returns the file name of a result; results of other settings have other names, so that none replaces another."""
-  return f"play_step_{steps:012d}_seed_{seed}_episodes_{episodes}{'' if interval_events else '_no_events'}.json"
+  events = "" if interval_events else "_no_events"
+  return f"play_step_{steps:012d}_seed_{seed}_episodes_{episodes}{events}{suffix(overrides)}.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,19 +154,19 @@ class Opened:
   trained: LoadedPolicy | None = None
 
 
-def open_policy(path: str, interval_events: bool = True) -> Opened:
+def open_policy(path: str, overrides: Sequence[str] = (), interval_events: bool = True) -> Opened:
   """Reads a run's policy, or an exported one, and builds its task, with or without interval events.
 
   Raises:
-    PlaygroundError: no such run or policy.
+    PlaygroundError: no such run or policy, or an invalid override.
   """
   if (exported_to := Path(path).expanduser() / "policy.onnx").is_file():
     path = str(exported_to)
   if Path(path).suffix == ".onnx":
     exported = ExportedPolicy.load(path)
     _set_up_cpu()
-    return Opened(exported, _task_of(exported, path, interval_events), Path(path).expanduser().parent)
-  trained = load_exact(path, interval_events)
+    return Opened(exported, _task_of(exported, path, overrides, interval_events), Path(path).expanduser().parent)
+  trained = load_exact(path, overrides, interval_events)
   return Opened(export_policy(trained), trained.env, trained.run_dir.path / "export", trained)
 
 
@@ -170,7 +174,7 @@ def _set_up_cpu() -> None:
   setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
 
 
-def _task_of(exported: ExportedPolicy, path: str, interval_events: bool) -> Env:
+def _task_of(exported: ExportedPolicy, path: str, overrides: Sequence[str], interval_events: bool) -> Env:
   """Builds the task of a policy's contract on C MuJoCo, and traces it so that invalid values raise here.
 
   Raises:
@@ -182,6 +186,8 @@ def _task_of(exported: ExportedPolicy, path: str, interval_events: bool) -> Env:
     default = registry.config(task).to_dict()
     default.pop("robot", None)  # another robot's section may hold other types
     config = configs.saved_section("env", config, default)
+  if overrides:
+    config = configs.override_task(config, overrides)
   try:
     env = load_on_c_physics(task, config, interval_events=interval_events)
     obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
@@ -208,11 +214,11 @@ def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
   return Menu(given if given == run.parent else run, trained, lambda message: console.print(message, soft_wrap=True))
 
 
-def _table(contract: Contract, episodes: int, scores: Mapping[str, float]) -> Table:
+def _table(contract: Contract, episodes: int, scores: Mapping[str, float], overrides: Sequence[str]) -> Table:
   """Builds a table of scores, beside those of the last evaluation in training."""
   origin = contract["origin"]
   trained = origin["evaluation"]
-  title = f"{contract['task']}, {origin['steps']:,} steps trained"
+  title = f"{contract['task']}, {origin['steps']:,} steps trained{described(overrides)}"
   table = Table("per episode", title=title)
   table.add_column(f"C MuJoCo, mean of {episodes}", justify="right")
   if trained:

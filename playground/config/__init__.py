@@ -24,6 +24,7 @@ from playground.config.composition import (
   compose_settings,
   from_saved,
   override_section,
+  override_task,
   register_options,
   saved_section,
 )

@@ -157,10 +157,28 @@ def register_options(roots: Sequence[Path] | None = None) -> None:
 
 def override_section(section: str, default: Section | ConfigDict, overrides: Section) -> dict[str, Plain]:
   """Returns a section, e.g. env, with values replaced by dotted key (`action_scale`), checked as in `compose`."""
-  schema = {section: _plain(default)}
   given = {f"{section}.{key}": value for key, value in overrides.items()}
-  parsed = [Override(key, value, False, f"{key}={format_value(value)}") for key, value in given.items()]
-  resolved = _apply(_literal(schema), parsed, schema)
+  return _replaced(section, default, [Override(k, v, False, f"{k}={format_value(v)}") for k, v in given.items()])
+
+
+def override_task(env: Section | ConfigDict, overrides: Sequence[str]) -> dict[str, Plain]:
+  """Returns a section env with values replaced by a command line (`env.action_scale=0.3`, `terrain=stairs`).
+
+  Raises:
+    ConfigError: an invalid value, or an override of a group or another section.
+  """
+  parsed = [parse(text, config_roots()) for text in overrides]
+  for override in parsed:
+    if override.is_group or not override.key.startswith("env."):
+      raise ConfigError(
+        f"{override.text}: a trained policy takes other values of `env` only, such as env.episode_length=500."
+      )
+  return _replaced("env", env, parsed)
+
+
+def _replaced(section: str, default: Section | ConfigDict, overrides: Sequence[Override]) -> dict[str, Plain]:
+  schema = {section: _plain(default)}
+  resolved = _apply(_literal(schema), overrides, schema)
   check_limits(resolved)
   return resolved[section]
 

@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -27,18 +28,19 @@ from playground.settings import Section
 _EXACT = "highest"  # precision of matrix products, as in the exported policy
 
 
-def load_exact(path: str | Path, interval_events: bool = True) -> LoadedPolicy:
+def load_exact(path: str | Path, overrides: Sequence[str] = (), interval_events: bool = True) -> LoadedPolicy:
   """Reads a run's newest checkpoint, or the one at `path`, with its task on C MuJoCo, on the CPU.
 
   Args:
     path: a run directory, one of its checkpoints, or `pretrained:<task>`.
+    overrides: of the task.
     interval_events: whether pushes and other interval events act.
 
   Raises:
-    PlaygroundError: no such run or checkpoint, or one that does not fit.
+    PlaygroundError: no such run or checkpoint, one that does not fit, or an invalid override.
   """
   load_task = functools.partial(load_on_c_physics, interval_events=interval_events)
-  return load_policy(path, load_task=load_task, platform="cpu", precision=_EXACT)
+  return load_policy(path, overrides, load_task=load_task, platform="cpu", precision=_EXACT)
 
 
 def record(trained: LoadedPolicy, num_envs: int, steps: int) -> tuple[dict[str, np.ndarray], np.ndarray, State]:

@@ -1,7 +1,7 @@
 """Loads a trained policy of a run, with its task and networks, on this machine."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -26,9 +26,9 @@ class LoadedPolicy:
 
   Attributes:
     run_dir: the run's directory.
-    config: the run's configuration.
+    config: the run's configuration, with overrides of the task.
     checkpoint: the policy's checkpoint.
-    env: the task as the run trained it, or as `load_task` made it.
+    env: the task as the run trained it but for overrides, or as `load_task` made it.
     hardware: this machine's devices.
     trainer: the algorithm's trainer, whose `act(policy, obs, key, deterministic)` returns actions.
     policy: networks and normaliser, on the devices.
@@ -63,6 +63,7 @@ class LoadedPolicy:
 
 def load_policy(
   path: str | Path,
+  overrides: Sequence[str] = (),
   *,
   load_task: Callable[[str, ConfigDict], Env] | None = None,
   platform: Platform | None = None,
@@ -72,16 +73,20 @@ def load_policy(
 
   Args:
     path: a run directory, one of its checkpoints, or `pretrained:<task>`.
+    overrides: of the task, such as `env.episode_length=500`.
     load_task: builds a task from a name and a configuration; `registry.load` if None.
     platform: device type; if None the run's, if this machine has it.
     precision: of the networks' matrix products; the run's if None.
 
   Raises:
-    PlaygroundError: no such run or checkpoint, or one that is damaged or does not fit.
+    PlaygroundError: no such run or checkpoint, one that is damaged or does not fit, or an invalid override.
   """
   checkpoint = weights_of(path)
   run_dir = RunDirectory.open(checkpoint.path.parents[1])
   config = configs.from_saved(run_dir.config)
+  if overrides:
+    env = configs.override_task(config.resolved["env"], overrides)
+    config = configs.from_dict({**config.resolved, "env": env}, config.overrides)
   hardware = setup(this_machine(config.hardware, platform))
   env = (load_task or registry.load)(config.choices["env"], config.env)
   trainer = Trainer(env, config.agent, hardware.mesh, precision or hardware.network_precision)

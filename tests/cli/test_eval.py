@@ -72,6 +72,17 @@ def test_one_checkpoint_with_more_episodes_and_another_seed(command: Command, tr
   assert report(trained, 2000, seed=3, episodes=6) == written, "fewer episodes do not replace more"
 
 
+def test_other_values_of_the_task(
+  command: Command, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  run, seen = shutil.copytree(trained, tmp_path / "run", symlinks=True), []
+  monkeypatch.setattr(registry, "load", lambda name, config=None: seen.append(config) or Point())
+  assert command(str(run), "env.sim_dt=0.005", "--seed", "1") == 0
+  assert [config.sim_dt for config in seen] == [0.005]
+  (file,) = (run / "eval").glob("step_000000004000_seed_1_episodes_4_*.json")
+  assert json.loads(file.read_text())["overrides"] == ["env.sim_dt=0.005"]
+
+
 def test_what_the_paper_measured_on_a_real_robot_stands_beside(
   command: Command, trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

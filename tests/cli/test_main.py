@@ -207,8 +207,15 @@ def test_doctor(command: Command, monkeypatch: pytest.MonkeyPatch):
 
 def test_eval_and_replay(command: Command, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
   calls = _stub(monkeypatch, "playground.cli.eval", "evaluate_run", 0)
-  assert command("eval", "results/a", "--episodes", "4") == 0
-  options = {"episodes": 4, "seed": 0, "deterministic": False, "video": None, "camera": None}
+  assert command("eval", "results/a", "--episodes", "4", "terrain=stairs") == 0
+  options = {
+    "overrides": ["terrain=stairs"],
+    "episodes": 4,
+    "seed": 0,
+    "deterministic": False,
+    "video": None,
+    "camera": None,
+  }
   assert calls == [((), {"path": "results/a", **options})]
   _stub(monkeypatch, "playground.cli.replay", "replay", CheckpointError("No dump\nthere."))
   assert command("replay", "dump.npz") == 2

@@ -42,6 +42,25 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
   return caller(monkeypatch, "playground", main)
 
 
+def test_play_with_other_values_of_the_task(
+  command: Command, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+  run = shutil.copytree(run, tmp_path / "run")
+  assert command("export", str(run)) == 0
+  scores = []
+  for policy in (run, run / "export" / "policy.onnx"):
+    assert command("play", str(policy), "--episodes", "2", "env.episode_length=30") == 0
+    assert "trained, with env.episode_length=30" in " ".join(capsys.readouterr().out.split())
+    (file,) = (run / "export").glob(f"play_step_{STEPS:012d}_seed_0_episodes_2_*.json")
+    report = json.loads(file.read_text())
+    assert (report["overrides"], report["scores"]["episode_length"]) == (["env.episode_length=30"], 30)
+    scores.append(report["scores"])
+  assert scores[0] == scores[1]
+  for wrong in ("agent.num_envs=2", "env=CheetahRun", "env.episode_lenght=3", "env.episode_length=0"):
+    assert command("play", str(run), wrong) == 2
+    assert wrong.partition("=")[0] in capsys.readouterr().err
+
+
 def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
   assert command("export", str(run)) == 0
   out = " ".join(capsys.readouterr().out.split())
