@@ -150,8 +150,8 @@ class Episode(Wrapper):
   """Ends episodes after `length` control steps and repeats each action.
 
   `info["episode_metrics"]` holds the episode's `sum_reward`, `length` and of each metric the sum over policy steps, or
-  the reduction of the task's `summaries`; a non-finite step counts in sums only, with 0. A policy step has the metrics
-  of its last repeat; those with a `max` have that of all repeats until the episode ends.
+  the reduction of the task's `summaries`; a non-finite step counts in sums only, with 0. A policy step's metrics are
+  such a sum or reduction of its repeats until the episode ends.
 
   A time-out, of this limit or of a termination term with `time_out`, gives done = 1 with `info["truncation"]` = 1, kept
   apart from the task's own termination. With repeats an episode that ends in an earlier one stays done and earns
@@ -175,27 +175,27 @@ class Episode(Wrapper):
       return state.info.get(TIME_OUT, jnp.zeros_like(state.done)) * (1 - state.info["nonfinite"])
 
     def repeat(
-      carry: tuple[State, jax.Array, jax.Array, jax.Array, dict[str, jax.Array], BufferUse | None], _: None
+      carry: tuple[State, jax.Array, jax.Array, jax.Array, dict[str, jax.Array], BufferUse | None], n: jax.Array
     ) -> tuple[Any, None]:
-      state, reward, done, cut, most, used = carry
+      state, reward, done, cut, metrics, used = carry
       state = self.env.step(state, action, model)
       cut = jnp.where(done > 0, cut, is_cut(state))
       used = None if used is None else used.join(state.data.buffers)
-      most = {k: jnp.where(done > 0, old, jnp.maximum(old, state.metrics[k])) for k, old in most.items()}
-      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done), cut, most, used), None
+      metrics = {k: jnp.where(done > 0, old, reduce[k](old, state.metrics[k], n)) for k, old in metrics.items()}
+      return (state, reward + state.reward * (1 - done), jnp.maximum(done, state.done), cut, metrics, used), None
 
     was_done = state.info["episode_done"]
     kinds = {k: kind for k, kind in self.env.summaries.items() if k in state.metrics}
+    reduce = {k: _SUMMARIES[kinds.get(k, "sum")] for k in state.info["episode_metrics"]}
     if self.repeat == 1:
       after = self.env.step(state, action, model)
       reward, ended, cut = after.reward, after.done, is_cut(after)
     else:
       unused = jax.tree.map(jnp.zeros_like, state.data.buffers)
-      least = {k: jnp.full_like(state.metrics[k], -jnp.inf) for k, kind in kinds.items() if kind == "max"}
-      zero = jnp.zeros_like(state.done)
-      start = (state, jnp.zeros_like(state.reward), zero, zero, least, unused)
-      (after, reward, ended, cut, most, used), _ = jax.lax.scan(repeat, start, None, self.repeat)
-      after = after.replace(data=after.data.replace(buffers=used), metrics=after.metrics | most)
+      none, zero = jax.tree.map(jnp.zeros_like, state.metrics), jnp.zeros_like(state.done)
+      start = (state, jnp.zeros_like(state.reward), zero, zero, none, unused)
+      (after, reward, ended, cut, metrics, used), _ = jax.lax.scan(repeat, start, jnp.arange(1, self.repeat + 1))
+      after = after.replace(data=after.data.replace(buffers=used), metrics=metrics)
 
     steps = state.info["steps"] + self.repeat
     timed_out = steps >= self.length
@@ -203,7 +203,7 @@ class Episode(Wrapper):
     sums = {k: jnp.where(was_done > 0, 0.0, v) for k, v in state.info["episode_metrics"].items()}
     values = {"sum_reward": reward, "length": jnp.full_like(reward, self.repeat)} | after.metrics
     count = sums["length"] / self.repeat + 1  # not of `steps`, which may begin at a random age
-    totals = {k: _SUMMARIES[kinds.get(k, "sum")](old, values[k], count) for k, old in sums.items()}
+    totals = {k: reduce[k](old, values[k], count) for k, old in sums.items()}
     totals |= {k: jnp.where(after.info["nonfinite"] > 0, sums[k], totals[k]) for k in kinds}
     info = after.info | {
       "steps": steps,

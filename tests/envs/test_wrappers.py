@@ -189,34 +189,28 @@ def test_action_repeat_sums_rewards_and_stops_at_a_termination() -> None:
   np.testing.assert_allclose(ended.reward, single[1], rtol=1e-5)
 
 
-def test_a_success_in_any_repeat_of_an_action_counts() -> None:
-  class Event(Counting):
-    """Succeeds in the control step `at` and in the third."""
+@pytest.mark.parametrize("kind", ["sum", "max", "mean", "last"])
+@pytest.mark.parametrize("die_at", [None, 2])
+def test_a_metric_is_of_all_repeats_of_an_action(kind: str, die_at: int | None) -> None:
+  class Timed(Counting):
+    """Its metric in control step n is 1/n."""
 
-    summaries: ClassVar[Mapping[str, str]] = {"success": "max"}
-
-    def __init__(self, at: int, **kwargs: Any):
-      super().__init__(episode_length=LENGTH, action_repeat=4, **kwargs)
-      self.at = at
+    summaries: ClassVar[Mapping[str, str]] = {"metric": kind} if kind != "sum" else {}
 
     def reset(self, rng: jax.Array, model: Any = None) -> State:
-      state = super().reset(rng, model)
-      return state.replace(metrics={"success": jnp.zeros(())})
+      return super().reset(rng, model).replace(metrics={"metric": jnp.zeros(())})
 
     def post_step(self, data: Any, info: Any, action: jax.Array) -> State:
       state = super().post_step(data, info, action)
-      age = state.info["age"]
-      return state.replace(metrics={"success": ((age == self.at) | (age == 3)).astype(jnp.float32)})
+      return state.replace(metrics={"metric": 1 / state.info["age"]})
 
-  def success(env: Any) -> list[float]:
-    wrapped = wrappers.wrap_for_training(env)
-    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), N))
-    after = jax.jit(wrapped.step)(state, jnp.full((N, 2), 0.1))
-    np.testing.assert_array_equal(after.metrics["success"], after.info["episode_metrics"]["success"])
-    return after.metrics["success"].tolist()
-
-  assert success(Event(at=1)) == [1] * N
-  assert success(Event(at=0, die_at=2)) == [0] * N, "what comes after an episode's end is not part of it"
+  wrapped = wrappers.wrap_for_training(Timed(die_at, episode_length=LENGTH, action_repeat=4))
+  state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), N))
+  after = jax.jit(wrapped.step)(state, jnp.full((N, 2), 0.1))
+  values = [1 / n for n in range(1, (die_at or 4) + 1)]  # what comes after an episode's end is not part of it
+  expected = {"sum": sum(values), "max": 1, "mean": np.mean(values), "last": values[-1]}[kind]
+  np.testing.assert_allclose(after.metrics["metric"], expected, rtol=1e-6)
+  np.testing.assert_allclose(after.info["episode_metrics"]["metric"], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("full_reset", [False, True])
