@@ -27,4 +27,4 @@ def test_time_truncates_and_actions_are_repeated(monkeypatch: pytest.MonkeyPatch
   assert not any(moment.terminated for moment in moments)
   first = moments[0]
   assert isinstance(first.obs, dict) and first.obs["privileged_state"].shape == (4,)
-  assert first.reward == pytest.approx(-2 * first.metrics["distance"])
+  assert first.reward == pytest.approx(-first.metrics["distance"]), "both are of two control steps"

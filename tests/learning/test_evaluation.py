@@ -44,19 +44,20 @@ def test_metrics_of_an_episode(action_repeat: int) -> None:
   key = jax.random.PRNGKey(0)
   scores, recording = evaluate(jnp.zeros(()), key, {}, {})
 
-  steps = []
+  ends = []
   reset_key = jax.random.split(jax.random.fold_in(key, 0))[0]
   for env_key in jax.random.split(reset_key, 8):
-    end = int(env.ends(env.reset(env_key).info))
-    steps.append(-(-end // action_repeat))  # decisions
-  ages = [np.arange(1, n + 1) * action_repeat for n in steps]
+    ends.append(int(env.ends(env.reset(env_key).info)))
+  steps = -(-np.array(ends) // action_repeat)  # decisions
+  ages = [np.arange(1, end + 1) for end in ends]  # a repeat after the end of an episode counts nowhere
+  of_decision = [[a[i : i + action_repeat].mean() for i in range(0, len(a), action_repeat)] for a in ages]
   assert len(set(steps)) > 1, "episodes of one length would show little"
   means = {
-    "length": np.array(steps) * action_repeat,
+    "length": steps * action_repeat,
     "total": [a.sum() for a in ages],
-    "average": [a.mean() for a in ages],
-    "highest": [-1.0],  # of all control steps, the repeats among them
-    "at_end": [a[-1] for a in ages],
+    "average": [np.mean(means) for means in of_decision],
+    "highest": [-1.0],
+    "at_end": ends,
   }
   for name, values in means.items():
     np.testing.assert_allclose(scores[f"episode_{name}"], np.mean(values), rtol=1e-6, err_msg=name)
