@@ -4,11 +4,10 @@ import math
 
 import jax
 import jax.numpy as jnp
-from brax.training import networks as brax_networks
 
 from playground.envs.base import Env
 from playground.learning.hyperparameters import C51Config
-from playground.learning.networks import Actor, refuse_images
+from playground.learning.networks import Actor, Critic, refuse_images, value_dtype
 from playground.learning.off_policy import Transition
 from playground.pytree import PyTree
 
@@ -54,13 +53,14 @@ class C51Networks(Actor):
     Raises:
       ConfigError: a task with images, an unknown activation, or an observation group that the task does not have.
     """
-    sizes, network = env.observation_size, config.network
-    refuse_images(sizes, agent)
-    hidden, norm = network.policy_hidden_layer_sizes, network.layer_norm
-    super().__init__(sizes, env.action_size, hidden, network, precision, norm)
+    network, norm = config.network, config.network.layer_norm
+    refuse_images(env.observation_size, agent)
+    hidden = network.policy_hidden_layer_sizes
+    super().__init__(env.observation_size, env.action_size, hidden, network, precision, norm)
     self.atoms = Atoms(config.min_value, config.max_value, config.num_atoms)
-    layers = [*network.q_hidden_layer_sizes, config.num_atoms]
-    self._critic = brax_networks.MLP(layers, self.activation, layer_norm=norm)
+    self.value_dtype = value_dtype(network.value_dtype)
+    sizes, dtype = tuple(network.q_hidden_layer_sizes), jnp.dtype(self.value_dtype)
+    self._critic = Critic(sizes, self.activation, dtype, norm, config.num_atoms)
     self._output_scale = network.policy_output_scale
 
   def init_policy(self, key: jax.Array) -> PyTree:

@@ -30,6 +30,10 @@ RewardScaling = Annotated[float, positive(), "factor on rewards"]
 ActorSizes = Annotated[Sequence[int], SIZES, "units of the actor's hidden layers"]
 PolicyObsKey = Annotated[str, "observation group that the actor reads"]
 ValueObsKey = Annotated[str, "observation group that the critic reads; privileged_state for an asymmetric pair"]
+ValueDtype = Annotated[
+  Literal["auto", "bfloat16", "float32"],
+  "of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere",
+]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -179,10 +183,7 @@ class NetworkConfig:
   clip_observations: Annotated[
     float | None, positive(), "largest input of actor and critic, after normalisation; null: it is not clipped"
   ] = None
-  value_dtype: Annotated[
-    Literal["auto", "bfloat16", "float32"],
-    "of the critic's hidden activations; auto is bfloat16 on a GPU, float32 elsewhere",
-  ] = "auto"
+  value_dtype: ValueDtype = "auto"
   cnn: Annotated[CNNConfig, "of actor and critic each, for images"] = dataclasses.field(default_factory=CNNConfig)
 
 
@@ -375,6 +376,7 @@ class C51NetworkConfig:
   policy_output_scale: Annotated[float, at_least_0(), "standard deviation of the actor's last weights at first"] = 0.01
   policy_obs_key: PolicyObsKey = "state"
   value_obs_key: ValueObsKey = "state"
+  value_dtype: ValueDtype = "auto"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

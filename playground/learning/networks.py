@@ -233,7 +233,7 @@ class ActorCriticParams(struct.PyTreeNode):
 
 
 class Critic(linen.Module):
-  """Brax's value MLP with its hidden layers computed in `dtype`; parameters and output are float32.
+  """Brax's MLP with its hidden layers computed in `dtype`; parameters and output, [..., output_size], are float32.
 
   Writing and reading hidden activations is most of the cost of an update on a GPU. The first layer stays in float32:
   advantages are differences of neighbouring states' values, which rounded observations would blur. The actor stays in
@@ -243,15 +243,25 @@ class Critic(linen.Module):
   hidden_layer_sizes: Sequence[int]
   activation: Callable[[jax.Array], jax.Array]
   dtype: DTypeLike
+  layer_norm: bool = False
+  output_size: int = 1
 
   @linen.compact
-  def __call__(self, obs: jax.Array) -> jax.Array:
-    init, hidden = jax.nn.initializers.lecun_uniform(), obs
+  def __call__(self, inputs: jax.Array) -> jax.Array:
+    init, hidden = jax.nn.initializers.lecun_uniform(), inputs
     for i, size in enumerate(self.hidden_layer_sizes):
       dtype = jnp.float32 if i == 0 else self.dtype
       hidden = self.activation(linen.Dense(size, dtype=dtype, kernel_init=init, name=f"hidden_{i}")(hidden))
-    last = linen.Dense(1, dtype=jnp.float32, kernel_init=init, name=f"hidden_{len(self.hidden_layer_sizes)}")
-    return last(hidden)[..., 0]
+      if self.layer_norm:
+        hidden = linen.LayerNorm(dtype=self.dtype)(hidden)
+    name = f"hidden_{len(self.hidden_layer_sizes)}"
+    return linen.Dense(self.output_size, dtype=jnp.float32, kernel_init=init, name=name)(hidden)
+
+
+def value_dtype(name: str) -> str:
+  """Returns the type of a critic's hidden activations for `agent.network.value_dtype`."""
+  auto = "bfloat16" if jax.default_backend() == "gpu" else "float32"
+  return auto if name == "auto" else name
 
 
 class ActorCritic(Actor):
@@ -260,8 +270,7 @@ class ActorCritic(Actor):
   def __init__(self, obs_size: ObservationSize, action_size: int, config: NetworkConfig, precision: str | None = None):
     """Builds the networks; see `Actor` for the arguments and errors."""
     super().__init__(obs_size, action_size, config.policy_hidden_layer_sizes, config, precision)
-    auto = "bfloat16" if jax.default_backend() == "gpu" else "float32"
-    self.value_dtype = auto if config.value_dtype == "auto" else config.value_dtype
+    self.value_dtype = value_dtype(config.value_dtype)
     sizes, dtype = tuple(config.value_hidden_layer_sizes), jnp.dtype(self.value_dtype)
     if self.pixel_sizes:
       self._critic = self._on_pixels(config.cnn, sizes, 1, dtype=dtype)
@@ -279,9 +288,9 @@ class ActorCritic(Actor):
   def value(self, value_params: PyTree, obs: Mapping[str, jax.Array]) -> jax.Array:
     """Returns state values, [...], for normalised observations."""
     with self.at_precision():
-      if self.pixel_sizes:
-        return self._critic.apply(value_params, *self._seen(obs, self.value_obs_key))[..., 0]  # pyright: ignore
-      return self._critic.apply(value_params, self._vector(obs, self.value_obs_key))  # pyright: ignore[reportReturnType]
+      pixels = bool(self.pixel_sizes)
+      seen = self._seen(obs, self.value_obs_key) if pixels else (self._vector(obs, self.value_obs_key),)
+      return self._critic.apply(value_params, *seen)[..., 0]  # pyright: ignore
 
 
 class SoftActorCriticParams(struct.PyTreeNode):

@@ -1,5 +1,8 @@
 """Distributions over atoms against their formulas."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -59,3 +62,17 @@ class Seen(PointTask):
 def test_images_are_refused(agent: str) -> None:
   with pytest.raises(ConfigError, match=f"agent={agent} reads no images: choose agent=ppo"):
     build_algorithm(Seen(), config_class(agent)(), None)
+
+
+@pytest.mark.parametrize("agent", ["fast_td3", "fast_sac"])
+def test_hidden_activations_of_the_critics_have_the_type_of_value_dtype(agent: str) -> None:
+  def logits(dtype: str) -> jax.Array:
+    config = config_class(agent)()
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, value_dtype=dtype))
+    networks = build_algorithm(PointTask(), config, None).networks
+    obs, action = {"state": jnp.full((4, 2), 0.3)}, jnp.full((4, 2), 0.2)
+    return networks.q(networks.init(jax.random.PRNGKey(0)).q, obs, action)
+
+  full, half = logits("float32"), logits("bfloat16")
+  assert full.dtype == half.dtype == jnp.float32
+  assert 0 < float(jnp.abs(full - half).max()) < 0.05
