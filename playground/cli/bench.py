@@ -10,7 +10,7 @@ from playground.benchmark.arguments import help_of, parse
 from playground.errors import PlaygroundError, UnknownNameError, nearest, one_sentence
 
 # Measurements are in one module; each other command is a module with `Options` and `run(options) -> exit code`.
-OTHERS = {name: f"playground.benchmark.{name}" for name in ("golden", "report", "gate")}
+OTHERS = {name: f"playground.benchmark.{name}" for name in ("golden", "record", "report", "gate")}
 
 
 def main() -> None:

@@ -19,8 +19,9 @@ from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
 from playground.envs.locomotion.gait_metrics import with_gait_metrics
-from playground.errors import CheckpointError, PlaygroundError
+from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.extras import need
+from playground.files import need_folder, read_json
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
@@ -127,6 +128,29 @@ def play(
       **episodes_of(recording, 1),
     )
   return 0
+
+
+def play_scores(run: Path, steps: int, episodes: int, interval_events: bool = True) -> dict[str, float]:
+  """Returns the scores of a run's newest policy in C MuJoCo (seed 0): played now, or those of an earlier play.
+
+  Args:
+    run: a run directory.
+    steps: of its newest checkpoint.
+    episodes: number of episodes.
+    interval_events: whether pushes and other interval events act.
+
+  Raises:
+    PlaygroundError: a policy that cannot be played.
+    ConfigError: the result's file holds no scores.
+  """
+  result = run / "export" / result_name(steps, seed=0, episodes=episodes, interval_events=interval_events)
+  if not result.exists():
+    need_folder(result.parent, str(result.parent), run)
+    play(str(run), episodes=episodes, interval_events=interval_events)
+  scores = read_json(result, scores=dict).get("scores")
+  if not scores:
+    raise ConfigError(f"{result} holds no scores: move it away, or see why `playground play` did not write it.")
+  return scores
 
 
 def result_name(

@@ -1,7 +1,6 @@
 """`playground pretrained`: lists the policies that come with the package, or adds one."""
 
 import math
-from pathlib import Path
 
 from rich.box import SIMPLE
 from rich.console import Console
@@ -9,11 +8,11 @@ from rich.table import Table
 
 from playground import catalog, pretrained
 from playground.cli.list_tasks import wide_console
-from playground.cli.play import play, result_name
+from playground.cli.play import play_scores
 from playground.config import task_names
 from playground.deploy.export import export_run
 from playground.errors import ConfigError
-from playground.files import need_folder, read_json
+from playground.files import need_folder
 from playground.learning.checkpoints import find_checkpoints, find_stages
 from playground.pretrained import add, cards
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, newest_evaluation
@@ -76,14 +75,10 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   row = newest_evaluation(run.metrics_csv, steps)
   if row is None:
     raise ConfigError(f"{path} was not evaluated before its newest checkpoint, step {steps}.")
-  result = run.path / "export" / result_name(steps, seed=0, episodes=_EPISODES)
-  need_folder(result.parent, str(result.parent), run.path)
+  need_folder(run.path / "export", str(run.path / "export"), run.path)
   need_folder(pretrained.POLICIES, str(pretrained.POLICIES))
-  scores = _scores(result) if result.exists() else None
+  scores = play_scores(run.path, steps, _EPISODES)
   export_run(path)
-  if scores is None:
-    play(path, episodes=_EPISODES)
-    scores = _scores(result)
   config, manifest = run.config, run.manifest
   git: dict[str, Plain] = manifest.get("git") or {}
   as_set, other = ("mode", "sampled") if config["agent"]["deterministic_eval"] else ("sampled", "mode")
@@ -118,14 +113,6 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
   print(f"{folder}: {size / 1e6:.1f} MB")
   return 0
-
-
-def _scores(result: Path) -> dict[str, float]:
-  """Returns the scores in a result of `play`; raises ConfigError if it has none."""
-  scores = read_json(result, scores=dict).get("scores")
-  if not scores:
-    raise ConfigError(f"{result} holds no scores: move it away, or see why `playground play` did not write it.")
-  return scores
 
 
 def _status(scores: dict[str, float]) -> catalog.Status:
