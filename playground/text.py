@@ -1,7 +1,8 @@
 """Values and errors in the words of the command line."""
 
+import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import yaml
 
@@ -20,6 +21,11 @@ def format_value(value: object) -> str:
 def millions(steps: float) -> str:
   """Formats a number of steps in millions, with three digits or all before the point."""
   return f"{steps / 1e6:.3g}" if steps < 1e9 else f"{steps / 1e6:,.0f}"
+
+
+def suffix(overrides: Sequence[str]) -> str:
+  """Returns what distinguishes the file names of results with overrides, "" without any."""
+  return f"_{hashlib.sha256(' '.join(overrides).encode()).hexdigest()[:8]}" if overrides else ""
 
 
 def quoted(value: object) -> str:

@@ -8,5 +8,7 @@ worker       the process of a measurement, which calls `measures/`, the only par
 peer/        drives the public package in its own environment
 golden       checks whole runs against windows
 gate         checks ratios of a quick set against committed ones
+record       appends finished runs to the tables of results/reference
+run_columns  describes a run directory in the columns of these tables
 report       writes one page from all rows
 """

@@ -4,17 +4,15 @@ import csv
 import dataclasses
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from playground.benchmark.arguments import check_limits
+from playground.benchmark.run_columns import conditions_of, fixed, notes_on_end, setting_of, stage_of, times_of
 from playground.benchmark.schema import commit_of
 from playground.catalog import entries
-from playground.config import compose
-from playground.config.limits import nodes
-from playground.config.overrides import SHORT_KEYS
-from playground.errors import ConfigError, PlaygroundError
+from playground.errors import ConfigError
 from playground.extras import need
 from playground.files import is_locked, lock_holder, locking, need_folder, read_csv, write_text
 from playground.learning.checkpoints import find_checkpoints, find_stages
@@ -22,11 +20,9 @@ from playground.limits import count
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_table
 from playground.runs.run_dir import RunDirectory
 from playground.settings import select
-from playground.text import format_value
 
-Row = dict[str, Any]
+Row = dict[str, object]
 _EPISODES = 20  # in C MuJoCo, of a row that does not say otherwise
-_EVAL_ENVS = 128  # episodes of an evaluation, of a row that does not say otherwise
 _MEASURED = {  # column -> its column of metrics.csv, and decimals
   "tracking_error_lin_m_s": ("eval/episode_tracking_error/lin_vel", 3),
   "tracking_error_ang_rad_s": ("eval/episode_tracking_error/ang_vel", 3),
@@ -40,13 +36,8 @@ _MEASURED = {  # column -> its column of metrics.csv, and decimals
   "goals_reached": ("eval/episode_goals_reached", 2),
 }
 _IN_C_MUJOCO = {"return": "episode_reward", "falls_per_episode": "episode_fall", "success": "episode_success"}
-_NOT_OF_SETTING = {  # overrides that have a column of their own, or that change no result
-  *("env", "agent", "seed", "experiment", "name", "run_dir", "resume", "trust"),
-  *("hardware", "tracking", "video", "visuals", "checkpoint", "profile", "launcher", "search", "sweep", "sweep_dir"),
-}
 _OF_MANIFEST = ("impl", "platform", "device", "num_devices", "matmul_precision", "network_precision", "versions")
 _OF_CONFIG = ("choices.env", "choices.agent", "agent.num_timesteps", "agent.num_eval_envs", "env", "seed")
-_PRECISION = {"tensorfloat32": "TF32", "highest": "float32"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +65,6 @@ class Entry:
     evaluations: its rows of `curves`, without the run's name.
     name: the run's name in `curves`, of which a number makes another one where it is taken.
     policy: steps of the newest checkpoint; None if nothing is to be played.
-    has_pushes: whether the task has interval events.
   """
 
   run: RunDirectory
@@ -84,7 +74,6 @@ class Entry:
   evaluations: list[Row]
   name: str
   policy: int | None
-  has_pushes: bool
 
 
 def run(options: Options) -> int:
@@ -146,8 +135,7 @@ def _entry(run: RunDirectory, folder: Path, options: Options) -> Entry:
   table, curves = folder / f"{suite}.csv", folder / f"{suite}_curves.csv"
   if select(config, "env.vision.enable"):
     table = folder / "vision.csv"
-  columns = _header(table)
-  _header(curves)
+  columns, _ = _header(table), _header(curves)
   if options.c_mujoco and "c_mujoco_return" not in columns:
     raise ConfigError(f"{table} has no columns c_mujoco_*: leave c_mujoco=true away for {run.path}.")
   metrics = read_table(run.metrics_csv).rows
@@ -158,23 +146,15 @@ def _entry(run: RunDirectory, folder: Path, options: Options) -> Entry:
   decimals = 1 if suite == "dm_control" or abs(float(last[RETURN])) >= 100 else 2
   mode = last[RETURN] if deterministic else last.get(OTHER_RETURNS["mode"], "")
   policy = int(find_checkpoints(run.path)[0].name) if options.c_mujoco else None
-  stage = _stage(run)
-  setting, later = _setting(run)
-  notes = []
-  if deterministic:
-    sampled = _fixed(last.get(OTHER_RETURNS["sampled"]), decimals)
-    notes.append("evaluated by the policy's mode")
-    notes += [f"sampled {sampled}"] * bool(sampled)
-  elif "final_mode_return" not in columns and mode:
-    notes.append(f"by the policy's mode {_fixed(mode, decimals)}")
-  notes += _stopped(run, int(last["step"]), max(policy or 0, int(metrics[-1]["step"])))
-  if policy is not None and _millions(policy) != _millions(int(last["step"])):
-    notes.append(f"played in C MuJoCo: the policy after {_millions(policy)} M")
-  if policy is not None and options.episodes != _EPISODES:
-    notes.append(f"{options.episodes} episodes in C MuJoCo")
-  commit = commit_of(manifest.get("git"))
-  starts = [commit_of(start.get("git")) for start in manifest.get("earlier_starts", [])]
-  notes += [f"begun at commit {start}" for start in starts[:1] if start != commit]
+  stage = stage_of(run)
+  setting, later = setting_of(run, stage)
+  evaluated, commit = int(last["step"]), commit_of(manifest.get("git"))
+  sampled = last.get(OTHER_RETURNS["sampled"]) if deterministic else None
+  notes = ["evaluated by the policy's mode"] * deterministic + [f"sampled {fixed(sampled, decimals)}"] * bool(sampled)
+  if not deterministic and mode and "final_mode_return" not in columns:
+    notes.append(f"by the policy's mode {fixed(mode, decimals)}")
+  notes += notes_on_end(run, evaluated, max(policy or 0, int(metrics[-1]["step"])), policy)
+  notes += [f"{options.episodes} episodes in C MuJoCo"] * (policy is not None and options.episodes != _EPISODES)
   notes += [f"then with {later}"] * bool(later) + [options.note] * bool(options.note)
   row = {
     "task": task,
@@ -184,179 +164,47 @@ def _entry(run: RunDirectory, folder: Path, options: Options) -> Entry:
     "setting": setting,
     "seed": config["seed"],
     "backend": manifest["impl"],
-    "steps": int(last["step"]),
-    "final_return": _fixed(last[RETURN], decimals),
-    "final_mode_return": _fixed(mode, decimals),
-    "return_std": _fixed(last.get(f"{RETURN}_std"), decimals),
-    "best_return": _fixed(max(float(row[RETURN]) for row in evaluations if int(row["step"])), decimals),
-    "nonfinite": _fixed(sum(float(row.get("training/nonfinite") or 0) for row in metrics), 1),
+    "steps": evaluated,
+    "final_return": fixed(last[RETURN], decimals),
+    "final_mode_return": fixed(mode, decimals),
+    "return_std": fixed(last.get(f"{RETURN}_std"), decimals),
+    "best_return": fixed(max(float(row[RETURN]) for row in evaluations if int(row["step"])), decimals),
+    "nonfinite": fixed(sum(float(row.get("training/nonfinite") or 0) for row in metrics), 1),
     "note": "; ".join(notes),
     "devices": manifest["num_devices"],
     "device": "CPU" if manifest["platform"] == "cpu" else manifest["device"],
-    "conditions": _conditions(config, manifest, options.machine, commit),
-    **{column: _fixed(last.get(metric), digits) for column, (metric, digits) in _MEASURED.items()},
-    **(_times(run, manifest) if options.alone else {}),
+    "conditions": conditions_of(config, manifest, options.machine, commit),
+    **{column: fixed(last.get(metric), digits) for column, (metric, digits) in _MEASURED.items()},
+    **(times_of(run, manifest) if options.alone else {}),
   }
   name = "_".join(filter(None, (task, agent, f"s{config['seed']}", stage, commit.rstrip("+"))))
-  points = list(_points(evaluations, _header(curves), stage, deterministic, options.alone))
-  return Entry(run, table, row, curves, points, name, policy, _has_pushes(config["env"]))
-
-
-def _stage(run: RunDirectory) -> str:
-  """Returns the name of a chain's stage, "" for a run of its own."""
-  in_chain = (run.path.parent / "config.yaml").is_file()
-  return run.path.absolute().name.partition("_")[2] if in_chain else ""
-
-
-def _setting(run: RunDirectory) -> tuple[str, str]:
-  """Returns the overrides that differ from the task's set, and what else differs from today's configuration.
-
-  Where today's configuration does not take the overrides, all of them are the setting. Of a stage, the setting is that
-  of its chain.
-  """
-  stage, config = _stage(run), run.config
-  texts = RunDirectory(run.path.parent).overrides if stage else run.overrides
-  kept = [text for text in texts if _key_of(text).split(".")[0] not in _NOT_OF_SETTING or _is_value(text)]
-  kept = [f"init_from=<{_start(text)}>" if _key_of(text) == "init_from" else text.lstrip("+") for text in kept]
-  if stage:
-    return " ".join([*kept, f"stage={stage}"]), ""
-  choices = config["choices"]
-  base = [f"experiment={choices['experiment']}"] if choices.get("experiment") else []
-  base += [f"env={choices['env']}", f"agent={choices['agent']}"]
-  try:
-    default = compose(base).resolved
-    same = lambda key: (
-      select(config, key) == select(default, key) and ("." in key or choices.get(key) == default["choices"].get(key))
-    )
-    kept = [text for text in kept if text.startswith(("~", "init_from=")) or not same(_key_of(text))]
-    today = compose([*base, *(text for text in kept if not text.startswith("init_from="))]).resolved
-  except PlaygroundError as error:
-    print(f"{run.path}: its setting has all of its overrides, for today's configuration is another one ({error})")
-    return " ".join(kept), ""
-  leaves = lambda values: {
-    f"{part}.{key}": value for part in ("env", "agent") for key, value in nodes(values[part]) if not _nested(value)
-  }
-  before, now = leaves(config), leaves(today)
-  changed = [key for key in before if key in now and before[key] != now[key]]
-  return " ".join(kept), " ".join(f"{key}={format_value(before[key])}" for key in changed)
-
-
-def _key_of(override: str) -> str:
-  key = override.lstrip("+~").partition("=")[0].partition("@")[0]
-  return SHORT_KEYS.get(key, key)
-
-
-def _is_value(override: str) -> bool:
-  """Returns whether an override sets a value of the task, the agent, or the number of environments of each device."""
-  return _key_of(override).startswith(("env.", "agent.")) or _key_of(override) == "hardware.scale_envs"
-
-
-def _nested(value: object) -> bool:
-  return isinstance(value, Mapping)
-
-
-def _start(override: str) -> str:
-  """Returns the task of the policy in `init_from=`, the name of its folder where there is no longer a run."""
-  path = override.partition("=")[2].strip("'\"").removeprefix("pretrained:")
-  folders = [Path(path).expanduser(), *Path(path).expanduser().parents]
-  started = next((folder for folder in folders if (folder / "config.yaml").is_file()), None)
-  return str(select(RunDirectory(started).config, "choices.env")) if started else Path(path).name
-
-
-def _stopped(run: RunDirectory, evaluated: int, trained: int) -> list[str]:
-  """Returns the remark on a run that ended before its budget."""
-  if run.status.get("status") == "finished":
-    return []
-  budget = run.config["agent"]["num_timesteps"]
-  late = f", last evaluated after {_millions(evaluated)} M" if _millions(evaluated) != _millions(trained) else ""
-  return [f"stopped after {_millions(trained)} of {_millions(budget)} M steps{late}"]
-
-
-def _millions(steps: float) -> str:
-  return f"{steps / 1e6:.0f}" if steps >= 1e7 else f"{steps / 1e6:.3g}"
-
-
-def _fixed(value: object, decimals: int) -> str:
-  """Formats a number; "" for None, an empty cell and NaN."""
-  return (
-    "" if value in (None, "") or value != value or str(value).lower() == "nan" else f"{float(str(value)):.{decimals}f}"
-  )
-
-
-def _conditions(config: Row, manifest: Row, machine: str | None, commit: str) -> str:
-  """Returns machine, versions, precision, commit, and an unusual number of episodes of an evaluation."""
-  on_cpu, versions = manifest["platform"] == "cpu", manifest["versions"]
-  device = "CPU" if on_cpu else manifest["device"]
-  devices = f"{manifest['num_devices']}x {device}" if manifest["num_devices"] > 1 else device
-  mujoco, mjx = versions.get("mujoco"), versions.get("mujoco-mjx")
-  physics, networks = (
-    "float32" if on_cpu else _PRECISION.get(manifest[kind], manifest[kind])
-    for kind in ("matmul_precision", "network_precision")
-  )
-  dtype = select(config, "agent.network.value_dtype")
-  critic = ("float32" if on_cpu else "bfloat16") if dtype == "auto" else dtype
-  precision = f"physics {physics}, networks {networks}"
-  if critic not in (None, "float32"):
-    precision += f", critic's hidden activations {critic} but for its first layer"
-  count = config["agent"]["num_eval_envs"]
-  parts = [
-    machine or devices,
-    f"Python {versions.get('python')}",
-    f"JAX {versions.get('jax')}",
-    f"MuJoCo and MJX {mujoco}" if mujoco == mjx else f"MuJoCo {mujoco}, MJX {mjx}",
-    *([f"Warp {versions.get('warp-lang')}"] if manifest["impl"] == "warp" or not on_cpu else []),
-    precision,
-    f"commit {commit or 'unknown'}" + f", {count} episodes an evaluation" * (count != _EVAL_ENVS),
-  ]
-  return "; ".join(parts)
-
-
-def _times(run: RunDirectory, manifest: Row) -> Row:
-  """Returns the columns of rate and time of a run that had its device to itself."""
-  timings, wall_clock = manifest.get("timings", {}), run.summary.get("wall_clock_s")
-  whole = None if wall_clock is None or manifest.get("earlier_starts") else timings.get("start_to_compiled_s")
-  return {
-    "training_steps_per_s": _fixed(timings.get("steady_steps_per_second"), 0),
-    "wall_clock_s": _fixed(wall_clock, 1),
-    "command_to_end_s": _fixed(None if whole is None else whole + wall_clock, 0),
-  }
-
-
-def _points(
-  evaluations: Sequence[Mapping[str, str]], columns: Sequence[str], stage: str, deterministic: bool, alone: bool
-) -> Iterator[Row]:
-  """Yields the evaluations in the columns of a table of curves."""
-  for row in evaluations:
-    values = dict(row)
-    if deterministic:
-      values[OTHER_RETURNS["mode"]] = row[RETURN]
-    if not alone:
-      values.pop("time/steps_per_second", None)
-    numbers = {column: _fixed(values.get(column), 3) for column in columns if column not in ("run", "stage", "step")}
-    yield {"stage": stage, "step": row["step"], **numbers}
-
-
-def _has_pushes(env: Row) -> bool:
-  events = [event for event in (env.get("events") or {}).values() if event]
-  return any(event.get("mode") == "interval" and event.get("enabled", True) for event in events)
+  points = []
+  for each in evaluations:
+    values = each | ({OTHER_RETURNS["mode"]: each[RETURN]} if deterministic else {})
+    values |= {} if options.alone else {"time/steps_per_second": ""}
+    numbers = {column: fixed(values.get(column), 3) for column in _header(curves) if "/" in column}
+    points.append({"stage": stage, "step": each["step"], **numbers})
+  return Entry(run, table, row, curves, points, name, policy)
 
 
 def _played(entry: Entry, episodes: int) -> Row:
   """Plays a run's policy in C MuJoCo, or reads the result of an earlier play, and returns the columns c_mujoco_*."""
-  from playground.cli.play import play_scores
+  from playground.deploy.scores import newest_scores
 
+  events = [event for event in entry.run.config["env"].get("events", {}).values() if event]
+  pushed = any(event.get("mode") == "interval" and event.get("enabled", True) for event in events)
   row = {}
-  for prefix, interval_events in {"c_mujoco": True, **({"c_mujoco_calm": False} if entry.has_pushes else {})}.items():
-    scores = play_scores(entry.run.path, entry.policy or 0, episodes, interval_events)
+  for prefix in ("c_mujoco", "c_mujoco_calm")[: 1 + pushed]:
+    scores = newest_scores(entry.run.path, entry.policy or 0, episodes, interval_events=prefix == "c_mujoco")
     row |= {f"{prefix}_{column}": f"{scores[name]:.4g}" for column, name in _IN_C_MUJOCO.items() if name in scores}
   return row
 
 
 def _key(row: Mapping[str, object]) -> tuple[str, ...]:
   """Returns what two records of the same run have in common."""
-  commit = re.search(r"\bcommit (\w+\+?)", str(row["conditions"]))
+  commits = re.findall(r"\bcommit ([0-9a-f]{7,}\+?)", str(row["conditions"]))
   columns = ("who", "task", "agent", "experiment", "setting", "seed", "steps")
-  return (*(str(row.get(column) or "") for column in columns), commit.group(1) if commit else "")
+  return (*(str(row.get(column) or "") for column in columns), *commits[-1:])
 
 
 def _add_curves(entry: Entry) -> str:

@@ -1,6 +1,5 @@
 """`playground eval <run>`: evaluates a trained policy on this machine."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from playground.rendering.visuals import drawn_model
 from playground.runs.callbacks import episodes_of
 from playground.runs.loaded_policy import load_policy
 from playground.runs.train import model_sampler
+from playground.text import suffix
 
 
 def evaluate_run(
@@ -89,11 +89,6 @@ def evaluate_run(
 def described(overrides: Sequence[str]) -> str:
   """Returns the end of a title that names overrides, "" without any."""
   return f", with {' '.join(overrides)}" if overrides else ""
-
-
-def suffix(overrides: Sequence[str]) -> str:
-  """Returns what distinguishes the file names of results with overrides, "" without any."""
-  return f"_{hashlib.sha256(' '.join(overrides).encode()).hexdigest()[:8]}" if overrides else ""
 
 
 def save(out: Path, report: Mapping[str, object], console: Console, run: Path | None = None) -> None:

@@ -10,18 +10,17 @@ from rich.table import Table
 
 from playground import config as configs
 from playground import registry
-from playground.cli.eval import described, save, suffix
+from playground.cli.eval import described, save
 from playground.deploy.contract import Contract
 from playground.deploy.menu import Menu
 from playground.deploy.policy import ActingPolicy, ExportedPolicy
+from playground.deploy.scores import measure, result_name, result_of
 from playground.deploy.scripted import ScriptedPolicy
 from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
 from playground.envs.base import Env
-from playground.envs.locomotion.gait_metrics import with_gait_metrics
-from playground.errors import CheckpointError, ConfigError, PlaygroundError
+from playground.errors import CheckpointError, PlaygroundError
 from playground.extras import need
-from playground.files import need_folder, read_json
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
@@ -107,17 +106,14 @@ def play(
     following = None if given.parent.name == "checkpoints" else LATEST
     watch(Session(env, exported, seed, menu, following, model_seed), host, port, console)
     return 0
-  evaluate = make_evaluator(with_gait_metrics(env), exported.act, episodes, make_mesh(1), 1 if film else 0)
-  scores, recording = evaluate({}, jax.random.PRNGKey(seed), {}, {})
-  scores = {name: float(value) for name, value in jax.device_get(scores).items()}
-  origin = exported.contract["origin"]
+  scores, recording = measure(exported, env, episodes, seed, 1 if film else 0)
   console.print(_table(exported.contract, episodes, scores, overrides))
   if opened.folder is not None:
-    out = opened.folder / result_name(origin["steps"], seed, episodes, interval_events, overrides)
-    played = {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "interval_events": interval_events}
-    played |= {"overrides": list(overrides)} if overrides else {}
+    steps = exported.contract["origin"]["steps"]
+    out = opened.folder / result_name(steps, seed, episodes, interval_events, overrides)
+    result = result_of(exported, scores, episodes, seed, interval_events, overrides)
     run = opened.trained.run_dir.path if opened.trained else None
-    save(out, played | {"scores": scores, "origin": origin}, console, run)
+    save(out, result, console, run)
   if film:
     render_video(
       env.mj_model,
@@ -128,37 +124,6 @@ def play(
       **episodes_of(recording, 1),
     )
   return 0
-
-
-def play_scores(run: Path, steps: int, episodes: int, interval_events: bool = True) -> dict[str, float]:
-  """Returns the scores of a run's newest policy in C MuJoCo (seed 0): played now, or those of an earlier play.
-
-  Args:
-    run: a run directory.
-    steps: of its newest checkpoint.
-    episodes: number of episodes.
-    interval_events: whether pushes and other interval events act.
-
-  Raises:
-    PlaygroundError: a policy that cannot be played.
-    ConfigError: the result's file holds no scores.
-  """
-  result = run / "export" / result_name(steps, seed=0, episodes=episodes, interval_events=interval_events)
-  if not result.exists():
-    need_folder(result.parent, str(result.parent), run)
-    play(str(run), episodes=episodes, interval_events=interval_events)
-  scores = read_json(result, scores=dict).get("scores")
-  if not scores:
-    raise ConfigError(f"{result} holds no scores: move it away, or see why `playground play` did not write it.")
-  return scores
-
-
-def result_name(
-  steps: int, seed: int, episodes: int, interval_events: bool = True, overrides: Sequence[str] = ()
-) -> str:
-  """Returns the file name of a result; results of other settings have other names, so that none replaces another."""
-  events = "" if interval_events else "_no_events"
-  return f"play_step_{steps:012d}_seed_{seed}_episodes_{episodes}{events}{suffix(overrides)}.json"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,9 +8,10 @@ from rich.table import Table
 
 from playground import catalog, pretrained
 from playground.cli.list_tasks import wide_console
-from playground.cli.play import play_scores
+from playground.cli.play import play
 from playground.config import task_names
 from playground.deploy.export import export_run
+from playground.deploy.scores import read_scores, result_name
 from playground.errors import ConfigError
 from playground.files import need_folder
 from playground.learning.checkpoints import find_checkpoints, find_stages
@@ -75,10 +76,14 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   row = newest_evaluation(run.metrics_csv, steps)
   if row is None:
     raise ConfigError(f"{path} was not evaluated before its newest checkpoint, step {steps}.")
-  need_folder(run.path / "export", str(run.path / "export"), run.path)
+  result = run.path / "export" / result_name(steps, seed=0, episodes=_EPISODES)
+  need_folder(result.parent, str(result.parent), run.path)
   need_folder(pretrained.POLICIES, str(pretrained.POLICIES))
-  scores = play_scores(run.path, steps, _EPISODES)
+  scores = read_scores(result) if result.exists() else None
   export_run(path)
+  if scores is None:
+    play(path, episodes=_EPISODES)
+    scores = read_scores(result)
   config, manifest = run.config, run.manifest
   git: dict[str, Plain] = manifest.get("git") or {}
   as_set, other = ("mode", "sampled") if config["agent"]["deterministic_eval"] else ("sampled", "mode")

@@ -62,8 +62,8 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
 @pytest.fixture
 def untrained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
   """Makes a run of a task that `add_policy` can read up to its policy."""
-  for name in ("pretrained.export_run", "play.play"):
-    monkeypatch.setattr(f"playground.cli.{name}", pytest.fail)
+  for name in ("export_run", "play"):
+    monkeypatch.setattr(f"playground.cli.pretrained.{name}", pytest.fail)
   monkeypatch.setattr(pretrained, "POLICIES", tmp_path / "policies")
 
   def make(task: str, *overrides: str) -> Path:
@@ -103,8 +103,8 @@ def test_a_result_without_scores_is_refused(
   with pytest.raises(ConfigError, match=r"episodes_20.json holds no scores: move it away"):
     add_policy(str(run))
   result.unlink()
-  for name in ("pretrained.export_run", "play.play"):  # which says why it does not write a result, and ends well
-    monkeypatch.setattr(f"playground.cli.{name}", lambda *_, **__: 0)
+  for name in ("export_run", "play"):  # which says why it does not write a result, and ends well
+    monkeypatch.setattr(f"playground.cli.pretrained.{name}", lambda *_, **__: 0)
   with pytest.raises(ConfigError, match=r"episodes_20.json holds no scores: .* why `playground play` did not write it"):
     add_policy(str(run))
   assert not (tmp_path / "policies").exists()
