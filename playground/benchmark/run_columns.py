@@ -35,7 +35,7 @@ def setting_of(run: RunDirectory, stage: str) -> tuple[str, str]:
   config = run.config
   texts = RunDirectory(run.path.parent).overrides if stage else run.overrides
   kept = [text.lstrip("+") for text in texts if _OF_SETTING.match(_key_of(text))]
-  starts = [f"init_from=<{_start(text)}>" for text in kept if _key_of(text) == "init_from"]
+  starts = [f"init_from=<{_start(text)}>" for text in kept if _key_of(text) == "init_from" and config["init_from"]]
   kept = [text for text in kept if _key_of(text) != "init_from"]
   if stage:
     return " ".join([*kept, *starts, f"stage={stage}"]), ""

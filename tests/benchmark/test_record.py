@@ -124,7 +124,7 @@ def test_two_runs_have_two_curves_and_two_rows(reference: Path, make: Make) -> N
 
 def test_what_has_become_another_default_is_a_note(reference: Path, make: Make) -> None:
   run = make("env=PandaPickCube", "agent.discounting=0.5", metrics=METRICS)
-  (run / "overrides.yaml").write_text("[]\n")
+  (run / "overrides.yaml").write_text("- init_from=null\n")
   assert record.run(Options(runs=(str(run),), reference=str(reference))) == 0
   row = last_row(reference / "manipulation.csv")
   assert (row["setting"], row["note"]) == ("", "then with agent.discounting=0.5")

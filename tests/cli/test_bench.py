@@ -56,6 +56,9 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     (["compare", "tasks=CheetahRun", f"peer_python={sys.executable}"], "it has none: install it there, or name"),
     (["compare", "tasks=CheetahRun", "agent=sac"], "compare is of ppo"),
     (["learning", "tasks=CheetahRun", "peer_menagerie=no_such_folder"], "holds no robot models"),
+    (["record"], "Name what to record: runs=<run directory>"),
+    (["record", "runs=no_such_run"], "No run directory at no_such_run"),
+    (["record", "runs=a", "episodes=0"], "episodes=0 must be a whole number from 1"),
     (["report", "rows=no_such_folder"], "rows=no_such_folder is not a folder"),
   ],
 )
