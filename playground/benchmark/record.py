@@ -147,7 +147,7 @@ def _entry(run: RunDirectory, folder: Path, options: Options) -> Entry:
   mode = last[RETURN] if deterministic else last.get(OTHER_RETURNS["mode"], "")
   policy = int(find_checkpoints(run.path)[0].name) if options.c_mujoco else None
   stage = stage_of(run)
-  setting, later = setting_of(run, stage)
+  setting, usual = setting_of(run, stage)
   evaluated, commit = int(last["step"]), commit_of(manifest.get("git"))
   sampled = last.get(OTHER_RETURNS["sampled"]) if deterministic else None
   notes = ["evaluated by the policy's mode"] * deterministic + [f"sampled {fixed(sampled, decimals)}"] * bool(sampled)
@@ -155,7 +155,7 @@ def _entry(run: RunDirectory, folder: Path, options: Options) -> Entry:
     notes.append(f"by the policy's mode {fixed(mode, decimals)}")
   notes += notes_on_end(run, evaluated, max(policy or 0, int(metrics[-1]["step"])), policy)
   notes += [f"{options.episodes} episodes in C MuJoCo"] * (policy is not None and options.episodes != _EPISODES)
-  notes += [f"then with {later}"] * bool(later) + [options.note] * bool(options.note)
+  notes += [f"then with {usual}"] * bool(usual) + [options.note] * bool(options.note)
   row = {
     "task": task,
     "agent": agent,
@@ -201,8 +201,8 @@ def _played(entry: Entry, episodes: int) -> Row:
 
 
 def _key(row: Mapping[str, object]) -> tuple[str, ...]:
-  """Returns what two records of the same run have in common."""
-  commits = re.findall(r"\bcommit ([0-9a-f]{7,}\+?)", str(row["conditions"]))
+  """Returns what two records of the same run have in common; older rows do not say whether files had changes."""
+  commits = re.findall(r"\bcommit ([0-9a-f]{7,})", str(row["conditions"]))
   columns = ("who", "task", "agent", "experiment", "setting", "seed", "steps")
   return (*(str(row.get(column) or "") for column in columns), *commits[-1:])
 

@@ -15,7 +15,8 @@ from playground.text import format_value
 
 _EVAL_ENVS = 128  # episodes of an evaluation, of a row that does not say otherwise
 _OF_SETTING = re.compile(  # keys of the overrides in the setting; others have columns or change no result
-  r"(env|agent|curriculum|on_nonfinite)\.|(debug|randomization|robot|tuned|curriculum|init_from|hardware\.scale_envs)$"
+  r"(env|agent(?!\.num_eval_envs$)|curriculum|on_nonfinite)\."
+  r"|(debug|randomization|robot|tuned|curriculum|init_from|hardware\.scale_envs)$"
 )
 _PRECISION = {"tensorfloat32": "TF32", "highest": "float32"}
 
@@ -27,14 +28,14 @@ def stage_of(run: RunDirectory) -> str:
 
 
 def setting_of(run: RunDirectory, stage: str) -> tuple[str, str]:
-  """Returns the overrides that differ from the task's set, and what else differs from today's configuration.
+  """Returns what differs from the task's set of today, and the overrides that have become part of it.
 
   Where today's configuration does not take the overrides, all of them are the setting. Of a stage, the setting is that
   of its chain.
   """
   config = run.config
   texts = RunDirectory(run.path.parent).overrides if stage else run.overrides
-  kept = [text.lstrip("+") for text in texts if _OF_SETTING.match(_key_of(text))]
+  kept = list({_key_of(text): text.lstrip("+") for text in texts if _OF_SETTING.match(_key_of(text))}.values())
   starts = [f"init_from=<{_start(text)}>" for text in kept if _key_of(text) == "init_from" and config["init_from"]]
   kept = [text for text in kept if _key_of(text) != "init_from"]
   if stage:
@@ -45,19 +46,28 @@ def setting_of(run: RunDirectory, stage: str) -> tuple[str, str]:
   value = lambda values, key: values["choices"].get(key) if key in values["choices"] else select(values, key)
   try:
     default = compose(base).resolved
-    kept = [text for text in kept if value(config, _key_of(text)) != value(default, _key_of(text))]
-    today = dict(_leaves(compose([*base, *kept]).resolved))
+    same = not _differences(config, default)  # whatever the overrides are called
+    differ = [t for t in kept if not same and value(config, _key_of(t)) != value(default, _key_of(t))]
+    older = _differences(config, compose([*base, *differ]).resolved)
   except PlaygroundError as error:
     print(f"{run.path}: its setting has all of its overrides, for today's configuration is another one ({error})")
     return " ".join([*kept, *starts]), ""
-  later = [f"{key}={format_value(value)}" for key, value in _leaves(config) if key in today and today[key] != value]
-  return " ".join([*kept, *starts]), " ".join(later)
+  return " ".join([*differ, *older, *starts]), " ".join(text for text in kept if text not in differ)
+
+
+def _differences(config: Section, other: Section) -> list[str]:
+  """Returns the values of task and agent that are other ones in `other`, as overrides."""
+  known = dict(_leaves(other))
+  changed = {key: value for key, value in _leaves(config) if key in known and known[key] != value}
+  return [f"{key}={format_value(value)}".replace(", ", ",") for key, value in changed.items()]
 
 
 def _leaves(config: Section) -> Iterator[tuple[str, object]]:
-  """Yields the values of task and agent by dotted key."""
+  """Yields the values of task and agent by dotted key, without the episodes of an evaluation, which conditions have."""
   for part in ("env", "agent"):
-    yield from ((f"{part}.{key}", value) for key, value in nodes(config[part]) if not isinstance(value, Mapping))
+    for key, value in nodes(config[part]):
+      if not isinstance(value, Mapping) and key != "num_eval_envs":
+        yield f"{part}.{key}", value
 
 
 def _key_of(override: str) -> str:

@@ -133,4 +133,4 @@ def _end_last_row(file: BinaryIO) -> None:
 
 def commit_of(git: Mapping[str, Any] | None) -> str:
   """Returns the column `commit` from `git_state`."""
-  return "" if git is None else git["commit"][:7] + "+" * git["dirty"]
+  return "" if git is None else git["commit"][:7] + "+" * bool(git.get("dirty"))

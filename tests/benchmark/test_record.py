@@ -102,7 +102,8 @@ def test_a_stopped_run_that_evaluates_the_mode(reference: Path, make: Make) -> N
   row = last_row(reference / "locomotion.csv")
   assert row["setting"] == "env.action_scale=0.25 agent.num_evals=3", "a default is none"
   assert row["note"] == (
-    "evaluated by the policy's mode; sampled 25.00; stopped after 12 of 20 M steps, last evaluated after 11 M"
+    "evaluated by the policy's mode; sampled 25.00; stopped after 12 of 20 M steps, last evaluated after 11 M; "
+    "then with agent.num_timesteps=20000000"
   )
   assert (row["final_return"], row["final_mode_return"], row["best_return"]) == ("27.12", "27.12", "27.12")
   assert (row["falls_per_episode"], row["tracking_error_lin_m_s"], row["steps"]) == ("0.250", "0.300", "11000000")
@@ -122,12 +123,12 @@ def test_two_runs_have_two_curves_and_two_rows(reference: Path, make: Make) -> N
   assert names[1] == f"{names[0]}_2"
 
 
-def test_what_has_become_another_default_is_a_note(reference: Path, make: Make) -> None:
+def test_a_default_that_has_changed_is_a_setting(reference: Path, make: Make) -> None:
   run = make("env=PandaPickCube", "agent.discounting=0.5", metrics=METRICS)
   (run / "overrides.yaml").write_text("- init_from=null\n")
   assert record.run(Options(runs=(str(run),), reference=str(reference))) == 0
   row = last_row(reference / "manipulation.csv")
-  assert (row["setting"], row["note"]) == ("", "then with agent.discounting=0.5")
+  assert (row["setting"], row["note"]) == ("agent.discounting=0.5", "")
 
 
 def test_images_have_a_table_and_stages_a_setting(reference: Path, make: Make) -> None:
