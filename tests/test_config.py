@@ -1,6 +1,7 @@
 """Composition: which file's value wins, what is refused and in which words."""
 
 import contextlib
+import dataclasses
 import io
 import json
 import math
@@ -639,11 +640,25 @@ def test_resume_takes_the_runs_own_configuration(run: Path):
   assert resumed.resume == resumed.run_dir == str(run)
 
 
+def test_a_resumed_run_may_train_longer_with_evaluations_as_far_apart(run: Path):
+  before = compose([f"resume={run}"]).agent
+  after = compose([f"resume={run}", f"agent.num_timesteps={3 * before.num_timesteps}"]).agent
+  assert after.num_timesteps == 3 * before.num_timesteps
+  assert after.num_evals - 1 == 3 * (before.num_evals - 1)
+  assert dataclasses.replace(after, num_timesteps=before.num_timesteps, num_evals=before.num_evals) == before
+
+
 @pytest.mark.parametrize(
   ("override", "parts"),
   {
-    "agent.num_timesteps=9": ["agent.num_timesteps=9 cannot be given with resume", "init_from={run} starts a new run"],
-    "env=CartpoleBalance": ["env=CartpoleBalance cannot be given with resume", "hardware, tracking, video;"],
+    "agent.gae_lambda=0.9": ["agent.gae_lambda=0.9 cannot be given with resume", "init_from={run} starts a new run"],
+    "agent.num_timesteps=9": ["agent.num_timesteps=9: {run} trains", "and can only train longer."],
+    "agent.num_timesteps=1e15": ["must be a whole number from 1 to 1e+12"],
+    "agent.num_timesteps=often": ["has the wrong type: it must be a whole number"],
+    "env=CartpoleBalance": [
+      "env=CartpoleBalance cannot be given with resume",
+      "video and a larger agent.num_timesteps;",
+    ],
     "seed=2": ["seed=2 cannot be given with resume"],
     "run_dir=x": ["run_dir=x cannot be given with resume"],
     "init_from={run}": ["resume={run} exclude each other"],

@@ -72,6 +72,7 @@ from playground.settings import Plain, Section, build, defaults, select
 from playground.text import first_line, format_value, join, wrong_type
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ in a resumed run
+_BUDGET = "agent.num_timesteps"  # may be larger in one
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that define the keys, in this order
 _SWEEP_SECTIONS = ("launcher", "search")
 _CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
@@ -429,31 +430,45 @@ def _literal(values: object) -> DictConfig:
 
 
 def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path]) -> RunConfig:
-  """Composes the configuration of a resumed run: the saved one, except for sections that may differ."""
+  """Composes the configuration of a resumed run: the saved one, except for its budget and sections that may differ."""
   _check_resumable(run, parsed)
   whole = from_saved(load(run / "config.yaml").resolved)
-  saved = whole.resolved
+  saved, folders = whole.resolved, [run / folder for folder in stage_folders(whole.curriculum).values()]
   fresh, choices = _hydra(group_overrides(parsed), roots)
   schema = _plain(fresh)
   chosen = {o.key for o in parsed if o.is_group}
   sections = {s: schema[s] if s in chosen else saved[s] for s in _RESUMABLE}
-  values = [o for o in parsed if not o.is_group and o.key != "resume"]
+  values = [o for o in parsed if not o.is_group and o.key not in ("resume", _BUDGET)]
   changed = _apply(_literal(sections), values, {s: schema[s] for s in sections})
+  for longer in (o for o in parsed if o.key == _BUDGET):
+    if folders:
+      last = f"resume={folders[-1]} {longer.text}"
+      raise ConfigError(f"{longer.text} is not for a chain: {last} trains its last stage longer.")
+    changed["agent"] = _trained_longer(saved["agent"], longer, run)
   resolved = {**saved, **changed, "resume": str(run), "run_dir": str(run), "init_from": None}
   resolved["choices"] = {**saved["choices"], **{group: choices[group] for group in chosen}}
   check_limits(resolved)
-  stages = [_compose_resumed(run / folder, parsed, roots) for folder in stage_folders(whole.curriculum).values()]
+  stages = [_compose_resumed(folder, parsed, roots) for folder in folders]
   return dataclasses.replace(from_dict(resolved, canonical(parsed, resolved)), stages=tuple(stages))
 
 
+def _trained_longer(agent: Section, longer: Override, run: Path) -> dict[str, Plain]:
+  """Returns an agent's section with a larger budget and so many more evaluations that they stay as far apart."""
+  new = _apply(_literal({"agent": agent}), [longer], {"agent": agent})["agent"]
+  before, steps = agent["num_timesteps"], new["num_timesteps"]
+  if steps < before:
+    raise ConfigError(f"{longer.text}: {run} trains {before:,} steps, and can only train longer.")
+  return {**new, "num_evals": 1 + round((agent["num_evals"] - 1) * steps / before)}
+
+
 def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:
-  """Raises ConfigError for changes that affect numbers: a resumed run ends as if it had never stopped."""
+  """Raises ConfigError for changes that affect numbers: a resumed run goes on as if it had never stopped."""
   for override in parsed:
     if override.key == "init_from":
       what = "resume continues a run exactly, init_from starts a new one from its weights"
       raise ConfigError(f"{override.text} and resume={run} exclude each other: {what}.")
-    if override.key.split(".")[0] not in ("resume", *_RESUMABLE):
-      what = f"which continues exactly that run and takes only {', '.join(_RESUMABLE)}"
+    if override.key.split(".")[0] not in ("resume", *_RESUMABLE) and override.key != _BUDGET:
+      what = f"which continues exactly that run and takes only {', '.join(_RESUMABLE)} and a larger {_BUDGET}"
       instead = f"init_from={run} starts a new run from its weights"
       raise ConfigError(f"{override.text} cannot be given with resume, {what}; {instead}.")
 

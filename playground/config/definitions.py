@@ -36,7 +36,7 @@ class RunSettings:
 
   seed: Annotated[int, SEED, "of the whole run"] = 1
   run_dir: Annotated[str | None, "the run's folder; null is results/<experiment or task>/<date_time>"] = None
-  resume: Annotated[str | None, "a run directory: continue exactly that run"] = None
+  resume: Annotated[str | None, "a run directory: continue exactly that run, or train it longer"] = None
   init_from: Annotated[str | None, "a run directory or checkpoint: a new run from its weights"] = None
   checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
   video: VideoConfig = dataclasses.field(default_factory=VideoConfig)

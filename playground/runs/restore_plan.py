@@ -58,6 +58,7 @@ class RestorePlan:
     columns: columns of metrics.csv at the restored checkpoint.
     settings: the agent's settings at the restored checkpoint, which population-based training may have changed.
     began_s: age of the process when the run started.
+    longer: whether the resumed run gets a larger budget than it was started with.
     error: why nothing can be restored, of a run that trains with others; else None.
   """
 
@@ -73,6 +74,7 @@ class RestorePlan:
   columns: list[str] = dataclasses.field(default_factory=list)
   settings: dict[str, float | list[float]] = dataclasses.field(default_factory=dict)
   began_s: float = 0.0
+  longer: bool = False
   error: str | None = None
 
   @classmethod
@@ -84,7 +86,8 @@ class RestorePlan:
     """
     if config.resume is not None:
       run_dir = RunDirectory.open(config.resume)
-      plan = cls(run_dir=run_dir, began_s=began_s)
+      longer = run_dir.config["agent"]["num_timesteps"] < config.agent.num_timesteps
+      plan = cls(run_dir=run_dir, began_s=began_s, longer=longer)
       try:
         plan.checkpoints = find_checkpoints(config.resume)
       except NoCheckpointError:
@@ -125,8 +128,8 @@ class RestorePlan:
 
   @property
   def finished(self) -> bool:
-    """Whether the resumed run has finished."""
-    return self.run_dir is not None and self.run_dir.status.get("status") == "finished"
+    """Whether the resumed run has finished, and is to train no longer."""
+    return self.run_dir is not None and self.run_dir.status.get("status") == "finished" and not self.longer
 
   def settings_over(self, own: Settings) -> dict[str, PyTree]:
     """Returns a run's settings: those of the restored checkpoint if it has any, else the config's."""

@@ -81,6 +81,14 @@ class RunDirectory:
       # Last, because this file makes the folder a run: an interrupted creation can be repeated.
       write_text(self.config_path, dump_yaml(plain(config)))
 
+  def note_budget(self, num_timesteps: int, num_evals: int) -> None:
+    """Changes the run's budget, and evaluations, in its configuration and overrides."""
+    budget = {"num_timesteps": num_timesteps, "num_evals": num_evals}
+    config, keys = self.config, [f"agent.{key}" for key in budget]
+    overrides = [text for text in self.overrides if text.partition("=")[0] not in keys]
+    overrides += [f"{key}={value}" for key, value in zip(keys, budget.values(), strict=True)]
+    self.write_config({**config, "agent": {**config["agent"], **budget}}, overrides)
+
   @classmethod
   def open(cls, path: str | Path) -> "RunDirectory":
     """Returns the run at `path`.

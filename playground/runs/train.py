@@ -78,7 +78,7 @@ def _train(config: RunConfig, interrupts: Interrupts, began_s: float = 0.0) -> i
     with plan.locked(config) as plan:
       if not plan.finished:
         return _train_locked(config, interrupts, began_s, plan, hardware)
-  print(f"{config.resume} is finished: nothing to resume (init_from={config.resume} trains on from its weights).")
+  print(f"{config.resume} is finished: nothing to resume (agent.num_timesteps=<more> trains it longer).")
   return 0
 
 
@@ -212,6 +212,8 @@ def _train_locked(
   run_dir = open_run(config, plan)
   share(str(run_dir.path.absolute()))
   with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(training.steps) as progress:
+    if plan.longer:  # not before it is recorded as running
+      run_dir.note_budget(config.agent.num_timesteps, config.agent.num_evals)
     run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=training.env.impl, **hardware.machine)
     for notice in plan.notices:
       progress.print(notice)

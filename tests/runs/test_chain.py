@@ -256,6 +256,12 @@ def test_a_chain_may_start_from_a_stage_of_another_of_its_kind(whole: Path, tmp_
     assert plan.weights is not None and plan.weights.path == find_checkpoints(whole / stage)[0]
 
 
+def test_the_last_stage_of_a_chain_trains_longer(whole: Path) -> None:
+  with pytest.raises(ConfigError, match=f"not for a chain: resume={whole / '2_far'} agent.num_timesteps=9000 trains"):
+    compose([f"resume={whole}", "agent.num_timesteps=9000"])
+  assert compose([f"resume={whole / '2_far'}", "agent.num_timesteps=9000"]).agent.num_timesteps == 9000
+
+
 def test_a_finished_chain_is_not_resumed(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
   before = (whole / "status.json").read_bytes()
   assert resume(whole) == 0

@@ -407,8 +407,27 @@ def test_a_run_that_another_process_finished_meanwhile_is_not_done_again(
 def test_a_finished_run_is_not_resumed(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
   before = (whole / "status.json").read_bytes()
   assert resume(whole) == 0
-  assert f"{whole} is finished: nothing to resume (init_from={whole}" in capsys.readouterr().out
+  assert f"{whole} is finished: nothing to resume (agent.num_timesteps=<more>" in capsys.readouterr().out
   assert (whole / "status.json").read_bytes() == before
+
+
+def test_a_run_that_trains_longer_ends_as_one_of_that_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  short, long = (tmp_path / name for name in ("short", "long"))
+  for run, steps, evals in ((short, 800, 2), (long, 1600, 3)):
+    budget = [f"agent.num_timesteps={steps}", f"agent.num_evals={evals}", "agent.num_resets_per_eval=0"]
+    assert train(compose([*TASK, *budget, f"run_dir={run}"])) == 0
+  with monkeypatch.context() as patch:
+    patch.setattr(train_module.Training, "compile", lambda *_: sys.exit(3))
+    with pytest.raises(SystemExit):
+      train(compose([f"resume={short}", "agent.num_timesteps=1600"]))
+  assert RunDirectory(short).status["status"] == "failed"
+  assert resume(short) == 0  # the budget is known by now
+  one, other = RunDirectory(short), RunDirectory(long)
+  assert one.config["agent"] == other.config["agent"]
+  assert {"agent.num_timesteps=1600", "agent.num_evals=3"} <= set(one.overrides)
+  assert one.summary["params_sha256"] == other.summary["params_sha256"]
+  steps = [pd.read_csv(run.metrics_csv)["step"].to_numpy()[-1] for run in (one, other)]
+  assert steps == [1600, 1600] and one.status["status"] == one.summary["status"] == "finished"
 
 
 def test_more_devices_than_there_are(tmp_path: Path, refused: Callable[..., str]) -> None:
