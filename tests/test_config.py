@@ -24,6 +24,7 @@ from playground.config.run_options import ProfileConfig, TrackingConfig, VideoCo
 from playground.errors import ConfigError, UnknownNameError
 from playground.hardware.options import DistributedConfig
 from playground.learning.hyperparameters import config_class
+from playground.mdp.options import is_model_field
 from playground.runs.run_dir import RunDirectory
 from playground.settings import plain
 from tests.sampling import some
@@ -687,6 +688,24 @@ def test_override_section():
   assert changed["commands"]["velocity"]["params"]["max"] == [1.0, 0.5, 0.5]
   assert list(changed["rewards"]) == [*env.rewards, "action_l2"], "in order"
   assert not math.isclose(env.rewards.joint_power_l1.weight, -1)
+
+
+def test_another_randomization_replaces_the_events_that_draw_the_model() -> None:
+  own = {"wind": {"mode": "startup", "func": "model_field", "params": {"field": "body_mass", "target": "trunk"}}}
+  env = compose(["env=Go1JoystickFlatTerrain"]).resolved["env"]
+  strong = compose(["env=Go1JoystickFlatTerrain", "randomization=go1_strong"]).resolved["env"]
+  env["events"]["push"]["enabled"] = True
+  changed = config.override_task({**env, "events": env["events"] | own}, ["randomization=go1_strong"])
+  assert changed["events"] == {**strong["events"], "push": env["events"]["push"]}
+  assert list(changed["events"]) == list(strong["events"]), "in order"
+  line = ["env.events.payload.params.range=[0,3]", "randomization=go1_strong"]
+  assert config.override_task(env, line)["events"]["payload"]["params"]["range"] == [0.0, 3.0]
+  nominal = config.override_task(env, ["randomization=none"])["events"]
+  assert nominal and not any(is_model_field(*event) for event in nominal.items())
+  with pytest.raises(UnknownNameError, match="'go1_strong'"):
+    config.override_task(env, ["randomization=go1_stron"])
+  with pytest.raises(ConfigError, match=r"robot=g1: .* and randomization=<name>"):
+    config.override_task(env, ["robot=g1"])
 
 
 def test_a_run_saved_by_an_earlier_version_gets_todays_keys_but_keeps_its_choices() -> None:

@@ -86,6 +86,9 @@ def play(
   model_seed = seed if randomize else None
   if agent is None:
     opened = open_policy(path, overrides, interval_events)
+    if drawn := [text for text in overrides if text.startswith("randomization=")]:
+      what = f"the model is the nominal one, so that only events of mode reset act; playground eval {path} {drawn[-1]}"
+      console.print(f"{drawn[-1]}: {what} measures all of them.", soft_wrap=True, markup=False, highlight=False)
   else:
     _set_up_cpu()
     section = configs.compose([f"env={path}", *overrides]).env

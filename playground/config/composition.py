@@ -67,6 +67,7 @@ from playground.config.sweep_options import SweepSettings
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.learning.hyperparameters import config_class
+from playground.mdp.options import is_model_field
 from playground.pretrained import locate
 from playground.settings import Plain, Section, build, defaults, select
 from playground.text import first_line, format_value, join, wrong_type
@@ -165,16 +166,24 @@ def override_section(section: str, default: Section | ConfigDict, overrides: Sec
 def override_task(env: Section | ConfigDict, overrides: Sequence[str]) -> dict[str, Plain]:
   """Returns a section env with values replaced by a command line (`env.action_scale=0.3`, `terrain=stairs`).
 
+  `randomization=<name>` replaces all events that draw fields of the model.
+
   Raises:
-    ConfigError: an invalid value, or an override of a group or another section.
+    ConfigError: an invalid value, or an override of another group or section.
   """
-  parsed = [parse(text, config_roots()) for text in overrides]
+  roots = config_roots()
+  parsed, values = [parse(text, roots) for text in overrides], _plain(env)
   for override in parsed:
-    if override.is_group or not override.key.startswith("env."):
+    if override.is_group and override.key == "randomization" and override.value is not None:
+      drawn = _plain(_hydra(group_overrides([override]), roots)[0])["env"]["events"]
+      own = {name: event for name, event in values.get("events", {}).items() if not is_model_field(name, event)}
+      values["events"] = drawn | own
+    elif override.is_group or not override.key.startswith("env."):
       raise ConfigError(
-        f"{override.text}: a trained policy takes other values of `env` only, such as env.episode_length=500."
+        f"{override.text}: a trained policy takes other values of `env` only, such as env.episode_length=500, and "
+        "randomization=<name>."
       )
-  return _replaced("env", env, parsed)
+  return _replaced("env", values, [override for override in parsed if not override.is_group])
 
 
 def _replaced(section: str, default: Section | ConfigDict, overrides: Sequence[Override]) -> dict[str, Plain]:

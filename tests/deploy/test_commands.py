@@ -56,6 +56,8 @@ def test_play_with_other_values_of_the_task(
     assert (report["overrides"], report["scores"]["episode_length"]) == (["env.episode_length=30"], 30)
     scores.append(report["scores"])
   assert scores[0] == scores[1]
+  assert command("play", str(run), "--episodes", "1", "randomization=none") == 0
+  assert "only events of mode reset act; playground eval" in capsys.readouterr().out
   for wrong in ("agent.num_envs=2", "env=CheetahRun", "env.episode_lenght=3", "env.episode_length=0"):
     assert command("play", str(run), wrong) == 2
     assert wrong.partition("=")[0] in capsys.readouterr().err
