@@ -4,9 +4,11 @@ import dataclasses
 import os
 import subprocess
 import sys
+import warnings
 from typing import Any
 from unittest.mock import Mock
 
+import jax
 import pytest
 import yaml
 
@@ -110,11 +112,14 @@ def test_platforms_that_jax_has_not_are_one_sentence(
 def test_flags_that_this_jax_has_no_more_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setenv("XLA_FLAGS", "--xla_exported=1")
   config = hardware(xla_flags="--xla_cpu_use_fusion_emitters=false --xla_given=2", devices=99)
+  jax.local_devices()
   for version, flags in (((0, 11, 2), []), ((0, 10, 2), ["--xla_cpu_use_fusion_emitters=false"])):
     monkeypatch.setattr("jax.__version_info__", version)
-    with pytest.raises(HardwareError):
+    with pytest.raises(HardwareError), pytest.warns(UserWarning, match="xla_flags=.* does not act: JAX has started"):
       setup(config)
     assert os.environ["XLA_FLAGS"].split() == ["--xla_exported=1", "--xla_given=2", *flags]
+  with pytest.raises(HardwareError), warnings.catch_warnings(action="error"):
+    setup(config)  # once said is enough
 
 
 @pytest.mark.parametrize("preset", [name for name in options("hardware") if "_x" in name])
