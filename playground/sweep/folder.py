@@ -65,7 +65,7 @@ class Job:
     varies = {key: _value(config, key) for key in varying}
     own = {text.partition("=")[0].lstrip("+~") for text in overrides}  # listed jobs may lack a key that others set
     named = {key: value for key, value in varies.items() if key in own}
-    short = lambda v: f"{v:.4g}" if isinstance(v, float) else str(v)
+    short = lambda v: f"{v:.4g}" if isinstance(v, float) else format_value(v)
     words = [short(v) if "." not in k and k != "seed" else f"{k.split('.')[-1]}={short(v)}" for k, v in named.items()]
     text = re.sub(r"[^A-Za-z0-9._=+-]+", "-", "_".join(words or [config.name]))[:80].strip("-.")
     if config.hardware.distributed.enable:

@@ -25,9 +25,9 @@ def test_jobs_are_named_after_what_they_differ_in(here: Path) -> None:
   sweep, settings = plan([*LINE, "sweep_dir=mine", "launcher.slots_per_gpu=2"])
   assert sweep.path == Path("mine")
   assert [job.name for job in sweep.jobs][::3] == [
-    "000_CartpoleBalance_seed=1_max_grad_norm=None",
+    "000_CartpoleBalance_seed=1_max_grad_norm=null",
     "003_CartpoleBalance_seed=2_max_grad_norm=1",
-    "006_PointMass_seed=2_max_grad_norm=None",
+    "006_PointMass_seed=2_max_grad_norm=null",
   ]
   assert sweep.jobs[3].varies == {"env": "CartpoleBalance", "seed": 2, "agent.max_grad_norm": 1.0}
   assert sweep.jobs[3].overrides == ["env=CartpoleBalance", "seed=2", "agent.max_grad_norm=1.0", "debug=fast"]
