@@ -24,6 +24,7 @@ from playground.text import quoted
 
 COMMAND = (*PYTHON, "-m", "playground.cli.run")
 POLL_S = 0.2
+_JAX_REMARK = "For simplicity, JAX has removed its internal frames"  # below a traceback and a line of dashes
 
 
 def job_command(trusted: Sequence[str] = (), lines: Sequence[str] = ()) -> tuple[str, ...]:
@@ -227,6 +228,8 @@ def _lines(log: Path) -> list[str]:
   except OSError:
     return []
   lines = [line.strip()[:300] for line in text.splitlines() if line.strip()]
+  if lines and lines[-1].startswith(_JAX_REMARK):
+    lines = lines[:-2]
   starts = [i for i, line in enumerate(lines) if line.startswith("--- start ")]
   return lines[starts[-1] + 1 :] if starts else lines
 

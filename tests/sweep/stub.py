@@ -46,6 +46,7 @@ with (run / "starts.jsonl").open("a") as file:  # whoever reads it may send a si
   file.write(json.dumps(facts | {"began": time.time(), "again": again}) + "\n")
 if seed == 10 or (seed == 14 and not again):
   print("Traceback …\nValueError: out of luck")
+  print("-" * 20 + "\nFor simplicity, JAX has removed its internal frames from the traceback of the following …")
   sys.exit(1)
 if seed == 11:
   time.sleep(60)
