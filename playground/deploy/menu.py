@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from playground.envs.options import MEANING
 from playground.errors import CheckpointError
 from playground.learning.checkpoints import BEST, find_checkpoints, find_stages
+from playground.pretrained import other_meaning
 from playground.runs.loaded_policy import LoadedPolicy
 
-# Keys of a run's config that define the meaning of an actor's inputs and outputs; its arrays define their sizes.
-_ENV = ("task", "robot", "vision", *MEANING)
-_MEANING = {"env": _ENV, "agent": ("name", "network", "normalize_observations")}
+# Keys of a run's config that, with `other_meaning`, define the meaning of an actor's inputs and outputs; its arrays
+# define their sizes.
+_MEANING = {"env": ("task", "robot", "vision"), "agent": ("name", "network", "normalize_observations")}
 
 
 class Menu:
@@ -67,4 +67,5 @@ class Menu:
     ours = self.trained.run_dir.config
     keys = [(section, key) for section, keys in _MEANING.items() for key in keys]
     other = [f"{section}.{key}" for section, key in keys if theirs[section].get(key) != ours[section].get(key)]
+    other += other_meaning(theirs["env"], ours["env"])
     return f"{other[0]} is not that of {self.trained.run_dir.path.name}." if other else ""

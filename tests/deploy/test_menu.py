@@ -70,3 +70,16 @@ def test_a_stage_alone(chain: Path, shown: list[Session], monkeypatch: pytest.Mo
   assert list(shown[0].choices()) == ["latest", "best (2,000)", "1,000", "2,000"]
   assert command("play", str(chain / "9_near/checkpoints/best"), "--web", "--port", "0") == 0
   assert (shown[1].following, shown[1].acting) == (None, "2,000")
+
+
+def test_stages_with_other_noise_stay(
+  tmp_path: Path, shown: list[Session], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  task, state = ("Go1JoystickFlatTerrain", "debug=fast"), "env.observations.state"
+  UntrainedRun(tmp_path / "1_scaled", *task, f"{state}.joint_vel.scale=2.0").save(1)
+  UntrainedRun(tmp_path / "2_noisy", *task, f"{state}.joint_vel.noise.uniform=3.0").save(2)
+  UntrainedRun(tmp_path / "3_quiet", *task).save(3)
+  (tmp_path / "config.yaml").touch()
+  assert caller(monkeypatch, "playground", main)("play", str(tmp_path), "--web", "--port", "0") == 0
+  assert list(shown[0].choices()) == ["latest", "noisy 2", "quiet 3"]
+  assert capsys.readouterr().out == "Stage 1_scaled is left out: env.observations is not that of 3_quiet.\n"
