@@ -151,8 +151,8 @@ class RestorePlan:
           f"{self.weights.path} was trained by {theirs.get('name')}: agent={name} cannot start from it."
         )
       there, here = networks_of(theirs), networks_of(dataclasses.asdict(trainer.config))
-      for key in there.keys() & here.keys():  # an earlier version had fewer keys
-        if there[key] != here[key]:
+      for key in there:
+        if there[key] != here.get(key, there[key]):  # an earlier version had fewer keys
           raise CheckpointError(
             f"{self.weights.path} was trained with {key}={there[key]}: "
             f"a run with {key}={here[key]} cannot start from it."
