@@ -20,7 +20,8 @@ def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: S
 
   Raises:
     ConfigError: there is only one run, the runs differ in program or task, so that returns are not comparable, they
-      keep fewer than `KEEP` checkpoints, or PPO adapts the learning rate that the population would set.
+      keep fewer than `KEEP` checkpoints, have too few evaluations for an exchange, or PPO adapts the learning rate that
+      the population would set.
     UnknownNameError: a key of `explore` is not one of the agent's numbers that are arguments of the program.
   """
   if not exploit_every:
@@ -40,6 +41,11 @@ def population_of(configs: "Sequence[RunConfig]", exploit_every: int, explore: S
     raise ConfigError(
       f"checkpoint.keep={keep} must be {KEEP} or more with launcher.exploit_every: after a kill the jobs go on from a "
       "step that all have, and their newest checkpoints may be two apart."
+    )
+  if (evals := min(config.agent.num_evals for config in configs)) < exploit_every + 2:
+    raise ConfigError(
+      f"agent.num_evals={evals} must be {exploit_every + 2} or more with launcher.exploit_every={exploit_every}: the "
+      "evaluations before and after training change nothing."
     )
   agent, known = configs[0].agent, [f"agent.{name}" for name in configs[0].agent.traced]
   for key in explore:

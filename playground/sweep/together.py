@@ -11,7 +11,7 @@ from playground.runs.programs import program_of
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import LocalLauncher, Slot
 from playground.sweep.worker import COMMAND
-from playground.text import quoted
+from playground.text import format_value, quoted
 
 
 class TogetherLauncher(LocalLauncher):
@@ -30,7 +30,11 @@ class TogetherLauncher(LocalLauncher):
   @staticmethod
   def check(config: LocalConfig, jobs: Sequence[Job]) -> None:
     LocalLauncher.check(config, jobs)
-    if isinstance(config, TogetherConfig) and config.exploit_every:
+    if not isinstance(config, TogetherConfig):
+      return
+    if not config.exploit_every and tuple(config.explore) != TogetherConfig.explore:
+      raise ConfigError(f"launcher.explore={format_value(config.explore)} needs launcher.exploit_every=1 or more.")
+    if config.exploit_every:
       population_of([compose(job.overrides) for job in jobs], config.exploit_every, config.explore)
       if len(jobs) > config.max_agents:
         raise ConfigError(f"launcher.max_agents={config.max_agents} is below the {len(jobs)} jobs of the population.")

@@ -92,6 +92,8 @@ def test_a_population_is_one_process(tmp_path: Path, started: list[list[str]]) -
     (["seed=1 agent.desired_kl=0.01", "seed=2 agent.desired_kl=0.01"], {}, "has no effect with agent.desired_kl"),
     (["seed=1", "seed=2 checkpoint.keep=2"], {}, "differ in more than seeds and numbers"),
     (["seed=1 checkpoint.keep=2", "seed=2 checkpoint.keep=2"], {}, "checkpoint.keep=2 must be 3 or more with launcher"),
+    (["seed=1 agent.num_evals=3", "seed=2 agent.num_evals=3"], {}, "agent.num_evals=3 must be 4 or more with launcher"),
+    (["seed=1"], {"exploit_every": 0, "explore": ["agent.tau"]}, "launcher.explore=[agent.tau] needs launcher."),
     (["seed=1", "seed=2", "seed=3"], {"max_agents": 2}, "launcher.max_agents=2 is below the 3 jobs"),
   ],
 )
@@ -100,7 +102,7 @@ def test_what_is_no_population(jobs: list[str], settings: dict[str, Any], messag
   params = "env.events.damping.params={field:dof_damping,target:all,operation:scale,range:[0.9,1.1]}"
   listed = [Job(text, ["tuned=null", damping, params, *text.split()], {}) for text in jobs]
   with pytest.raises(ConfigError, match=re.escape(message)):
-    TogetherLauncher.check(TogetherConfig(exploit_every=2, **settings), listed)
+    TogetherLauncher.check(TogetherConfig(**{"exploit_every": 2, **settings}), listed)
 
 
 GROUP = f"""
