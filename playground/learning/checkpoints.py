@@ -394,6 +394,9 @@ def find_checkpoints(path: str | Path) -> list[Path]:
     folders = [*path.glob("*/"), *path.glob("jobs/*/")]  # `path` may be that of a sweep
     if runs := sorted(run for run in folders if (run / "checkpoints").is_dir()):
       raise NoCheckpointError(f"{path} is a folder of runs: name one, such as the newest, {runs[-1]}.")
+    if path.suffix == ".onnx" or (path / "policy.onnx").is_file():
+      what = "holds no checkpoint, but an exported policy, which only `playground play` takes"
+      raise NoCheckpointError(f"{path} {what}: give the run that it came from.")
     raise NoCheckpointError(f"{path} holds no checkpoint: give a run directory, or a folder under its checkpoints/.")
   return [found[step] for step in sorted(found, reverse=True)]
 

@@ -528,3 +528,11 @@ def test_find_checkpoints_where_there_is_none(tmp_path: Path, content: str | Non
     with pytest.raises(CheckpointError) as error:
       find_checkpoints(tmp_path)
     one_sentence(error, "is a folder of runs: name one, such as the newest,", str(run))
+
+
+@pytest.mark.parametrize("given", ["", "policy.onnx"])
+def test_an_exported_policy_is_no_checkpoint(tmp_path: Path, given: str) -> None:
+  (tmp_path / "policy.onnx").touch()
+  with pytest.raises(CheckpointError) as error:
+    find_checkpoints(tmp_path / given)
+  one_sentence(error, str(tmp_path / given), "an exported policy, which only `playground play` takes")
