@@ -7,6 +7,7 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
+from playground.cli.header import of_events_that_are_off
 from playground.envs.locomotion.gait_metrics import with_gait_metrics
 from playground.files import unwritable, write_json
 from playground.learning.evaluation import make_evaluator
@@ -54,6 +55,8 @@ def evaluate_run(
   drawn = drawn_model(env, run.video.visuals)
   need_camera(drawn, camera, "--camera")
   _, model = model_sampler(env, run, 1, count)(run.seed)
+  for sentence in of_events_that_are_off(env.config, overrides):
+    console.print(sentence, soft_wrap=True, markup=False, highlight=False)
   deterministic = deterministic or run.agent.deterministic_eval
   act = lambda policy, obs, key: trained.trainer.act(policy, obs, key, deterministic)
   evaluate = make_evaluator(with_gait_metrics(env), act, count, hardware.mesh, 1 if film else 0)

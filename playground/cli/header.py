@@ -1,14 +1,14 @@
 """Formats the first lines of a run: task, algorithm, folder, and differences from the defaults."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-from playground.config import RunConfig, is_hydras
+from playground.config import RunConfig, TaskConfig, is_hydras
 
 _SHOWN = 6  # values of the command line; config.yaml has all
 
 
 def header(config: RunConfig) -> list[str]:
-  """Returns at most ten lines that describe a run, or a chain of runs."""
+  """Returns some ten lines that describe a run, or a chain of runs."""
   title, *rows = _rows(config)
   return [title[1], *(f"  {name:<10} {text}" for name, text in rows)]
 
@@ -32,12 +32,23 @@ def _rows(config: RunConfig) -> Iterator[tuple[str, str]]:
   if set_here := [text for text in given if "." in text.partition("=")[0]]:
     more = f" and {len(set_here) - _SHOWN} more" if len(set_here) > _SHOWN else ""
     yield "changed", " ".join(set_here[:_SHOWN]) + more
+  for text in of_events_that_are_off(env, given):
+    yield "no effect", text
   for key in ("resume", "init_from"):
     if getattr(config, key):
       yield key, str(getattr(config, key))
   if not config.resume:
     yield "folder", str(config.run_dir)
   yield "config", "config.yaml in this folder; --verbose prints it"
+
+
+def of_events_that_are_off(env: TaskConfig, overrides: Sequence[str]) -> list[str]:
+  """Returns a sentence for each event that overrides change, but that is off."""
+  keys = [text.lstrip("+").partition("=")[0].split(".") for text in overrides]
+  changed = {key[2]: None for key in keys if key[:2] == ["env", "events"] and len(key) > 3 and key[3] != "enabled"}
+  events = {name: env.get("events", {}).get(name) for name in changed}
+  off = [name for name, event in events.items() if event and not event.get("enabled", True)]
+  return [f"The event {name} is off: env.events.{name}.enabled=true turns it on." for name in off]
 
 
 def _steps(config: RunConfig) -> str:

@@ -11,6 +11,7 @@ from rich.table import Table
 from playground import config as configs
 from playground import registry
 from playground.cli.eval import described, save
+from playground.cli.header import of_events_that_are_off
 from playground.deploy.contract import Contract
 from playground.deploy.menu import Menu
 from playground.deploy.policy import ActingPolicy, ExportedPolicy
@@ -95,6 +96,8 @@ def play(
     env = load_on_c_physics(path, section, interval_events=interval_events, model_seed=model_seed)
     opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
   exported, env = opened.exported, opened.env
+  for sentence in of_events_that_are_off(env.config, overrides):
+    console.print(sentence, soft_wrap=True, markup=False, highlight=False)
   need_camera(env.mj_model, camera, "--camera")
   if viewer:
     from playground.deploy.viewer import view

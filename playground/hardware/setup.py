@@ -7,7 +7,6 @@ import warnings
 from pathlib import Path
 
 import jax
-from jax._src.xla_bridge import backends_are_initialized  # JAX has no public name for it
 from jax.sharding import Mesh
 
 from playground.errors import HardwareError
@@ -98,6 +97,8 @@ def _environment(config: HardwareConfig) -> None:
   added = [flag for flag in config.xla_flags.split() if known(flag) and flag not in exported]
   if added:  # a chain calls this often
     os.environ["XLA_FLAGS"] = " ".join([*exported, *added])
+    from jax._src.xla_bridge import backends_are_initialized  # JAX has no public name for it
+
     if backends_are_initialized():
       what = "does not act: JAX has started in this process already. Train in a new process, or export XLA_FLAGS first."
       warnings.warn(f"hardware.xla_flags={' '.join(added)} {what}", stacklevel=3)

@@ -56,6 +56,11 @@ def test_trains_the_default_run_and_describes_it_in_ten_lines(
   assert "num_timesteps: 6000000" in out and "changed    agent.num_envs=128" in out
   assert command("env=Go1JoystickFlatTerrain", "env.rewards.joint_power_l1.weight=-1") == 0
   assert "changed    env.rewards.joint_power_l1.weight=-1" in capsys.readouterr().out
+  speed = "env.events.push.params.velocity=[0,1]"
+  assert command("env=Go1JoystickFlatTerrain", speed) == 0
+  assert "no effect  The event push is off: env.events.push.enabled=true turns it on." in capsys.readouterr().out
+  assert command("env=Go1JoystickFlatTerrain", speed, "env.events.push.enabled=true") == 0
+  assert "no effect" not in capsys.readouterr().out
   assert command("experiment=go1_joystick_chain") == 0
   assert "slow_turns (100,000,000 steps), fast_turns" in capsys.readouterr().out
 
