@@ -16,7 +16,6 @@ import sys
 import tarfile
 from pathlib import Path
 
-ENDED = ("finished", "failed", "preempted", "timeout", "killed")
 FILES = ("config.yaml", "overrides.yaml", "manifest.json", "metrics.csv", "status.json", "summary.json", "job.log")
 
 
@@ -48,8 +47,8 @@ def pack(folder: Path, out: Path, part: int, parts: int) -> list[str]:
   with tarfile.open(fileobj=archive, mode="w") as tar:
     for job in sorted((folder / "jobs").iterdir()):
       path = job / "status.json"
-      status = json.loads(path.read_text()) if path.is_file() else {"status": "queued"}
-      if status["status"] not in ENDED or packed.get(job.name) == status["updated"]:
+      status = json.loads(path.read_text()) if path.is_file() else {"status": "running"}
+      if status["status"] == "running" or packed.get(job.name) == status["updated"]:
         continue
       members = _members(job)
       needed = sum(path.lstat().st_size + 1024 for path in members)  # 1024: header and padding
