@@ -23,7 +23,7 @@ from playground.settings import select
 
 Row = dict[str, object]
 _EPISODES = 20  # in C MuJoCo, of a row that does not say otherwise
-_MEASURED = {  # column -> its column of metrics.csv, and decimals
+_MEASURED = {  # column -> its column of metrics.csv, and decimals; the mode's where that was evaluated, as play shows it
   "tracking_error_lin_m_s": ("eval/episode_tracking_error/lin_vel", 3),
   "tracking_error_ang_rad_s": ("eval/episode_tracking_error/ang_vel", 3),
   "falls_per_episode": ("eval/episode_fall", 3),
@@ -174,7 +174,7 @@ def _entry(run: RunDirectory, folder: Path, options: Options) -> Entry:
     "devices": manifest["num_devices"],
     "device": "CPU" if manifest["platform"] == "cpu" else manifest["device"],
     "conditions": conditions_of(config, manifest, options.machine, commit),
-    **{column: fixed(last.get(metric), digits) for column, (metric, digits) in _MEASURED.items()},
+    **{column: fixed(_of_mode(last, metric), digits) for column, (metric, digits) in _MEASURED.items()},
     **(times_of(run, manifest) if options.alone else {}),
   }
   name = "_".join(filter(None, (task, agent, f"s{config['seed']}", stage, commit.rstrip("+"))))
@@ -185,6 +185,11 @@ def _entry(run: RunDirectory, folder: Path, options: Options) -> Entry:
     numbers = {column: fixed(values.get(column), 3) for column in _header(curves) if "/" in column}
     points.append({"stage": stage, "step": each["step"], **numbers})
   return Entry(run, table, row, curves, points, name, policy)
+
+
+def _of_mode(evaluation: Mapping[str, str], metric: str) -> str | None:
+  """Returns a metric of the mode's episodes, where an evaluation has both kinds, else of those it has."""
+  return evaluation.get(metric.replace("eval/", "eval/mode/")) or evaluation.get(metric)
 
 
 def _played(entry: Entry, episodes: int) -> Row:

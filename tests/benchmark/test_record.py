@@ -113,6 +113,14 @@ def test_a_stopped_run_that_evaluates_the_mode(reference: Path, make: Make) -> N
   assert point["eval/mode/episode_reward"] == point["eval/episode_reward"] == "27.125"
 
 
+def test_falls_are_the_modes_where_a_run_that_samples_evaluates_it_too(reference: Path, make: Make) -> None:
+  metrics = "step,eval/episode_reward,eval/episode_fall,eval/mode/episode_reward,eval/mode/episode_fall\n9,3,0.5,4,0.1\n"
+  run = make("env=Go1JoystickFlatTerrain", metrics=metrics)
+  assert record.run(Options(runs=(str(run),), reference=str(reference))) == 0
+  row = last_row(reference / "locomotion.csv")
+  assert (row["final_return"], row["final_mode_return"], row["falls_per_episode"]) == ("3.00", "4.00", "0.100")
+
+
 def test_two_runs_have_two_curves_and_two_rows(reference: Path, make: Make) -> None:
   first = make("env=Go1JoystickFlatTerrain", metrics=METRICS)
   other = make("env=Go1JoystickFlatTerrain", "agent.discounting=0.9", metrics=METRICS.replace("27.125", "26"), name="b")
