@@ -23,7 +23,7 @@ from playground.settings import select
 
 Row = dict[str, object]
 _EPISODES = 20  # in C MuJoCo, of a row that does not say otherwise
-_MEASURED = {  # column -> its column of metrics.csv, and decimals; the mode's where that was evaluated, as play shows it
+_MEASURED = {  # column -> its column of metrics.csv, the mode's where it was evaluated, too, and decimals
   "tracking_error_lin_m_s": ("eval/episode_tracking_error/lin_vel", 3),
   "tracking_error_ang_rad_s": ("eval/episode_tracking_error/ang_vel", 3),
   "falls_per_episode": ("eval/episode_fall", 3),
