@@ -114,7 +114,9 @@ def test_a_stopped_run_that_evaluates_the_mode(reference: Path, make: Make) -> N
 
 
 def test_falls_are_the_modes_where_a_run_that_samples_evaluates_it_too(reference: Path, make: Make) -> None:
-  metrics = "step,eval/episode_reward,eval/episode_fall,eval/mode/episode_reward,eval/mode/episode_fall\n9,3,0.5,4,0.1\n"
+  metrics = (
+    "step,eval/episode_reward,eval/episode_fall,eval/mode/episode_reward,eval/mode/episode_fall\n9,3,0.5,4,0.1\n"
+  )
   run = make("env=Go1JoystickFlatTerrain", metrics=metrics)
   assert record.run(Options(runs=(str(run),), reference=str(reference))) == 0
   row = last_row(reference / "locomotion.csv")
