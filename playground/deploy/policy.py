@@ -11,7 +11,7 @@ import numpy as np
 
 from playground.deploy.contract import FORMAT, Contract, check_contract, read_contract
 from playground.envs.base import Observation
-from playground.errors import CheckpointError
+from playground.errors import CheckpointError, ConfigError
 from playground.extras import need
 
 Seen = Observation | np.ndarray | Mapping[str, np.ndarray]  # inputs of a policy, with any leading axes
@@ -86,7 +86,11 @@ class ExportedPolicy:
       raise CheckpointError(f"{path}: {error}") from None
 
   def actions(self, obs: Seen) -> np.ndarray:
-    """Returns actions in [-1, 1], [..., action_size], for observations with any leading axes: one inference each."""
+    """Returns actions in [-1, 1], [..., action_size], for observations with any leading axes: one inference each.
+
+    Raises:
+      ConfigError: a group is missing, or has another shape than the contract says.
+    """
     feeds, entries = {}, self._read(obs)
     for row in self.contract["policy"]["inputs"]:
       feeds[row["name"]] = np.asarray(entries[row["entry"]], row["type"]).reshape(-1, *row["shape"])
@@ -115,6 +119,14 @@ class ExportedPolicy:
   def _read(self, obs: Seen) -> dict[str, np.ndarray | jax.Array]:
     """Returns the groups that the actor reads; a flat observation counts as `state`."""
     entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    for row in self.contract["policy"]["inputs"]:
+      name, shape = row["entry"], tuple(row["shape"][1:])
+      if name not in entries:
+        raise ConfigError(f"The observation lacks {name}, which the policy reads: it has {', '.join(entries)}.")
+      found = np.shape(entries[name])
+      if found[len(found) - len(shape) :] != shape:
+        sizes = ", ".join(map(str, shape))
+        raise ConfigError(f"The policy reads {name} of the shape [..., {sizes}], not {list(found)}.")
     return {row["entry"]: entries[row["entry"]] for row in self.contract["policy"]["inputs"]}
 
   def _batch(self, entries: Mapping[str, np.ndarray | jax.Array]) -> tuple[int, ...]:

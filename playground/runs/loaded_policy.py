@@ -11,11 +11,13 @@ from playground import config as configs
 from playground import registry
 from playground.config import RunConfig
 from playground.envs.base import Env, Observation
+from playground.errors import CheckpointError
 from playground.hardware.options import Platform
 from playground.hardware.setup import Hardware, setup, this_machine
 from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import Checkpoint
 from playground.learning.trainer import Trainer
+from playground.pretrained import other_meaning
 from playground.runs.restore_plan import weights_of
 from playground.runs.run_dir import RunDirectory
 
@@ -90,5 +92,13 @@ def load_policy(
   hardware = setup(this_machine(config.hardware, platform))
   env = (load_task or registry.load)(config.choices["env"], config.env)
   trainer = Trainer(env, config.agent, hardware.mesh, precision or hardware.network_precision)
-  policy = trainer.place_policy(checkpoint.restore("policy", trainer.policy_shape()))
+  try:
+    policy = trainer.place_policy(checkpoint.restore("policy", trainer.policy_shape()))
+  except CheckpointError:
+    changed = other_meaning(run_dir.config["env"], config.resolved["env"]) if overrides else []
+    if not changed:
+      raise
+    raise CheckpointError(
+      f"{' '.join(overrides)} does not fit the policy, which was trained with other {changed[0]}: leave it as it was."
+    ) from None
   return LoadedPolicy(run_dir, config, checkpoint, env, hardware, trainer, policy)

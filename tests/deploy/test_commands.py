@@ -17,7 +17,7 @@ from playground.cli.main import main
 from playground.deploy import export
 from playground.deploy.policy import ExportedPolicy
 from playground.deploy.web.server import Watch
-from playground.errors import CheckpointError
+from playground.errors import CheckpointError, ConfigError
 from tests.command import Command, caller
 from tests.deploy.untrained import UntrainedRun, free_port
 
@@ -329,3 +329,20 @@ def test_one_sentence_each(
     assert command(*args) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ") and said in line
+
+
+def test_observations_that_do_not_fit_a_policy(
+  command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  assert command("export", str(run), "--out", str(tmp_path)) == 0
+  policy = ExportedPolicy.load(tmp_path / "policy.onnx")
+  with pytest.raises(ConfigError, match=re.escape("The policy reads state of the shape [..., 5], not [2, 4].")):
+    policy.actions(np.zeros((2, 4)))
+  with pytest.raises(ConfigError, match=r"The observation lacks state, which the policy reads: it has other\."):
+    policy.actions({"other": np.zeros(5)})
+  capsys.readouterr()
+  monkeypatch.chdir(tmp_path)
+  term = "env.observations.state.gravity=null"
+  assert command("eval", "pretrained:Go1JoystickFlatTerrain", term) == 2
+  sentence = f"{term} does not fit the policy, which was trained with other env.observations: leave it as it was."
+  assert capsys.readouterr().err == f"error: {sentence}\n"
