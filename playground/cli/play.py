@@ -27,6 +27,7 @@ from playground.hardware.setup import setup, this_machine
 from playground.learning.evaluation import make_evaluator
 from playground.rendering.video import need_camera, need_place, render_video
 from playground.runs.callbacks import episodes_of
+from playground.runs.csv_tracker import OTHER_RETURNS
 from playground.runs.loaded_policy import LoadedPolicy
 from playground.text import first_line
 
@@ -210,17 +211,22 @@ def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
 
 
 def _table(contract: Contract, episodes: int, scores: Mapping[str, float], overrides: Sequence[str]) -> Table:
-  """Builds a table of scores, beside those of the last evaluation in training."""
+  """Builds a table of scores, beside those of the last evaluation in training, the mode's first."""
   origin = contract["origin"]
   trained = origin["evaluation"]
   title = f"{contract['task']}, {origin['steps']:,} steps trained{described(overrides)}"
   table = Table("per episode", title=title)
-  table.add_column(f"C MuJoCo, mean of {episodes}", justify="right")
+  table.add_column("C MuJoCo", justify="right")
+  table.caption = f"C MuJoCo: mean of {episodes} episode{'s' * (episodes != 1)}, nominal model, mode of the policy."
+  kinds = {}  # of actions in training: what their scores' names begin with
   if trained:
+    other = {name.partition("/")[0] for name in trained} & {*OTHER_RETURNS}
+    kinds = {kind: f"{kind}/" if kind in other else "" for kind in OTHER_RETURNS} if other else {"": ""}
+    for kind in kinds:
+      table.add_column("training" + f", {kind}" * bool(kind), justify="right")
     backend = _BACKENDS.get(origin.get("impl"), "")
-    table.add_column(f"{backend}in training, at {trained['steps']:,} steps", justify="right")
-    table.caption = "C MuJoCo: nominal model, mode of the policy. In training: as configured."
+    table.caption += f"\nTraining: {backend}at {trained['steps']:,} steps, as configured."
   for name, value in scores.items():
-    beside = [f"{trained[name]:.4g}" if name in trained else ""] if trained else []
+    beside = [f"{trained[begin + name]:.4g}" if begin + name in trained else "" for begin in kinds.values()]
     table.add_row(name.removeprefix("episode_"), f"{value:.4g}", *beside)
   return table

@@ -21,7 +21,7 @@ from playground.envs.options import uses_vision
 from playground.envs.wrappers import wrap_for_training
 from playground.extras import need
 from playground.randomization import Randomizer
-from playground.runs.csv_tracker import newest_evaluation
+from playground.runs.csv_tracker import OTHER_RETURNS, newest_evaluation
 from playground.runs.loaded_policy import LoadedPolicy, load_policy
 from playground.settings import Section
 
@@ -95,11 +95,15 @@ def export_policy(trained: LoadedPolicy, state: State | None = None) -> Exported
 
 
 def _newest_evaluation(trained: LoadedPolicy) -> dict[str, float]:
-  """Returns `steps` and the finite scores of the last evaluation in training, {} without one."""
+  """Returns `steps` and the finite scores of the last evaluation in training, {} without one.
+
+  Where it has both kinds of actions, the names of the other kind's scores begin with its name, `mode/` or `sampled/`.
+  """
   last = newest_evaluation(trained.run_dir.metrics_csv, trained.checkpoint.step)
   if last is None:
     return {}
-  scores = {name.removeprefix("eval/"): float(last[name]) for name in last if name.startswith("eval/episode_")}
+  kinds = tuple(f"eval/{kind}episode_" for kind in ("", *(f"{name}/" for name in OTHER_RETURNS)))
+  scores = {name.removeprefix("eval/"): float(last[name]) for name in last if name.startswith(kinds)}
   return {"steps": int(last["step"])} | {name: score for name, score in scores.items() if math.isfinite(score)}
 
 

@@ -31,7 +31,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
   run = UntrainedRun(path, "CartpoleBalance", "debug=fast", "env.episode_length=40")
   run.directory.update_manifest(git={"commit": "abc", "dirty": False}, impl="warp")
   run.directory.metrics_csv.write_text(
-    "step,eval/episode_reward,eval/episode_length\n0,1.0,40\n2000,12.5,40\n2500,,\n4000,30.0,40\n"
+    "step,eval/episode_reward,eval/episode_length,eval/mode/episode_reward\n"
+    "0,1.0,40,1.5\n2000,12.5,40,13.5\n2500,,,\n4000,30.0,40,31\n"
   )
   run.save(STEPS)
   return path
@@ -72,7 +73,8 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
   contract = yaml.safe_load((run / "export" / "policy.yaml").read_text())
   origin = {"run": "run", "agent": "ppo", "steps": STEPS, "commit": "abc", "dirty": False, "impl": "warp"}
   assert origin.items() <= contract["origin"].items()
-  assert contract["origin"]["evaluation"] == {"steps": 2000, "episode_reward": 12.5, "episode_length": 40}
+  evaluation = {"steps": 2000, "episode_reward": 12.5, "episode_length": 40, "mode/episode_reward": 13.5}
+  assert contract["origin"]["evaluation"] == evaluation
 
   scores = []
   for policy in (run, run / "export" / "policy.onnx", run / "export"):
@@ -81,8 +83,9 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
     report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_episodes_3.json").read_text())
     assert (report["simulator"], report["episodes"]) == ("C MuJoCo", 3)
     scores.append(report["scores"])
-    assert "MJX-Warp in training" in shown
-    assert re.search(rf"reward\W+{scores[-1]['episode_reward']:.4g}\W+12.5\b", shown)
+    assert re.search(r"C MuJoCo\W+training, mode\W+training, sampled", shown)
+    assert "Training: MJX-Warp at 2,000 steps" in shown
+    assert re.search(rf"reward\W+{scores[-1]['episode_reward']:.4g}\W+13.5\W+12.5\b", shown)
   assert scores[0] == scores[1] == scores[2]
   assert command("play", str(run), "--episodes", "3", "--seed", "4", "--no-events") == 0
   report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_episodes_3_no_events.json").read_text())
