@@ -73,9 +73,9 @@ def _read(setting: Setting, text: str) -> object:
   if setting.text_depth == 1:
     return tuple(dict.fromkeys(parts))  # none is measured twice
   if setting.limit is None:
-    if text not in ("true", "false"):
+    if text.lower() not in ("true", "false"):  # as Hydra reads them
       raise ConfigError(f"{setting.name}={text} must be true or false.")
-    return text == "true"
+    return text.lower() == "true"
   numbers = [_number(part, setting.limit) for part in parts]
   listed = setting.limit.form == "list"
   if None in numbers or not (listed or len(numbers) == 1):

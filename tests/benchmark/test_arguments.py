@@ -35,7 +35,7 @@ def test_types_and_lists():
   assert parse("some", Some, given) == Some(
     ("A", "B"), (4, 1000), 2.0, rerun=True, overrides=("agent.num_envs=64", "++hardware=cpu")
   )
-  assert parse("some", Some, ["out=null"]).out is None
+  assert parse("some", Some, ["out=null"]).out is None and parse("some", Some, ["rerun=True"]).rerun
   assert parse("some", Some, ["tasks=A,B,A", "sizes=2,2.0"]) == Some(("A", "B"), (2,)), "each once"
   assert parse("some", Some, []) == Some()
 
