@@ -119,7 +119,7 @@ def _from_bits(row: np.ndarray, example: PyTree) -> PyTree:
 class Stacked(struct.PyTreeNode):
   """A tree with its vectors and numbers in one array for each shape and dtype.
 
-  A loop on a GPU copies every array that it carries or stores, in each step: half of a small task's kernels.
+  A loop on a GPU copies every array that it carries or stores, in each step: two in five of a small task's launches.
 
   Attributes:
     arrays: stacks along axis 0, and the other leaves.

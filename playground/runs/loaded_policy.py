@@ -95,7 +95,8 @@ def load_policy(
   try:
     policy = trainer.place_policy(checkpoint.restore("policy", trainer.policy_shape()))
   except CheckpointError:
-    changed = other_meaning(run_dir.config["env"], config.resolved["env"]) if overrides else []
+    meaning = other_meaning(run_dir.config["env"], config.resolved["env"]) if overrides else []
+    changed = [key for key in meaning if key.startswith("env.observation")]
     if not changed:
       raise
     raise CheckpointError(
