@@ -78,7 +78,7 @@ def test_env_and_agent_alone_pick_the_tuned_set():
   ("chosen", "tuned"),
   [
     ("env=HumanoidWalk", None),
-    ("experiment=humanoid_run", None),
+    ("experiment=humanoid_run", "reppo/HumanoidRun"),
     ("experiment=g1_joystick", "fast_sac/G1JoystickFlatTerrain"),
     ("env=T1JoystickRoughTerrain", "fast_sac/T1JoystickFlatTerrain"),
   ],
