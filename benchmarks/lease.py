@@ -4,8 +4,9 @@
   python benchmarks/lease.py train FOLDER SECONDS [overrides]   after SECONDS the runs save and end; call again to go on
   python benchmarks/lease.py pack FOLDER OUT [MIB PARTS]        OUT/pack.000 ...: at most PARTS files of MIB MiB (15, 4)
 
-A pack has metrics, configuration and policy of each job that has ended since the last pack, without the training state,
-which only a resume needs. At home: `cat pack.* | tar x`, or a pack after the other, each its own archive.
+A pack has metrics, configuration, policy and first non-finite state of each job that has ended since the last pack. It
+lacks the training state, which only a resume needs. At home: `cat pack.* | tar x`, or a pack after the other, each its
+own archive.
 """
 
 import io
@@ -72,10 +73,11 @@ def pack(folder: Path, out: Path, part: int, parts: int) -> list[str]:
 
 
 def _members(job: Path) -> list[Path]:
-  """Returns a job's small files, and its newest and its best checkpoint without the training state."""
+  """Returns a job's small files, its newest and best checkpoint without the training state, and its first dump."""
   checkpoints, best = job / "checkpoints", job / "checkpoints" / "best"
   steps = sorted(path.name for path in checkpoints.glob("*") if path.name.isdecimal())
   found = [job / name for name in FILES if (job / name).is_file()] + [best] * best.is_symlink()
+  found += sorted((job / "nan_dump").glob("*.npz"))[:1]
   for step in {*steps[-1:], *[step for step in steps if best.exists() and step == best.resolve().name]}:
     parts = [path for path in (checkpoints / step).iterdir() if path.name != "state"]
     found += [path for part in parts for path in (part, *part.rglob("*")) if path.is_file()]

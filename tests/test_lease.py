@@ -23,6 +23,9 @@ def make_job(sweep: Path, name: str, status: str = "finished", size: int = 1000)
       path.parent.mkdir(parents=True)
       path.write_bytes(b"x" * size)
   (job / "checkpoints" / "best").symlink_to("100")
+  (job / "nan_dump").mkdir()
+  for step in (150, 120):
+    (job / "nan_dump" / f"step_{step:012d}.npz").write_bytes(b"x")
   (job / "metrics.csv").write_text("step")
   (job / "status.json").write_text(json.dumps({"status": status, "updated": "8:00"}))
 
@@ -39,7 +42,7 @@ def test_a_pack_has_the_policies_of_jobs_that_ended_once(tmp_path: Path) -> None
   for name, status in (("0_a", "finished"), ("1_b", "running"), ("2_c", "preempted")):
     make_job(tmp_path, name, status)
   assert lease.main(["pack", str(tmp_path), str(tmp_path / "out")]) == 0
-  inside = {"metrics.csv", "status.json", "checkpoints/best"}
+  inside = {"metrics.csv", "status.json", "checkpoints/best", "nan_dump/step_000000000120.npz"}
   inside |= {f"checkpoints/{step}/{part}" for step in ("100", "200") for part in ("policy/d/x", "meta/m")}
   assert packed(tmp_path / "out", tmp_path) == {f"{job}/{name}" for job in ("0_a", "2_c") for name in inside}
   (tmp_path / "jobs" / "1_b" / "status.json").write_text('{"status": "finished", "updated": "9:00"}')

@@ -32,6 +32,7 @@ from typing import TypeVar
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+import tensorstore as ts
 
 from playground.errors import CheckpointError
 from playground.files import numbered
@@ -55,6 +56,7 @@ _TRANSIENT = ("RESOURCE_EXHAUSTED", "UNAVAILABLE", "PERMISSION_DENIED", "DEADLIN
 _RETRY_AFTER_S = (0.1, 0.5, 2.0)
 _PLAIN_PATH = re.compile(r"[\w/.,+=@ -]*")
 _NO_BEST = (-math.inf, -1)  # return and step
+_BY_BYTE = {"id": "blosc", "cname": "zstd", "clevel": 9, "shuffle": 1}  # a compressor of Zarr
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)  # errors of file systems without links
 logging.getLogger("absl").setLevel(logging.CRITICAL)  # Orbax warns about its own defaults, and raises its errors
 Arrays = list[np.ndarray]
@@ -443,7 +445,7 @@ def _return_of(folder: Path) -> float | None:
 def round_policy(folder: str | Path, bits: int, chosen: Callable[[str], bool]) -> None:
   """Rounds arrays of a checkpoint's item 'policy' to fewer significant bits, and removes the path of its run.
 
-  The dtype stays. The files are compressed: those of arrays of 4 bits take about a quarter of the space.
+  The dtype stays. The files are compressed: those of arrays of 4 bits take about a fifth of the space.
 
   Args:
     folder: the checkpoint.
@@ -461,10 +463,35 @@ def round_policy(folder: str | Path, bits: int, chosen: Callable[[str], bool]) -
       arrays[i] = np.ldexp(np.round(mantissa * 2**bits) / 2**bits, exponent).astype(dtype)
   with _quiet_threads(), ocp.StandardCheckpointer() as checkpointer:
     checkpointer.save(checkpoint.path / "policy", _numbered(arrays), force=True)
+  compress(checkpoint.path / "policy")
   meta["sha256"]["policy"] = checksum(arrays)
   meta["config"]["run_dir"] = None
   meta["meta_sha256"] = _meta_checksum(meta)
   (checkpoint.path / "meta" / "metadata").write_text(json.dumps(meta))
+
+
+def compress(item: Path) -> None:
+  """Compresses the arrays of a checkpoint's item by their first bytes, their second bytes and so on.
+
+  That takes a quarter less space where the last bits are zero. Orbax does not write such files, but reads them.
+  """
+  context = ts.Context()  # one for all arrays, which come to one file then
+  with tempfile.TemporaryDirectory(dir=item.parent) as folder:
+    old, new = ({"driver": "ocdbt", "base": f"file://{path}/"} for path in (item, folder))
+    with ts.Transaction() as transaction:
+      for key in ts.KvStore.open(old).result().list().result():
+        if key.endswith(b".zarray"):
+          name = key.decode().removesuffix(".zarray")
+          array = ts.open({"driver": "zarr", "kvstore": old, "path": name}).result()
+          metadata = array.spec().to_json()["metadata"] | {"compressor": _BY_BYTE}
+          spec = {"driver": "zarr", "kvstore": new, "path": name, "metadata": metadata}
+          copy = ts.open(spec, create=True, transaction=transaction, context=context).result()
+          copy.write(array.read().result()).result()
+    (item / "manifest.ocdbt").unlink()
+    for data in ("d", "ocdbt.process_0"):
+      shutil.rmtree(item / data, ignore_errors=True)
+    for part in Path(folder).iterdir():
+      part.rename(item / part.name)
 
 
 def describe(tree: PyTree) -> list[Leaf]:

@@ -99,6 +99,22 @@ def test_what_is_stored_comes_back_bit_for_bit(tmp_path: Path) -> None:
       assert got.tobytes() == np.asarray(leaf).tobytes(), name
 
 
+def test_rounded_arrays_take_less_space_and_come_back_bit_for_bit(tmp_path: Path) -> None:
+  (path,) = save(tmp_path, 10)
+  size = lambda: sum(file.stat().st_size for file in (path / "policy").rglob("*") if file.is_file())
+  checkpoints.round_policy(path, 4, lambda name: "w" in name)
+  count, rounded = Checkpoint(path).arrays("policy")
+  np.testing.assert_allclose(rounded, POLICY["w"], rtol=2**-4)
+  assert count == 7 and len(np.unique(rounded)) < 0.05 * rounded.size
+  compressed = size()
+  with ocp.StandardCheckpointer() as orbax:
+    orbax.save(path / "policy", {"00000": count, "00001": rounded}, force=True)
+  assert compressed < 0.8 * size()
+  checkpoints.compress(path / "policy")
+  assert size() < 1.02 * compressed
+  np.testing.assert_array_equal(Checkpoint(path).arrays("policy")[1], rounded)
+
+
 def test_the_newest_are_kept(tmp_path: Path) -> None:
   assert [p.name for p in save(tmp_path, 10, 20, 30, 40, keep=2)] == ["000000000040", "000000000030"]
   # A run that goes on counts those that are there.
