@@ -10,6 +10,7 @@ from rich.table import Table
 from playground.cli.header import of_events_that_are_off
 from playground.envs.locomotion.gait_metrics import with_gait_metrics
 from playground.files import unwritable, write_json
+from playground.learning.checkpoints import of_a_better_one
 from playground.learning.evaluation import make_evaluator
 from playground.paper import paper_table
 from playground.rendering.video import need_camera, need_place, render_video
@@ -55,7 +56,7 @@ def evaluate_run(
   drawn = drawn_model(env, run.video.visuals)
   need_camera(drawn, camera, "--camera")
   _, model = model_sampler(env, run, 1, count)(run.seed)
-  for sentence in of_events_that_are_off(env.config, overrides):
+  for sentence in (*of_a_better_one(path, checkpoint), *of_events_that_are_off(env.config, overrides)):
     console.print(sentence, soft_wrap=True, markup=False, highlight=False)
   deterministic = deterministic or run.agent.deterministic_eval
   act = lambda policy, obs, key: trained.trainer.act(policy, obs, key, deterministic)

@@ -24,6 +24,7 @@ from playground.errors import CheckpointError, PlaygroundError
 from playground.extras import need
 from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
+from playground.learning.checkpoints import of_a_better_one
 from playground.learning.evaluation import make_evaluator
 from playground.rendering.video import need_camera, need_place, render_video
 from playground.runs.callbacks import episodes_of
@@ -97,7 +98,8 @@ def play(
     env = load_on_c_physics(path, section, interval_events=interval_events, model_seed=model_seed)
     opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
   exported, env = opened.exported, opened.env
-  for sentence in of_events_that_are_off(env.config, overrides):
+  better = of_a_better_one(path, opened.trained.checkpoint) if opened.trained else ()
+  for sentence in (*better, *of_events_that_are_off(env.config, overrides)):
     console.print(sentence, soft_wrap=True, markup=False, highlight=False)
   need_camera(env.mj_model, camera, "--camera")
   if viewer:

@@ -14,6 +14,7 @@ from playground.deploy.trained import export_policy, load_exact, record
 from playground.errors import ConfigError, PlaygroundError
 from playground.extras import need
 from playground.files import need_folder, replacing, write_text
+from playground.learning.checkpoints import of_a_better_one
 
 TOLERANCE = 1e-5  # largest difference between an exported and a trained policy's actions
 _ENVS, _DECISIONS = 8, 125  # 1000 observations
@@ -59,6 +60,8 @@ def export_run(path: str, *, out: str | None = None) -> int:
   with replacing(folder / "policy.onnx") as temporary:
     temporary.write_bytes(exported.model)
   console = Console()
+  for sentence in of_a_better_one(path, trained.checkpoint):
+    console.print(sentence, soft_wrap=True, markup=False, highlight=False)
   console.print(
     _summary(exported.contract, len(actions), error, 1e6 * exported.latency(obs)), soft_wrap=True, markup=False
   )

@@ -442,6 +442,25 @@ def _return_of(folder: Path) -> float | None:
     return None
 
 
+def of_a_better_one(named: str | Path, newest: Checkpoint) -> list[str]:
+  """Returns a sentence if a run was named whose best checkpoint returned a tenth more than its newest, else nothing.
+
+  Args:
+    named: what the user gave, see `find_checkpoints`.
+    newest: the first of those checkpoints.
+  """
+  best = newest.path.parent / BEST
+  if Path(named).name in (BEST, newest.path.name):
+    return []
+  try:
+    reached, now = Checkpoint(_linked(best)).meta["return"], newest.meta["return"]
+  except CheckpointError:  # no best, or a damaged one
+    return []
+  if reached is None or now is None or reached - now <= 0.1 * abs(reached):
+    return []
+  return [f"The newest checkpoint returned {now:.4g} in training, {best} {reached:.4g}: name that one to take it."]
+
+
 def round_policy(folder: str | Path, bits: int, chosen: Callable[[str], bool]) -> None:
   """Rounds arrays of a checkpoint's item 'policy' to fewer significant bits, and removes the path of its run.
 
@@ -477,7 +496,7 @@ def compress(item: Path) -> None:
   """
   context = ts.Context()  # one for all arrays, which come to one file then
   with tempfile.TemporaryDirectory(dir=item.parent) as folder:
-    old, new = ({"driver": "ocdbt", "base": f"file://{path}/"} for path in (item, folder))
+    old, new = ({"driver": "ocdbt", "base": {"driver": "file", "path": f"{path}/"}} for path in (item, folder))
     with ts.Transaction() as transaction:
       for key in ts.KvStore.open(old).result().list().result():
         if key.endswith(b".zarray"):

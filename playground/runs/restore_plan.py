@@ -13,7 +13,13 @@ from playground.config import RunConfig, compose
 from playground.errors import CheckpointError
 from playground.hardware.distributed import is_main
 from playground.learning.algorithm import Policy
-from playground.learning.checkpoints import Checkpoint, DamagedCheckpointError, NoCheckpointError, find_checkpoints
+from playground.learning.checkpoints import (
+  Checkpoint,
+  DamagedCheckpointError,
+  NoCheckpointError,
+  find_checkpoints,
+  of_a_better_one,
+)
 from playground.learning.loop import Draw
 from playground.learning.trainer import Settings, Trainer, TrainState
 from playground.pretrained import check_task, is_pretrained, locate, other_meaning
@@ -99,7 +105,8 @@ class RestorePlan:
     if config.resolved["run_dir"] is not None:  # else `create` numbers the name if it is taken
       RunDirectory(config.run_dir).must_be_new()
     if config.init_from is not None:
-      return cls(weights=weights_of(config.init_from))
+      weights = weights_of(config.init_from)
+      return cls(weights=weights, notices=of_a_better_one(config.init_from, weights))
     return cls()
 
   def start_over(self, config: RunConfig) -> None:

@@ -115,6 +115,26 @@ def test_rounded_arrays_take_less_space_and_come_back_bit_for_bit(tmp_path: Path
   np.testing.assert_array_equal(Checkpoint(path).arrays("policy")[1], rounded)
 
 
+@pytest.mark.parametrize(
+  ("returns", "said"),
+  [
+    ({10: 999.0, 20: 485.1}, "The newest checkpoint returned 485.1 in training, {best} 999: name that one to take it."),
+    ({10: -4.0, 20: -8.0}, "The newest checkpoint returned -8 in training, {best} -4: name that one to take it."),
+    ({10: 999.0, 20: 940.0}, ""),
+    ({10: 3.0, 20: 999.0}, ""),
+    ({10: 999.0, 20: math.nan}, ""),
+  ],
+)
+def test_that_an_earlier_one_is_better_is_said(returns: dict[int, float], said: str, tmp_path: Path) -> None:
+  newest, best = save(tmp_path, returns=returns)[0], tmp_path / "checkpoints" / "best"
+  for named in (tmp_path, tmp_path / "checkpoints"):
+    assert "".join(checkpoints.of_a_better_one(named, Checkpoint(newest))) == said.format(best=best)
+  for named in (newest, best):
+    assert not checkpoints.of_a_better_one(named, Checkpoint(newest))
+  best.unlink()
+  assert not checkpoints.of_a_better_one(tmp_path, Checkpoint(newest))
+
+
 def test_the_newest_are_kept(tmp_path: Path) -> None:
   assert [p.name for p in save(tmp_path, 10, 20, 30, 40, keep=2)] == ["000000000040", "000000000030"]
   # A run that goes on counts those that are there.
