@@ -453,8 +453,8 @@ def of_a_better_one(named: str | Path, newest: Checkpoint) -> list[str]:
   if Path(named).name in (BEST, newest.path.name):
     return []
   try:
-    reached, now = Checkpoint(_linked(best)).meta["return"], newest.meta["return"]
-  except CheckpointError:  # no best, or a damaged one
+    reached, now = _return_of(_linked(best)), newest.meta.get("return")
+  except CheckpointError:  # no best, or one that cannot be read
     return []
   if reached is None or now is None or reached - now <= 0.1 * abs(reached):
     return []

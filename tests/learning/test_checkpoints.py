@@ -131,6 +131,9 @@ def test_that_an_earlier_one_is_better_is_said(returns: dict[int, float], said: 
     assert "".join(checkpoints.of_a_better_one(named, Checkpoint(newest))) == said.format(best=best)
   for named in (newest, best):
     assert not checkpoints.of_a_better_one(named, Checkpoint(newest))
+  older = Checkpoint(newest)
+  del older.meta["return"]  # an earlier version noted none
+  assert not checkpoints.of_a_better_one(tmp_path, older)
   best.unlink()
   assert not checkpoints.of_a_better_one(tmp_path, Checkpoint(newest))
 
