@@ -494,10 +494,10 @@ def compress(item: Path) -> None:
 
   That takes a quarter less space where the last bits are zero. Orbax does not write such files, but reads them.
   """
-  context = ts.Context()  # one for all arrays, which come to one file then
+  context = ts.Context()  # one for all arrays, which one transaction writes
   with tempfile.TemporaryDirectory(dir=item.parent) as folder:
     old, new = ({"driver": "ocdbt", "base": {"driver": "file", "path": f"{path}/"}} for path in (item, folder))
-    with ts.Transaction() as transaction:
+    with ts.Transaction(atomic=True) as transaction:  # else their number of files depends on timing
       for key in ts.KvStore.open(old).result().list().result():
         if key.endswith(b".zarray"):
           name = key.decode().removesuffix(".zarray")
