@@ -116,39 +116,6 @@ def _from_bits(row: np.ndarray, example: PyTree) -> PyTree:
   return jax.tree.unflatten(structure, values)
 
 
-class Stacked(struct.PyTreeNode):
-  """A tree with its vectors and numbers in one array for each shape and dtype.
-
-  A loop on a GPU copies every array that it carries or stores, in each step: two in five of a small task's launches.
-
-  Attributes:
-    arrays: stacks along axis 0, and the other leaves.
-    groups: places of the leaves in each array.
-    structure: of the tree.
-  """
-
-  arrays: tuple[jax.Array, ...]
-  groups: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
-  structure: PyTree = struct.field(pytree_node=False)
-
-  @classmethod
-  def of(cls, tree: PyTree) -> "Stacked":
-    leaves, structure = jax.tree.flatten(tree)
-    places: dict[object, list[int]] = {}
-    for i, leaf in enumerate(leaves):
-      places.setdefault((leaf.shape, leaf.dtype) if leaf.ndim < 2 else i, []).append(i)
-    stack = lambda group: leaves[group[0]] if len(group) == 1 else jnp.stack([leaves[i] for i in group])
-    return cls(tuple(map(stack, places.values())), tuple(map(tuple, places.values())), structure)
-
-  def tree(self, axis: int = 0) -> PyTree:
-    """Returns the tree; `axis` is that of the stacks, 1 after a scan has stacked its steps along axis 0."""
-    leaves = {}
-    for array, group in zip(self.arrays, self.groups, strict=True):
-      one = len(group) == 1
-      leaves |= {i: array if one else jax.lax.index_in_dim(array, j, axis, False) for j, i in enumerate(group)}
-    return jax.tree.unflatten(self.structure, [leaves[i] for i in range(len(leaves))])
-
-
 T = TypeVar("T")
 EpisodeSums = dict[str, jax.Array]
 
@@ -200,13 +167,13 @@ class Environments(struct.PyTreeNode):
   ) -> tuple["Environments", T]:
     """Scans `step(envs, key)` over keys; returns the environments and the stacked outputs."""
 
-    def body(carry: Stacked, key: jax.Array) -> tuple[Stacked, Stacked]:
-      state, capture = carry.tree()
-      envs, out = step(self.replace(state=state, capture=capture, sums={}), key)
-      return Stacked.of((envs.state, envs.capture)), Stacked.of((out, envs.sums))
+    def body(
+      carry: tuple[State, NonfiniteCapture], key: jax.Array
+    ) -> tuple[tuple[State, NonfiniteCapture], tuple[T, EpisodeSums]]:
+      envs, out = step(self.replace(state=carry[0], capture=carry[1], sums={}), key)
+      return (envs.state, envs.capture), (out, envs.sums)
 
-    carry, outputs = jax.lax.scan(body, Stacked.of((self.state, self.capture)), keys)
-    (state, capture), (out, sums) = carry.tree(), outputs.tree(axis=1)
+    (state, capture), (out, sums) = jax.lax.scan(body, (self.state, self.capture), keys)
     return self._after(state, capture, jax.tree.map(lambda x: x.sum(axis=0), sums)), out
 
   def _after(self, state: State, capture: NonfiniteCapture, sums: EpisodeSums) -> "Environments":
