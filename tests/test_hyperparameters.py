@@ -107,9 +107,9 @@ def test_hyperparameters_are_those_of_the_source(agent: str, task: str):
 
 @pytest.mark.parametrize("agent", ["ppo", "sac"])
 def test_a_variant_without_a_set_of_its_own_takes_its_agents(agent: str):
-  run = compose([f"agent={agent}_v020", "env=CartpoleBalance"])
-  own = composed(agent, "CartpoleBalance")
-  assert (run.choices["agent"], run.choices["tuned"]) == (f"{agent}_v020", f"{agent}/CartpoleBalance")
+  run = compose([f"agent={agent}_v020", "env=PointMass"])
+  own = composed(agent, "PointMass")
+  assert (run.choices["agent"], run.choices["tuned"]) == (f"{agent}_v020", f"{agent}/PointMass")
   assert (run.resolved["agent"], run.resolved["env"]) == (own.resolved["agent"], own.resolved["env"])
   assert compose(run.overrides).resolved == run.resolved
 
