@@ -19,7 +19,7 @@ Status = Literal["solved", "learning", "open", "not measured"]
 STATUSES: tuple[Status, ...] = get_args(Status)
 FILE = Path(__file__).parent / "catalog.json"
 _REFERENCE = FILE.parents[1] / "results/reference"
-_NO_PUSHES = "events.push.enabled=false"  # in the setting of a run
+_NO_PUSHES = re.compile(r"events\.push(\.enabled=false|=null)")  # in the setting of a run
 _TABLES = ("dm_control", "locomotion", "manipulation", "vision")
 
 
@@ -143,7 +143,7 @@ def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]
   """
   ours = our_runs(rows, task)
   groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
-  for row in [row for row in ours if _NO_PUSHES not in row["setting"]] or ours:
+  for row in [row for row in ours if not _NO_PUSHES.search(row["setting"])] or ours:
     groups.setdefault((row["agent"], row["setting"], row["backend"], row["steps"]), []).append(row)
   mean = lambda runs: fmean(map(reached_return, runs))
   highest = max(map(mean, groups.values()), default=0.0)
@@ -167,7 +167,7 @@ def run_name(row: dict[str, str]) -> str:
     + (f", from {start.group(1)}" if start else "")
     + ", mirrored data" * ("agent.mirror_augmentation=true" in setting)
     + ", without mirrored data" * ("agent.mirror_augmentation=false" in setting)
-    + ", no pushes, nothing randomised" * (_NO_PUSHES in setting)
+    + ", no pushes, nothing randomised" * bool(_NO_PUSHES.search(setting))
   )
 
 

@@ -96,7 +96,7 @@ METRICS = """step,eval/episode_reward,eval/sampled/episode_reward,eval/episode_f
 
 
 def test_a_stopped_run_that_evaluates_the_mode(reference: Path, make: Make) -> None:
-  overrides = ["env=G1JoystickFlatTerrain", "agent=fast_sac", "agent.num_timesteps=20000000", "env.action_scale=0.25"]
+  overrides = ["env=T1JoystickFlatTerrain", "agent=fast_sac", "agent.num_timesteps=20000000", "env.action_scale=0.25"]
   run = make(*overrides, "agent.num_evals=3", "video.enable=false", metrics=METRICS, status="preempted")
   assert record.run(Options(runs=(str(run),), machine="four Xs", reference=str(reference))) == 0
   row = last_row(reference / "locomotion.csv")

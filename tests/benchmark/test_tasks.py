@@ -41,8 +41,9 @@ def test_a_chain_counts_by_its_last_stage():
   assert best_runs([*rows, run(10)], TASK) == [run(10)]
 
 
-def test_runs_without_pushes_count_only_alone():
-  off = run(40, setting="env.events.push.enabled=false")
+@pytest.mark.parametrize("setting", ["env.events.push.enabled=false", "env.events.push=null"])
+def test_runs_without_pushes_count_only_alone(setting: str):
+  off = run(40, setting=setting)
   assert best_runs([off, run(5)], TASK) == [run(5)]
   assert best_runs([off], TASK) == [off]
   assert run_name(off) == "ppo, no pushes, nothing randomised"
