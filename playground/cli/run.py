@@ -6,6 +6,7 @@ whose jobs run in separate processes (`playground.sweep`).
 """
 
 import argparse
+import faulthandler
 import itertools
 import os
 import re
@@ -47,6 +48,8 @@ _COMPLETION = re.compile("(install|uninstall|query)=(bash|fish|zsh)")
 
 def main() -> None:
   """Runs the command and exits: 0 done, 2 an error that the user can act on, 128 plus a signal's number after it."""
+  if not faulthandler.is_enabled():
+    faulthandler.enable()  # a crash in a driver or a compiler prints where
   withhold_gl()
   os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # any other error is a bug: show the traceback
   try:

@@ -1,5 +1,6 @@
 """`playground-run`: what it hands to training, what it only shows, and what it says when it cannot."""
 
+import signal
 import subprocess
 import sys
 import types
@@ -206,3 +207,15 @@ def test_a_mistake_is_reported_before_jax_is_imported():
   assert done.returncode == 2
   assert done.stderr.startswith("error: env=Gone does not exist")
   assert done.stderr.count("\n") == 1
+
+
+def test_a_crash_outside_python_prints_where():
+  code = """import os, signal
+from playground.cli import run
+def crashes(_):
+  os.kill(os.getpid(), signal.SIGSEGV)
+run._main = crashes
+run.main()"""
+  done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+  assert done.returncode == -signal.SIGSEGV
+  assert "Segmentation fault" in done.stderr and "in crashes" in done.stderr
