@@ -25,12 +25,12 @@ import jax
 from playground import registry
 from playground.physics.warp_kernels import KernelBuild
 env = registry.load(sys.argv[1], overrides={"impl": "warp"})
-build = KernelBuild(env.mj_model, env.physics._njmax)
+build = KernelBuild(env.mj_model, env.config.njmax)
 assert build.wait() is None
 import warp
 modules = lambda: {name for name in os.listdir(warp.config.kernel_cache_dir) if name.startswith("wp_")}
 before = modules()
-again = KernelBuild(env.mj_model, env.physics._njmax)
+again = KernelBuild(env.mj_model, env.config.njmax)
 assert again._process is None and again.wait() is None
 state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
 state = jax.jit(jax.vmap(env.step))(state, jax.numpy.zeros((2, env.action_size)))
