@@ -133,7 +133,7 @@ def load(path: Path) -> RunConfig:
     raise ConfigError(f"{path} is not a file.")
   try:
     resolved = OmegaConf.to_container(OmegaConf.load(path))
-  except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
+  except (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError) as error:
     raise ConfigError(f"{path} cannot be read: {first_line(error)}.") from None
   if not isinstance(resolved, dict):
     raise ConfigError(f"{path} is not the configuration of a run.")

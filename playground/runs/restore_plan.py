@@ -92,7 +92,8 @@ class RestorePlan:
     """
     if config.resume is not None:
       run_dir = RunDirectory.open(config.resume)
-      longer = run_dir.config["agent"]["num_timesteps"] < config.agent.num_timesteps
+      now = config.agent.num_timesteps
+      longer = run_dir.config["agent"].get("num_timesteps", now) < now  # a key that is not there has its default
       plan = cls(run_dir=run_dir, began_s=began_s, longer=longer)
       try:
         plan.checkpoints = find_checkpoints(config.resume)
