@@ -130,7 +130,7 @@ def read(path: Path) -> dict[str, dict[str, Golden]]:
   """
   try:
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
-  except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+  except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # such as an invalid date
     reason = getattr(error, "strerror", None) or " ".join(str(error).split())
     raise ConfigError(f"table={path} cannot be read: {reason}.") from None
   if (

@@ -238,7 +238,7 @@ class SweepDirectory:
       content = yaml.safe_load(file.read_text(encoding="utf-8"))
       _check(content)
       return cls(path, **content | {"jobs": [Job(**job) for job in content["jobs"]], "cwd": Path(content["cwd"])})
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
       raise CheckpointError(f"{file} is damaged: {first_line(error)}.") from None
 
   @property

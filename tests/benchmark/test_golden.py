@@ -145,6 +145,8 @@ def test_other_overrides_are_another_run(tmp_path: Path, monkeypatch: pytest.Mon
     ("a", "must hold sets of runs"),
     ("cpu: {}", "must hold sets of runs"),
     ("cpu: [", "cannot be read"),
+    pytest.param("[" * 100_000, "cannot be read: maximum recursion depth", id="deep"),
+    ("cpu: 2026-02-30", "cannot be read"),
     (ONE.replace("    from: here\n", ""), "cpu.pole must have the keys run, metrics, from"),
     (ONE.replace("[0, 20]", "[20, 0]"), r"eval/episode_reward=\[20, 0\] must be two numbers"),
     (ONE.replace("[0, 20]", "[.nan, 0]"), "must be two numbers"),

@@ -130,3 +130,9 @@ def test_a_damaged_sweep_is_one_sentence(tmp_path: Path, content: object) -> Non
   (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(content))
   with pytest.raises(CheckpointError, match=r"sweep\.yaml is damaged"):
     SweepDirectory.open(tmp_path)
+
+
+def test_a_sweep_nested_too_deeply_is_one_sentence(tmp_path: Path) -> None:
+  (tmp_path / "sweep.yaml").write_text("[" * 100_000)
+  with pytest.raises(CheckpointError, match=r"sweep\.yaml is damaged: maximum recursion depth"):
+    SweepDirectory.open(tmp_path)
