@@ -157,7 +157,7 @@ def test_every_chain_has_an_experiment():
     (
       "g1_rough_chain",
       ("choices.env", "agent.name", "agent.num_timesteps"),
-      [("G1JoystickFlatTerrain", "fast_sac", 50_000_000), ("G1JoystickRoughTerrain", "fast_sac", 20_000_000)],
+      [("G1JoystickFlatTerrain", "fast_sac", 50_000_000), ("G1JoystickRoughTerrain", "fast_sac", 50_000_000)],
     ),
   ],
 )

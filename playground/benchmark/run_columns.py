@@ -52,7 +52,8 @@ def setting_of(run: RunDirectory, stage: str) -> tuple[str, str]:
   except PlaygroundError as error:
     print(f"{run.path}: its setting has all of its overrides, for today's configuration is another one ({error})")
     return " ".join([*kept, *starts]), ""
-  return " ".join([*differ, *older, *starts]), " ".join(text for text in kept if text not in differ)
+  part = [text for text in kept if text not in differ and _key_of(text) != "tuned"]  # that one a run adds itself
+  return " ".join([*differ, *older, *starts]), " ".join(part)
 
 
 def _differences(config: Section, other: Section) -> list[str]:

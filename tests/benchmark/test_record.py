@@ -96,14 +96,15 @@ METRICS = """step,eval/episode_reward,eval/sampled/episode_reward,eval/episode_f
 
 
 def test_a_stopped_run_that_evaluates_the_mode(reference: Path, make: Make) -> None:
-  overrides = ["env=T1JoystickFlatTerrain", "agent=fast_sac", "agent.num_timesteps=20000000", "env.action_scale=0.25"]
-  run = make(*overrides, "agent.num_evals=3", "video.enable=false", metrics=METRICS, status="preempted")
+  overrides = ["env=T1JoystickFlatTerrain", "agent=fast_sac", "agent.num_timesteps=50000000", "env.action_scale=0.25"]
+  added = "tuned=fast_sac/T1JoystickFlatTerrain"  # by the program
+  run = make(*overrides, added, "agent.num_evals=3", "video.enable=false", metrics=METRICS, status="preempted")
   assert record.run(Options(runs=(str(run),), machine="four Xs", reference=str(reference))) == 0
   row = last_row(reference / "locomotion.csv")
   assert row["setting"] == "env.action_scale=0.25 agent.num_evals=3", "a default is none"
   assert row["note"] == (
-    "evaluated by the policy's mode; sampled 25.00; stopped after 12 of 20 M steps, last evaluated after 11 M; "
-    "then with agent.num_timesteps=20000000"
+    "evaluated by the policy's mode; sampled 25.00; stopped after 12 of 50 M steps, last evaluated after 11 M; "
+    "then with agent.num_timesteps=50000000"
   )
   assert (row["final_return"], row["final_mode_return"], row["best_return"]) == ("27.12", "27.12", "27.12")
   assert (row["falls_per_episode"], row["tracking_error_lin_m_s"], row["steps"]) == ("0.250", "0.300", "11000000")
