@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 
 from playground.config import compose
 from playground.envs.base import State
@@ -217,5 +218,5 @@ def test_what_the_actor_estimates_is_learnt_and_does_not_act() -> None:
 
 def _variables(jaxpr: Any) -> list[Any]:
   """All that a program computes, in the programs inside it, too."""
-  inner = [sub for eqn in jaxpr.eqns for sub in jax.core.jaxprs_in_params(eqn.params)]
+  inner = [sub for eqn in jaxpr.eqns for sub in jaxprs_in_params(eqn.params)]
   return [v for eqn in jaxpr.eqns for v in eqn.outvars] + [v for sub in inner for v in _variables(sub)]
