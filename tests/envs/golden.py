@@ -175,8 +175,6 @@ _RENAMED_IN = {
 _SETTINGS = {"PandaPickCubeCartesian": {"guide_probability": 0.0}}  # the roll does not begin with the cube in the hand
 _FAR = 1000  # control steps until the next command, in rolls of 8
 _PROGRAMS: dict[Any, Any] = {}  # compiled physics by structure of the model and fields that are kept
-# With them, JAX 0.10's code takes minutes for a step of PandaRobotiqPushCube; JAX 0.11 has no such option.
-_COMPILER_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else None
 BATCH = 8  # T of all recordings
 KEYS = jnp.stack([jax.random.PRNGKey(seed) for seed in range(BATCH)])
 _ROWS = {"data/sensordata": "sensor", "data/site_xpos": "site", "data/site_xmat": "site"}
@@ -204,10 +202,7 @@ def compiled_task(name: str, overrides: Mapping[str, Any] | None = None) -> Any:
   """
   env = load_task(name, {**(overrides or {}), "impl": "jax"})
   physics = env.physics
-  programs = (
-    jax.jit(physics.forward, compiler_options=_COMPILER_OPTIONS),
-    jax.jit(physics.step, static_argnames="num_substeps", compiler_options=_COMPILER_OPTIONS),
-  )
+  programs = jax.jit(physics.forward), jax.jit(physics.step, static_argnames="num_substeps")
   physics.forward, physics.step = _PROGRAMS.setdefault((jax.tree.structure(physics.model), env.derived), programs)
   env.post_step = jax.jit(env.post_step)
   return env
