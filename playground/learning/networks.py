@@ -31,6 +31,8 @@ from playground.pytree import PyTree
 
 ACTIVATIONS: dict[ActivationName, Activation] = {name: getattr(linen, name) for name in get_args(ActivationName)}
 
+MIN_STD = 1e-3  # of actions before squashing
+
 Normalizer = running_statistics.RunningStatisticsState
 ObservationSize = int | Mapping[str, tuple[int, ...]]
 
@@ -116,7 +118,7 @@ class Actor:
     self.policy_obs_key, self.value_obs_key = config.policy_obs_key, config.value_obs_key
     self.obs_keys = tuple(sorted({config.policy_obs_key, config.value_obs_key, self.estimated_obs_key} - {""}))
     self.obs_sizes = {key: sizes[key] for key in self.obs_keys}
-    self.distribution = NormalTanhDistribution(event_size=action_size)
+    self.distribution = NormalTanhDistribution(event_size=action_size, min_std=MIN_STD)
     self.cnn: CNNConfig | None = None
     if self.pixel_sizes:
       assert isinstance(config, NetworkConfig)
@@ -270,6 +272,7 @@ class ActorCritic(Actor):
   def __init__(self, obs_size: ObservationSize, action_size: int, config: NetworkConfig, precision: str | None = None):
     """Builds the networks; see `Actor` for the arguments and errors."""
     super().__init__(obs_size, action_size, config.policy_hidden_layer_sizes, config, precision)
+    self.init_std, self._last_hidden = config.init_std, f"hidden_{len(config.policy_hidden_layer_sizes)}"
     self.value_dtype = value_dtype(config.value_dtype)
     sizes, dtype = tuple(config.value_hidden_layer_sizes), jnp.dtype(self.value_dtype)
     if self.pixel_sizes:
@@ -281,9 +284,18 @@ class ActorCritic(Actor):
     policy, value = jax.random.split(key)
     if self.pixel_sizes:
       actor, critic = (self._seen(self._example(), key) for key in (self.policy_obs_key, self.value_obs_key))
-      return ActorCriticParams(self._actor.init(policy, *actor), self._critic.init(value, *critic))
+      return ActorCriticParams(self._at_std(self._actor.init(policy, *actor)), self._critic.init(value, *critic))
     obs = jnp.zeros((1, *self.obs_sizes[self.value_obs_key]))
-    return ActorCriticParams(self.policy_network.init(policy), self._critic.init(value, obs))
+    return ActorCriticParams(self._at_std(self.policy_network.init(policy)), self._critic.init(value, obs))
+
+  def _at_std(self, policy: PyTree) -> PyTree:
+    """Returns a new actor whose last biases give its actions the standard deviation `init_std`."""
+    if self.init_std is None:
+      return policy
+    layers, last = policy["params"], "output" if self.pixel_sizes else self._last_hidden
+    bias = math.log(math.expm1(max(self.init_std - MIN_STD, MIN_STD)))  # softplus(bias) + MIN_STD is the deviation
+    layer = layers[last] | {"bias": layers[last]["bias"].at[self.action_size :].set(bias)}
+    return {"params": layers | {last: layer}}
 
   def value(self, value_params: PyTree, obs: Mapping[str, jax.Array]) -> jax.Array:
     """Returns state values, [...], for normalised observations."""
