@@ -73,7 +73,10 @@ def pack(folder: Path, out: Path, part: int, parts: int) -> list[str]:
 
 
 def _members(job: Path) -> list[Path]:
-  """Returns a job's small files, its newest and best checkpoint without the training state, and its first dump."""
+  """Returns a job's small files, its newest and best checkpoint without the training state, and its first dump.
+
+  A curriculum's stages are folders of the job, each with the same.
+  """
   checkpoints, best = job / "checkpoints", job / "checkpoints" / "best"
   steps = sorted(path.name for path in checkpoints.glob("*") if path.name.isdecimal())
   found = [job / name for name in FILES if (job / name).is_file()] + [best] * best.is_symlink()
@@ -81,7 +84,8 @@ def _members(job: Path) -> list[Path]:
   for step in {*steps[-1:], *[step for step in steps if best.exists() and step == best.resolve().name]}:
     parts = [path for path in (checkpoints / step).iterdir() if path.name != "state"]
     found += [path for part in parts for path in (part, *part.rglob("*")) if path.is_file()]
-  return found
+  stages = sorted(path.parent for path in job.glob("*/status.json"))
+  return found + [path for stage in stages for path in _members(stage)]
 
 
 def main(arguments: list[str]) -> int:

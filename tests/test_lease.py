@@ -53,6 +53,17 @@ def test_a_pack_has_the_policies_of_jobs_that_ended_once(tmp_path: Path) -> None
   assert not list((tmp_path / "out").glob("pack.*"))
 
 
+def test_a_pack_has_the_policies_of_a_chains_stages(tmp_path: Path) -> None:
+  make_job(tmp_path, "0_chain/1_dense")
+  chain = tmp_path / "jobs" / "0_chain"
+  (chain / "metrics.csv").write_text("step,stage")
+  (chain / "status.json").write_text('{"status": "finished", "updated": "8:00"}')
+  assert lease.pack(tmp_path, tmp_path / "out", 2**20, 1) == ["0_chain"]
+  names = packed(tmp_path / "out", tmp_path)
+  assert {"0_chain/metrics.csv", "0_chain/1_dense/metrics.csv", "0_chain/1_dense/checkpoints/200/policy/d/x"} <= names
+  assert not any("/state/" in name for name in names)
+
+
 def test_no_part_is_larger_than_allowed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
   for name in ("0_a", "1_b"):
     make_job(tmp_path, name, size=30_000)

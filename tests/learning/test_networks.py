@@ -49,6 +49,25 @@ def test_bfloat16_is_near_and_keeps_parameters_in_float32() -> None:
     assert jnp.linalg.norm(near - grad) < 0.03 * jnp.linalg.norm(grad)
 
 
+@pytest.mark.parametrize("sizes", [{"state": (5,)}, {"state": (5,), "pixels/eye": (12, 12, 3)}])
+def test_a_new_actors_actions_have_the_standard_deviation_that_is_set(sizes: dict[str, tuple[int, ...]]) -> None:
+  zero = {key: jnp.zeros((1, *shape), jnp.uint8 if key != "state" else jnp.float32) for key, shape in sizes.items()}
+
+  def fresh(init_std: float | None) -> tuple[Any, Any]:
+    networks = ActorCritic(sizes, 2, NetworkConfig((8,), SIZES, init_std=init_std))
+    params = networks.init(jax.random.PRNGKey(3))
+    return networks.distribution.create_dist(networks.logits(params.policy, zero)), params
+
+  usual, params = fresh(None)
+  small, same = fresh(0.15)
+  exact = 1e-6 if len(sizes) == 1 else 0.2  # an image of zeros is no vector of zeros
+  np.testing.assert_allclose(usual.scale, jax.nn.softplus(0.0) + 1e-3, rtol=exact)
+  np.testing.assert_allclose(small.scale, 0.15, rtol=exact)
+  np.testing.assert_array_equal(small.loc, usual.loc)
+  changed = [bool((a != b).any()) for a, b in zip(jax.tree.leaves(params), jax.tree.leaves(same), strict=True)]
+  assert sum(changed) == 1, "one layer's biases"
+
+
 def test_dtype_follows_the_device() -> None:
   networks, _ = critic("auto")
   assert networks.value_dtype == ("bfloat16" if jax.default_backend() == "gpu" else "float32")
