@@ -184,7 +184,7 @@ class NetworkConfig:
     float | None, positive(), "largest input of actor and critic, after normalisation; null: it is not clipped"
   ] = None
   init_std: Annotated[
-    float | None, positive(100), "standard deviation of a new actor's actions before squashing; null: about 0.7"
+    float | None, Limit(0.01, 10), "standard deviation of a new actor's actions before squashing; null: about 0.7"
   ] = None
   value_dtype: ValueDtype = "auto"
   cnn: Annotated[CNNConfig, "of actor and critic each, for images"] = dataclasses.field(default_factory=CNNConfig)

@@ -293,7 +293,7 @@ class ActorCritic(Actor):
     if self.init_std is None:
       return policy
     layers, last = policy["params"], "output" if self.pixel_sizes else self._last_hidden
-    bias = math.log(math.expm1(max(self.init_std - MIN_STD, MIN_STD)))  # init_std is its softplus, plus MIN_STD
+    bias = math.log(math.expm1(self.init_std - MIN_STD))  # init_std is its softplus, plus MIN_STD
     layer = layers[last] | {"bias": layers[last]["bias"].at[self.action_size :].set(bias)}
     return {"params": layers | {last: layer}}
 

@@ -85,6 +85,7 @@ def test_dtype_follows_the_device() -> None:
     ({"network": {"cnn": {"activation": "rel"}}}, "network.cnn.activation=rel is unknown: .* Did you mean 'relu'"),
     ({"network": {"policy_hidden_layer_sizes": [8, 0]}}, r"sizes=\[8, 0\] must be a list of whole numbers from 1 to"),
     ({"discounting": 1.5}, "agent.discounting=1.5 must be a number from 0 to 1"),
+    ({"network": {"init_std": 0.0001}}, "network.init_std=0.0001 must be a number from 0.01 to 10"),
   ],
 )
 def test_python_and_the_command_line_refuse_the_same_values(config: dict[str, Any], message: str) -> None:
