@@ -134,7 +134,7 @@ class Trainer:
     return jax.tree.map(stack, *parts) if self.num_agents else parts[0]
 
   def agent(self, tree: PyTree, index: int) -> PyTree:
-    """Returns one agent's part of a tree."""
+    """Returns one agent's part of a tree on the host; on several devices each leaf would be a program of its own."""
     return jax.tree.map(lambda x: x[index], tree) if self.num_agents else tree
 
   def shapes(self, tree: PyTree) -> PyTree:

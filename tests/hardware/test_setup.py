@@ -69,8 +69,8 @@ for count, devices in ((2, 1), (3, 2)):  # one agent on each device; all of them
   for i, config in enumerate(agents):
     alone = Trainer(PointTask(), config, make_mesh(devices))
     expected, _ = alone.train(alone.init(jax.random.PRNGKey(i), {}, None, alone.settings), {}, np.int32(10))
-    ours, theirs = (jax.tree.leaves(jax.device_get(s.algorithm.params)) for s in (trainer.agent(state, i), expected))
-    for a, b in zip(ours, theirs, strict=True):
+    params, theirs = jax.device_get((state.algorithm.params, expected.algorithm.params))
+    for a, b in zip(jax.tree.leaves(trainer.agent(params, i)), jax.tree.leaves(theirs), strict=True):
       np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
   state = trainer.inherit(state, np.zeros(count, int), trainer.settings)
   for leaf in jax.tree.leaves(jax.device_get(state.algorithm)):
