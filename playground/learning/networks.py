@@ -272,7 +272,8 @@ class ActorCritic(Actor):
   def __init__(self, obs_size: ObservationSize, action_size: int, config: NetworkConfig, precision: str | None = None):
     """Builds the networks; see `Actor` for the arguments and errors."""
     super().__init__(obs_size, action_size, config.policy_hidden_layer_sizes, config, precision)
-    self.init_std, self._last_hidden = config.init_std, f"hidden_{len(config.policy_hidden_layer_sizes)}"
+    self.init_std = config.init_std
+    self._output = "output" if self.pixel_sizes else f"hidden_{len(config.policy_hidden_layer_sizes)}"  # of the actor
     self.value_dtype = value_dtype(config.value_dtype)
     sizes, dtype = tuple(config.value_hidden_layer_sizes), jnp.dtype(self.value_dtype)
     if self.pixel_sizes:
@@ -292,10 +293,10 @@ class ActorCritic(Actor):
     """Returns a new actor whose last biases give its actions the standard deviation `init_std`."""
     if self.init_std is None:
       return policy
-    layers, last = policy["params"], "output" if self.pixel_sizes else self._last_hidden
-    bias = math.log(math.expm1(self.init_std - MIN_STD))  # init_std is its softplus, plus MIN_STD
-    layer = layers[last] | {"bias": layers[last]["bias"].at[self.action_size :].set(bias)}
-    return {"params": layers | {last: layer}}
+    layers = policy["params"]
+    layer = layers[self._output]
+    bias = layer["bias"].at[self.action_size :].set(math.log(math.expm1(self.init_std - MIN_STD)))  # softplus, inverted
+    return {"params": layers | {self._output: layer | {"bias": bias}}}
 
   def value(self, value_params: PyTree, obs: Mapping[str, jax.Array]) -> jax.Array:
     """Returns state values, [...], for normalised observations."""
