@@ -9,6 +9,7 @@ from playground.config import compose
 from playground.config.limits import nodes
 from playground.config.overrides import SHORT_KEYS
 from playground.errors import PlaygroundError
+from playground.mdp.terms import MODULES
 from playground.runs.run_dir import RunDirectory
 from playground.settings import Section, select
 from playground.text import format_value
@@ -46,7 +47,7 @@ def setting_of(run: RunDirectory, stage: str) -> tuple[str, str]:
   value = lambda values, key: values["choices"].get(key) if key in values["choices"] else select(values, key)
   try:
     default = compose(base).resolved
-    same = not _differences(config, default)  # whatever the overrides are called
+    same = not _differences(config, default) and _terms(config) == _terms(default)  # whatever the overrides are called
     differ = [t for t in kept if not same and value(config, _key_of(t)) != value(default, _key_of(t))]
     older = _differences(config, compose([*base, *differ]).resolved)
   except PlaygroundError as error:
@@ -61,6 +62,11 @@ def _differences(config: Section, other: Section) -> list[str]:
   known = dict(_leaves(other))
   changed = {key: value for key, value in _leaves(config) if key in known and known[key] != value}
   return [f"{key}={format_value(value)}".replace(", ", ",") for key, value in changed.items()]
+
+
+def _terms(config: Section) -> set[str]:
+  """Returns the keys of the task's terms: one that was removed or added has no value to compare."""
+  return {key for key, value in nodes(config["env"]) if key.split(".")[0] in MODULES and isinstance(value, Mapping)}
 
 
 def _leaves(config: Section) -> Iterator[tuple[str, object]]:

@@ -142,6 +142,13 @@ def test_a_default_that_has_changed_is_a_setting(reference: Path, make: Make) ->
   assert (row["setting"], row["note"]) == ("agent.discounting=0.5", "")
 
 
+def test_terms_that_were_removed_are_a_setting(reference: Path, make: Make) -> None:
+  run = make("env=T1JoystickFlatTerrain", "randomization=none", "env.events.push=null", metrics=METRICS)
+  assert record.run(Options(runs=(str(run),), reference=str(reference))) == 0
+  row = last_row(reference / "locomotion.csv")
+  assert row["setting"] == "randomization=none env.events.push=null" and "then with" not in row["note"]
+
+
 def test_images_have_a_table_and_stages_a_setting(reference: Path, make: Make) -> None:
   images = make("env=CartpoleBalanceVision", metrics="step,eval/episode_reward,eval/mode/episode_reward\n100,24,24.5\n")
   chain = RunDirectory.create(images.parent / "chain", {"name": "chain"}, ["curriculum.scale=0.4", "hardware=cpu"])
