@@ -143,7 +143,6 @@ def _parser() -> argparse.ArgumentParser:
   view.add_argument(
     "--agent", choices=("zero", "random"), default="zero", help="zero or random actions (default: %(default)s)"
   )
-  view.add_argument("--randomize", action="store_true", help="draw the model by the task's startup events")
   view.add_argument("--seed", type=int, default=0, help="seed of episodes and model (default: %(default)s)")
   _add_places(view, "render an episode to this .mp4 instead")
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
@@ -183,6 +182,9 @@ def _add_places(parser: argparse.ArgumentParser, video: str) -> argparse._Mutual
   parser.add_argument("--camera", metavar="NAME", help=_CAMERA)
   parser.add_argument(
     "--no-events", dest="interval_events", action="store_false", help="switch pushes and other interval events off"
+  )
+  parser.add_argument(
+    "--randomize", action="store_true", help="draw the model by the task's startup events, one for each episode"
   )
   parser.add_argument("--host", default="127.0.0.1", help="address that the page listens on (default: %(default)s)")
   parser.add_argument("--port", type=int, default=8080, help="port of the page (default: %(default)s)")

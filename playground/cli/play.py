@@ -1,5 +1,6 @@
 """`playground play <run|policy.onnx>`: measures, films or shows the exported policy in plain C MuJoCo."""
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from playground.deploy.policy import ActingPolicy, ExportedPolicy
 from playground.deploy.scores import measure, result_name, result_of
 from playground.deploy.scripted import ScriptedPolicy
 from playground.deploy.session import LATEST, Session
-from playground.deploy.trained import export_policy, load_exact, load_on_c_physics
+from playground.deploy.trained import draw_models, export_policy, load_exact, load_on_c_physics, set_fields
 from playground.envs.base import Env
 from playground.errors import CheckpointError, PlaygroundError
 from playground.extras import need
@@ -51,14 +52,15 @@ def play(
   host: str = "127.0.0.1",
   port: int = 8080,
 ) -> int:
-  """Runs a policy with ONNX Runtime in C MuJoCo, with the task's rate, noise, pushes and delays, on the nominal model.
+  """Runs a policy with ONNX Runtime in C MuJoCo, with the task's rate, noise, pushes and delays.
 
   Args:
     path: a run directory, one of its checkpoints, or a `policy.onnx` with its `policy.yaml` beside it, or their folder;
       with `agent` a task.
     agent: zero or random actions in place of a policy; None is the policy of `path`.
     overrides: of the task, such as `terrain=stairs`; with `agent`: as for playground-run.
-    randomize: with `agent`: whether the task's startup events draw the model.
+    randomize: whether the task's startup events draw the model, a new one for each episode that is measured; False is
+      the nominal model.
     interval_events: whether pushes and other interval events act.
     episodes: number of episodes to measure.
     seed: of the episodes.
@@ -73,7 +75,8 @@ def play(
     The exit code, 0.
 
   Raises:
-    PlaygroundError: no such run, policy or camera, no display for the viewer, or no port for the browser.
+    PlaygroundError: no such run, policy or camera, no display for the viewer, no port for the browser, or a task
+      without startup events to randomise by.
   """
   console = Console()
   film = need_place(video, camera)
@@ -86,12 +89,12 @@ def play(
     from playground.deploy.web.gate import need_port
 
     need_port(host, port)
-  model_seed = seed if randomize else None
+  model_seed = seed if randomize and (viewer or web) else None
   if agent is None:
-    opened = open_policy(path, overrides, interval_events)
-    if drawn := [text for text in overrides if text.startswith("randomization=")]:
-      what = f"the model is the nominal one, so that only events of mode reset act; playground eval {path} {drawn[-1]}"
-      console.print(f"{drawn[-1]}: {what} measures all of them.", soft_wrap=True, markup=False, highlight=False)
+    opened = open_policy(path, overrides, interval_events, model_seed)
+    if not randomize and (drawn := [text for text in overrides if text.startswith("randomization=")]):
+      what = "the model is the nominal one, so that only events of mode reset act; --randomize draws it."
+      console.print(f"{drawn[-1]}: {what}", soft_wrap=True, markup=False, highlight=False)
   else:
     _set_up_cpu()
     section = configs.compose([f"env={path}", *overrides]).env
@@ -115,17 +118,20 @@ def play(
     following = None if given.parent.name == "checkpoints" else LATEST
     watch(Session(env, exported, seed, menu, following, model_seed), host, port, console)
     return 0
-  scores, recording = measure(exported, env, episodes, seed, 1 if film else 0)
-  console.print(_table(exported.contract, episodes, scores, overrides))
+  models = draw_models(env, exported.contract["task"], episodes, seed) if randomize else {}
+  scores, recording = measure(exported, env, episodes, seed, 1 if film else 0, models)
+  console.print(_table(exported.contract, episodes, scores, overrides, randomize))
   if opened.folder is not None:
     steps = exported.contract["origin"]["steps"]
-    out = opened.folder / result_name(steps, seed, episodes, interval_events, overrides)
-    result = result_of(exported, scores, episodes, seed, interval_events, overrides)
+    out = opened.folder / result_name(steps, seed, episodes, interval_events, overrides, randomize)
+    result = result_of(exported, scores, episodes, seed, interval_events, overrides, randomize)
     run = opened.trained.run_dir.path if opened.trained else None
     save(out, result, console, run)
   if film:
+    drawn_model = copy.copy(env.mj_model)
+    set_fields(drawn_model, {name: values[0] for name, values in models.items()})
     render_video(
-      env.mj_model,
+      drawn_model,
       out_path=film,
       dt=env.dt * env.action_repeat,
       camera=camera,
@@ -152,8 +158,10 @@ class Opened:
   trained: LoadedPolicy | None = None
 
 
-def open_policy(path: str, overrides: Sequence[str] = (), interval_events: bool = True) -> Opened:
-  """Reads a run's policy, or an exported one, and builds its task, with or without interval events.
+def open_policy(
+  path: str, overrides: Sequence[str] = (), interval_events: bool = True, model_seed: int | None = None
+) -> Opened:
+  """Reads a run's policy, or an exported one, and builds its task; `load_on_c_physics` has the last two arguments.
 
   Raises:
     PlaygroundError: no such run or policy, or an invalid override.
@@ -163,8 +171,9 @@ def open_policy(path: str, overrides: Sequence[str] = (), interval_events: bool 
   if Path(path).suffix == ".onnx":
     exported = ExportedPolicy.load(path)
     _set_up_cpu()
-    return Opened(exported, _task_of(exported, path, overrides, interval_events), Path(path).expanduser().parent)
-  trained = load_exact(path, overrides, interval_events)
+    env = _task_of(exported, path, overrides, interval_events, model_seed)
+    return Opened(exported, env, Path(path).expanduser().parent)
+  trained = load_exact(path, overrides, interval_events, model_seed)
   return Opened(export_policy(trained), trained.env, trained.run_dir.path / "export", trained)
 
 
@@ -172,7 +181,9 @@ def _set_up_cpu() -> None:
   setup(this_machine(configs.compose(["hardware=cpu"]).hardware))
 
 
-def _task_of(exported: ExportedPolicy, path: str, overrides: Sequence[str], interval_events: bool) -> Env:
+def _task_of(
+  exported: ExportedPolicy, path: str, overrides: Sequence[str], interval_events: bool, model_seed: int | None
+) -> Env:
   """Builds the task of a policy's contract on C MuJoCo, and traces it so that invalid values raise here.
 
   Raises:
@@ -187,7 +198,7 @@ def _task_of(exported: ExportedPolicy, path: str, overrides: Sequence[str], inte
   if overrides:
     config = configs.override_task(config, overrides)
   try:
-    env = load_on_c_physics(task, config, interval_events=interval_events)
+    env = load_on_c_physics(task, config, interval_events=interval_events, model_seed=model_seed)
     obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
     entries = obs if isinstance(obs, Mapping) else {"state": obs}
     theirs = {row["entry"]: (tuple(row["shape"][1:]), row["type"]) for row in policy["inputs"]}
@@ -212,14 +223,17 @@ def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
   return Menu(given if given == run.parent else run, trained, lambda message: console.print(message, soft_wrap=True))
 
 
-def _table(contract: Contract, episodes: int, scores: Mapping[str, float], overrides: Sequence[str]) -> Table:
+def _table(
+  contract: Contract, episodes: int, scores: Mapping[str, float], overrides: Sequence[str], randomized: bool
+) -> Table:
   """Builds a table of scores, beside those of the last evaluation in training, the mode's first."""
   origin = contract["origin"]
   trained = origin["evaluation"]
   title = f"{contract['task']}, {origin['steps']:,} steps trained{described(overrides)}"
   table = Table("per episode", title=title)
   table.add_column("C MuJoCo", justify="right")
-  table.caption = f"C MuJoCo: mean of {episodes} episode{'s' * (episodes != 1)}, nominal model, mode of the policy."
+  model = "randomised models" if randomized else "nominal model"
+  table.caption = f"C MuJoCo: mean of {episodes} episode{'s' * (episodes != 1)}, {model}, mode of the policy."
   kinds = {}  # of actions in training: what their scores' names begin with
   if trained:
     other = {name.partition("/")[0] for name in trained} & {*OTHER_RETURNS}

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import jax
 
@@ -9,6 +10,7 @@ from playground.deploy.policy import ActingPolicy
 from playground.deploy.trained import export_policy, load_exact
 from playground.envs.base import Env
 from playground.envs.locomotion.gait_metrics import with_gait_metrics
+from playground.envs.wrappers import ModelFields
 from playground.errors import ConfigError
 from playground.files import need_folder, read_json, write_json
 from playground.hardware.mesh import make_mesh
@@ -18,11 +20,19 @@ from playground.text import suffix
 
 
 def measure(
-  exported: ActingPolicy, env: Env, episodes: int, seed: int = 0, recorded: int = 0
+  exported: ActingPolicy,
+  env: Env,
+  episodes: int,
+  seed: int = 0,
+  recorded: int = 0,
+  models: ModelFields = MappingProxyType({}),
 ) -> tuple[dict[str, float], PyTree]:
-  """Plays episodes in C MuJoCo; returns their mean scores by name, and the states of the first `recorded` episodes."""
+  """Plays episodes in C MuJoCo, on randomised `models` if given.
+
+  Returns their mean scores by name, and the states of the first `recorded` episodes.
+  """
   evaluate = make_evaluator(with_gait_metrics(env), exported.act, episodes, make_mesh(1), recorded)
-  scores, recording = evaluate({}, jax.random.PRNGKey(seed), {}, {})
+  scores, recording = evaluate({}, jax.random.PRNGKey(seed), dict(models), {})
   return {name: float(value) for name, value in jax.device_get(scores).items()}, recording
 
 
@@ -33,19 +43,27 @@ def result_of(
   seed: int = 0,
   interval_events: bool = True,
   overrides: Sequence[str] = (),
+  randomized: bool = False,
 ) -> dict[str, object]:
   """Returns the content of a result's file: how the policy was played, its scores and its origin."""
   played = {"simulator": "C MuJoCo", "episodes": episodes, "seed": seed, "interval_events": interval_events}
   played |= {"overrides": list(overrides)} if overrides else {}
+  played |= {"randomized": True} if randomized else {}
   return played | {"scores": scores, "origin": exported.contract["origin"]}
 
 
 def result_name(
-  steps: int, seed: int, episodes: int, interval_events: bool = True, overrides: Sequence[str] = ()
+  steps: int,
+  seed: int,
+  episodes: int,
+  interval_events: bool = True,
+  overrides: Sequence[str] = (),
+  randomized: bool = False,
 ) -> str:
   """Returns the file name of a result; results of other settings have other names, so that none replaces another."""
-  events = "" if interval_events else "_no_events"
-  return f"play_step_{steps:012d}_seed_{seed}_episodes_{episodes}{events}{suffix(overrides)}.json"
+  how = "" if interval_events else "_no_events"
+  how += "_randomized" * randomized
+  return f"play_step_{steps:012d}_seed_{seed}_episodes_{episodes}{how}{suffix(overrides)}.json"
 
 
 def read_scores(result: Path) -> dict[str, float]:

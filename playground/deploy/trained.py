@@ -3,10 +3,11 @@
 import functools
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 from ml_collections import ConfigDict
 
@@ -19,6 +20,7 @@ from playground.envs.base import Env, State
 from playground.envs.c_physics import on_c_physics
 from playground.envs.options import uses_vision
 from playground.envs.wrappers import wrap_for_training
+from playground.errors import ConfigError
 from playground.extras import need
 from playground.randomization import Randomizer
 from playground.runs.csv_tracker import OTHER_RETURNS, newest_evaluation
@@ -28,18 +30,21 @@ from playground.settings import Section
 _EXACT = "highest"  # precision of matrix products, as in the exported policy
 
 
-def load_exact(path: str | Path, overrides: Sequence[str] = (), interval_events: bool = True) -> LoadedPolicy:
+def load_exact(
+  path: str | Path, overrides: Sequence[str] = (), interval_events: bool = True, model_seed: int | None = None
+) -> LoadedPolicy:
   """Reads a run's newest checkpoint, or the one at `path`, with its task on C MuJoCo, on the CPU.
 
   Args:
     path: a run directory, one of its checkpoints, or `pretrained:<task>`.
     overrides: of the task.
     interval_events: whether pushes and other interval events act.
+    model_seed: of the model, see `load_on_c_physics`.
 
   Raises:
     PlaygroundError: no such run or checkpoint, one that does not fit, or an invalid override.
   """
-  load_task = functools.partial(load_on_c_physics, interval_events=interval_events)
+  load_task = functools.partial(load_on_c_physics, interval_events=interval_events, model_seed=model_seed)
   return load_policy(path, overrides, load_task=load_task, platform="cpu", precision=_EXACT)
 
 
@@ -126,7 +131,8 @@ def load_on_c_physics(
     model_seed: of the model that the startup events draw; None is the nominal model.
 
   Raises:
-    ConfigError: the task has images, and MuJoCo-Warp, which renders them, is not installed.
+    ConfigError: the task has images, and MuJoCo-Warp, which renders them, is not installed, or `model_seed` is given
+      and it has no startup events.
   """
   own = config_dict(config)
   if not interval_events:
@@ -134,6 +140,27 @@ def load_on_c_physics(
   own.impl = "warp" if uses_vision(own) else "jax"  # the smallest model to build; it is not simulated
   env = registry.load(task, config=own)
   if model_seed is not None:
-    for name, value in Randomizer(env.mj_model, own.events).sample(jax.random.PRNGKey(model_seed)).items():
-      getattr(env.mj_model, name)[:] = np.asarray(value)
+    set_fields(env.mj_model, _startup(env, task).sample(jax.random.PRNGKey(model_seed)))
   return on_c_physics(env)
+
+
+def draw_models(env: Env, task: str, number: int, seed: int) -> dict[str, jax.Array]:
+  """Returns the fields of models that the startup events of a task draw, as in training: by name, [number, ...].
+
+  Raises:
+    ConfigError: it has none.
+  """
+  return _startup(env, task).sample_batch(jax.random.split(jax.random.PRNGKey(seed), number))
+
+
+def set_fields(mj_model: mujoco.MjModel, fields: Mapping[str, jax.Array]) -> None:
+  """Changes fields of a model in place."""
+  for name, value in fields.items():
+    getattr(mj_model, name)[:] = np.asarray(value)
+
+
+def _startup(env: Env, task: str) -> Randomizer:
+  randomizer = Randomizer(env.mj_model, env.config.get("events"))
+  if not randomizer.fields:
+    raise ConfigError(f"--randomize: {task} has no events of mode startup here, which draw the model.")
+  return randomizer

@@ -11,6 +11,5 @@ def on_c_physics(env: Env) -> Env:
   """
   task = env.unwrapped
   task.physics = CPhysics(task.mj_model, derived=task.derived)
-  task.redraws = False  # C MuJoCo takes no randomised model
   task.as_configured = False
   return env

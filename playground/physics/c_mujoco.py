@@ -14,12 +14,15 @@ import numpy as np
 from playground.errors import ConfigError
 from playground.physics.backend import STATE_FIELDS, Physics, PhysicsData, mjx
 
+_MODEL_FIELDS = tuple(field.name for field in mjx.Model.fields())
+
 
 class CPhysics(Physics):
   """MuJoCo's own `mj_forward` and `mj_step`, called back from jitted code; see `Physics`.
 
-  A state is complete (`STATE_FIELDS`), so every call sets all of it and nothing is left over from the one before.
-  Within a control step MuJoCo computes in double precision; the state between two steps is single.
+  A state is complete (`STATE_FIELDS`), so every call sets all of it and nothing is left over from the one before. The
+  arrays of a randomised model go with it; what MuJoCo derives from them when it compiles a model stays nominal, as in
+  MJX. Within a control step MuJoCo computes in double precision; the state between two steps is single.
   """
 
   def __init__(self, mj_model: mujoco.MjModel, *, derived: tuple[str, ...]):
@@ -48,25 +51,35 @@ class CPhysics(Physics):
     return self._call(model, data.replace(ctrl=ctrl), num_substeps)
 
   def _call(self, model: mjx.Model, data: PhysicsData, num_substeps: int) -> PhysicsData:
-    if model is not self.model:
-      raise ConfigError("C MuJoCo simulates the model as it is: nothing of it can be randomised.")
     state = {name: getattr(data, name) for name in STATE_FIELDS}
-    run = lambda state: self._run(state, num_substeps)
-    return PhysicsData(**jax.pure_callback(run, self._shapes, state, vmap_method="broadcast_all"))
+    drawn = {name: value for name in _MODEL_FIELDS if (value := getattr(model, name)) is not getattr(self.model, name)}
+    if other := [name for name, value in drawn.items() if not isinstance(value, jax.Array)]:
+      raise ConfigError(f"C MuJoCo takes randomised arrays of a model, and its `{other[0]}` is none.")
+    run = lambda state, drawn: self._run(state, drawn, num_substeps)
+    return PhysicsData(**jax.pure_callback(run, self._shapes, state, drawn, vmap_method="broadcast_all"))
 
-  def _run(self, state: dict[str, np.ndarray], num_substeps: int) -> dict[str, np.ndarray]:
-    """Runs each environment of a batch (any leading axes): `num_substeps` steps, or for 0 a forward pass."""
-    state = {name: np.asarray(value) for name, value in state.items()}
+  def _run(
+    self, state: dict[str, np.ndarray], drawn: dict[str, np.ndarray], num_substeps: int
+  ) -> dict[str, np.ndarray]:
+    """Runs each environment of a batch (any leading axes): `num_substeps` steps, or for 0 a forward pass.
+
+    `drawn` are the fields of its model that are not the nominal ones.
+    """
+    state, drawn = jax.tree.map(np.asarray, (state, drawn))
     batch = state["time"].shape
     out = {name: np.empty((*batch, *shape.shape), shape.dtype) for name, shape in self._shapes.items()}
     with self._lock:
       for i in np.ndindex(batch):
         for name, value in state.items():
           setattr(self._c_data, name, value[i].reshape(np.shape(getattr(self._c_data, name))))
+        for name, value in drawn.items():
+          getattr(self._c_model, name)[:] = value[i]
         if num_substeps:
           mujoco.mj_step(self._c_model, self._c_data, num_substeps)
         else:
           mujoco.mj_forward(self._c_model, self._c_data)
         for name, values in out.items():
           values[i] = np.reshape(getattr(self._c_data, name), self._shapes[name].shape)
+      for name in drawn:
+        getattr(self._c_model, name)[:] = getattr(self.mj_model, name)
     return out

@@ -170,9 +170,6 @@ def test_what_a_batch_does_not_do_is_refused() -> None:
     GymVectorEnv(3, "CartpoleBalance", autoreset_mode="Disabled")
   with pytest.raises(ConfigError, match="render_mode='rgb_array': a batch renders nothing"):
     gymnasium.make_vec("playground/CartpoleBalance", num_envs=3, render_mode="rgb_array")
-  drawn = {"field": "geom_friction", "target": "floor", "column": 0, "operation": "set", "range": [0.4, 1.0]}
-  with pytest.raises(ConfigError, match="use physics='mjx'"):
-    GymEnv("Go1JoystickFlatTerrain", {"events.friction": {"mode": "reset", "func": "model_field", "params": drawn}})
 
 
 def test_a_mask_begins_some_episodes_anew() -> None:

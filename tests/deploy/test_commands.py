@@ -58,7 +58,7 @@ def test_play_with_other_values_of_the_task(
     scores.append(report["scores"])
   assert scores[0] == scores[1]
   assert command("play", str(run), "--episodes", "1", "randomization=none") == 0
-  assert "only events of mode reset act; playground eval" in capsys.readouterr().out
+  assert "only events of mode reset act; --randomize draws it" in capsys.readouterr().out
   for wrong in ("agent.num_envs=2", "env=CheetahRun", "env.episode_lenght=3", "env.episode_length=0"):
     assert command("play", str(run), wrong) == 2
     assert wrong.partition("=")[0] in capsys.readouterr().err
@@ -94,6 +94,31 @@ def test_export_then_play(command: Command, run: Path, capsys: pytest.CaptureFix
   assert command("play", str(run), "--episodes", "1", "--seed", "4") == 0
   report = json.loads((run / "export" / f"play_step_{STEPS:012d}_seed_4_episodes_3.json").read_text())
   assert report["episodes"] == 3, "fewer episodes do not replace more"
+
+
+def test_play_on_randomised_models(
+  command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  run = shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("export"))
+  assert command("play", str(run), "--randomize") == 2
+  assert "CartpoleBalance has no events of mode startup here" in capsys.readouterr().err
+  params = "{field: body_mass, target: all, operation: scale, range: [0.1, 10]}"
+  event = f"+env.events.masses={{mode: startup, func: model_field, params: {params}}}"
+  drawn: list[Any] = []
+  measure = play.measure
+  monkeypatch.setattr(play, "measure", lambda *args: (drawn.append(args[-1]), measure(*args))[1])
+  films: list[Any] = []
+  monkeypatch.setattr(play, "render_video", lambda model, **_: films.append(model))
+  assert command("play", str(run), "--episodes", "3", "--randomize", "--video", str(tmp_path / "a.mp4"), event) == 0
+  assert "mean of 3 episodes, randomised models" in " ".join(capsys.readouterr().out.split())
+  (masses,) = (np.asarray(models["body_mass"]) for models in drawn)
+  assert len(np.unique(masses[:, 1])) == 3
+  np.testing.assert_allclose(films[0].body_mass, masses[0], rtol=1e-6)
+  (file,) = (run / "export").glob("play_*_randomized*.json")
+  assert json.loads(file.read_text())["randomized"] is True
+  assert command("play", str(run), "--episodes", "3", event) == 0
+  other = json.loads(next((run / "export").glob("play_*_episodes_3_[!r]*.json")).read_text())
+  assert "randomized" not in other and other["scores"] != json.loads(file.read_text())["scores"]
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """C MuJoCo behind a task: one control step as MJX takes it, batches, and what it refuses."""
 
 import copy
+import operator
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,10 @@ def rolled(env: Env, steps: int) -> State:
   for _ in range(steps):
     state = step(state, action)
   return state
+
+
+def rolled_on(env: Env, state: State, action: jax.Array) -> jax.Array:
+  return jax.jit(env.step)(state, action).data.qvel
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -69,10 +74,37 @@ def test_an_unstable_simulation_shows_its_numbers() -> None:
   assert not np.isfinite(np.asarray(after.qpos)).all()  # MuJoCo's own way is to begin anew
 
 
-def test_a_randomised_model_is_refused() -> None:
-  env = on_c("CartpoleBalance")
-  with pytest.raises(ConfigError, match="nothing of it can be randomised"):
-    jax.eval_shape(env.jitted[0], jax.random.PRNGKey(0), {"dof_damping": jnp.ones(2)}, {})
+def test_each_environment_of_a_batch_has_its_randomised_model() -> None:
+  env, mjx = on_c("CartpoleBalance"), compiled_task("CartpoleBalance")
+  action, damping = jnp.full(1, 0.5), jnp.array([[0.0, 0.0], [5e-4, 2e-6], [5.0, 0.5]])
+  state = rolled(env, 3)
+  step = lambda fields: env.step(state, action, env.mjx_model.replace(**fields)).data.qvel
+  ours = jax.jit(jax.vmap(step))({"dof_damping": damping})
+  assert len(np.unique(ours[:, 0])) == 3
+  for qvel, each in zip(ours, damping, strict=True):
+    theirs = mjx.step(state, action, load_task("CartpoleBalance").mjx_model.replace(dof_damping=each))
+    np.testing.assert_allclose(qvel, theirs.data.qvel, atol=1e-5)
+  nominal = rolled_on(env, state, action)
+  np.testing.assert_array_equal(nominal, rolled_on(on_c("CartpoleBalance"), state, action))
+
+
+@pytest.mark.slow
+def test_each_episode_has_the_model_that_events_draw() -> None:
+  params = {"field": "body_mass", "target": "all", "operation": "scale", "range": [0.5, 2.0], "shared": True}
+  heavier = {"events.mass": {"mode": "reset", "func": "model_field", "params": params}}
+  env = on_c_physics(load_task("Go1JoystickFlatTerrain", {"impl": "jax", **heavier}))
+  states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 2))
+  light, heavy = (jax.tree.map(operator.itemgetter(i), states) for i in range(2))
+  step, action = jax.jit(env.step), jnp.zeros(env.action_size)
+  other = light.replace(info=light.info | {name: heavy.info[name] for name in heavy.info if "model" in name})
+  assert (step(light, action).data.qvel != step(other, action).data.qvel).any()
+
+
+def test_what_is_no_array_of_the_model_is_refused() -> None:
+  physics = on_c("CartpoleBalance").physics
+  other = physics.model.replace(opt=physics.model.opt.replace(gravity=jnp.zeros(3)))
+  with pytest.raises(ConfigError, match="randomised arrays of a model, and its `opt` is none"):
+    physics.forward(other, physics.make())
 
 
 @pytest.mark.slow
