@@ -109,10 +109,10 @@ class Randomizer:
 
   def __init__(self, mj_model: mujoco.MjModel, events: Mapping[str, Any], mode: str = "startup"):
     """Binds those of `env.events` of func `model_field` and this mode to a model, whose values are the nominal ones."""
-    self._draws = [
-      _bind(mj_model, term, f"env.events.{name}.params") for name, term in model_fields(events, mode).items()
-    ]
-    self.fields: tuple[str, ...] = tuple(dict.fromkeys(slot.field for draw in self._draws for slot in draw.slots))
+    terms = model_fields(events, mode)
+    self._draws = {name: _bind(mj_model, term, f"env.events.{name}.params") for name, term in terms.items()}
+    slots = (slot for draw in self._draws.values() for slot in draw.slots)
+    self.fields: tuple[str, ...] = tuple(dict.fromkeys(slot.field for slot in slots))
     self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
 
   def sample(self, key: jax.Array, model: mjx.Model | None = None) -> dict[str, jax.Array]:
@@ -122,7 +122,7 @@ class Randomizer:
     """
     start = self._nominal if model is None else {field: getattr(model, field) for field in self.fields}
     values = {field: jnp.asarray(value) for field, value in start.items()}
-    for draw in self._draws:
+    for draw in self._draws.values():
       key, draw_key = jax.random.split(key)
       drawn, operation = draw(draw_key), _OPERATIONS[draw.term.operation]
       for field, index, sign in draw.slots:
@@ -136,7 +136,18 @@ class Randomizer:
 
   def describe(self) -> list[dict[str, str]]:
     """Returns one row per term for people: `ModelField.describe`, and the number of values drawn."""
-    return [draw.term.describe() | {"values": str(draw.count)} for draw in self._draws]
+    return [draw.term.describe() | {"values": str(draw.count)} for draw in self._draws.values()]
+
+  def without_nominal(self) -> list[str]:
+    """Returns a sentence for each term that sets values in a range in which the nominal ones are not."""
+    found = []
+    for name, draw in self._draws.items():
+      nominal = np.concatenate([np.ravel(slot.sign * self._nominal[slot.field][slot.index]) for slot in draw.slots])
+      if draw.term.operation == "set" and draw.term.range:
+        low, high = draw.term.range
+        if others := sorted({f"{value:g}" for value in nominal if not low <= value <= high}):
+          found.append(f"env.events.{name} draws {low:g} to {high:g}, and the nominal model has {', '.join(others)}.")
+    return found
 
 
 def model_fields(events: Mapping[str, Any] | None, mode: str = "startup") -> dict[str, ModelField]:

@@ -326,6 +326,13 @@ def test_describe(go1: mujoco.MjModel) -> None:
   }  # fmt: skip
 
 
+def test_a_range_without_the_nominal_value_is_said(go1: mujoco.MjModel) -> None:
+  assert Randomizer(go1, GO1).without_nominal() == []
+  assert Randomizer(model_of("aero_hand"), shipped("aero_hand")).without_nominal() == [
+    "env.events.fingertip_friction draws 0.5 to 1, and the nominal model has 0.2."
+  ]
+
+
 GOOD = {"field": "body_mass", "target": "hand", "operation": "scale", "range": [0.9, 1.1]}
 
 

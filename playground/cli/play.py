@@ -27,6 +27,7 @@ from playground.hardware.mesh import make_mesh
 from playground.hardware.setup import setup, this_machine
 from playground.learning.checkpoints import of_a_better_one
 from playground.learning.evaluation import make_evaluator
+from playground.randomization import Randomizer
 from playground.rendering.video import need_camera, need_place, render_video
 from playground.runs.callbacks import episodes_of
 from playground.runs.csv_tracker import OTHER_RETURNS
@@ -102,7 +103,9 @@ def play(
     opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
   exported, env = opened.exported, opened.env
   better = of_a_better_one(path, opened.trained.checkpoint) if opened.trained else ()
-  for sentence in (*better, *of_events_that_are_off(env.config, overrides)):
+  unlike = [] if randomize else Randomizer(env.mj_model, env.config.get("events")).without_nominal()
+  unlike = [f"{sentence} --randomize plays on models like those of training." for sentence in unlike]
+  for sentence in (*better, *of_events_that_are_off(env.config, overrides), *unlike):
     console.print(sentence, soft_wrap=True, markup=False, highlight=False)
   need_camera(env.mj_model, camera, "--camera")
   if viewer:
