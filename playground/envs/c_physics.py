@@ -10,6 +10,6 @@ def on_c_physics(env: Env) -> Env:
   MuJoCo-Warp still renders the images of `env.vision`, from the states of C MuJoCo.
   """
   task = env.unwrapped
-  task.physics = CPhysics(task.mj_model, derived=task.derived)
+  task.physics = CPhysics(task.physics)
   task.as_configured = False
   return env

@@ -25,10 +25,11 @@ class CPhysics(Physics):
   MJX. Within a control step MuJoCo computes in double precision; the state between two steps is single.
   """
 
-  def __init__(self, mj_model: mujoco.MjModel, *, derived: tuple[str, ...]):
-    """Takes a model and the names out of `DERIVED_FIELDS` that the task reads."""
-    super().__init__(mj_model, derived=derived)
-    self._c_model = copy.copy(mj_model)
+  def __init__(self, other: Physics):
+    """Simulates the model of `other`, a task's physics in MJX, and keeps its `model`, which is rendered."""
+    super().__init__(other.mj_model, derived=other.derived)
+    self.model = other.model
+    self._c_model = copy.copy(other.mj_model)
     # C MuJoCo would reset an unstable simulation. Its numbers should show instead, as in MJX.
     self._c_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     self._c_data = mujoco.MjData(self._c_model)
@@ -36,13 +37,15 @@ class CPhysics(Physics):
     example = self._keep(self._template())
     self._shapes = {
       name: jax.ShapeDtypeStruct(np.shape(value), value.dtype)
-      for name in (*STATE_FIELDS, *derived)
+      for name in (*STATE_FIELDS, *self.derived)
       if (value := getattr(example, name)) is not None
     }
 
   def __deepcopy__(self, memo: dict[int, object]) -> "CPhysics":
     """Returns a simulator of its own, for Python cannot copy a lock."""
-    return CPhysics(copy.deepcopy(self.mj_model, memo), derived=self.derived)
+    other = copy.copy(self)
+    other.mj_model = copy.deepcopy(self.mj_model, memo)
+    return CPhysics(other)
 
   def forward(self, model: mjx.Model, data: PhysicsData) -> PhysicsData:
     return self._call(model, data, 0)

@@ -51,7 +51,6 @@ class Vision(Wrapper):
       raise ConfigError(f"env.vision.brightness={list(brightness)}: geoms have no brightness, leave it [1.0, 1.0].")
     self._image, self._camera, self._farthest = config.image, config.camera, config.farthest
     self._frames, self._brightness = config.frames, brightness
-    self._warp_model = env.mjx_model  # the model to render, also where the task is simulated elsewhere (`c_physics.py`)
     size = {"width": config.width, "height": config.height}
     kind = "rgb" if self._image in ("rgb", "gray") else self._image
     visuals = {"shadows": config.shadows, "textures": config.textures}
@@ -101,7 +100,7 @@ class Vision(Wrapper):
     self, data: PhysicsData, info: Mapping[str, PyTree], model: mjx.Model | None
   ) -> tuple[jax.Array, PhysicsData]:
     """Renders the current image, [height, width, channels] uint8; also returns the state to continue with."""
-    shown: Any = self.env.model_of(info, self._warp_model if model is None else model)
+    shown: Any = self.env.model_of(info, model)
     images, data = self._renderer.render(shown, data)
     seen = images[self._camera]
     if self._image == "depth":

@@ -111,12 +111,15 @@ def test_what_is_no_array_of_the_model_is_refused() -> None:
 def test_a_task_sees_what_c_mujoco_simulates() -> None:
   size = {"vision.width": 24, "vision.height": 24, "vision.frames": 1}
   load = lambda: registry.load("CartpoleBalanceVision", overrides=size)
-  seen = {}
+  seen, dark = {}, {}
   for name, env in {"c": on_c_physics(load()), "warp": load()}.items():
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     step = jax.jit(env.step)
     states = [state, *(state := step(state, jnp.ones(1)) for _ in range(10))]
+    dark[name] = env.reset(jax.random.PRNGKey(0), env.mjx_model.replace(mat_rgba=0.5 * env.mjx_model.mat_rgba)).obs
     seen[name] = np.stack([state.obs["pixels/fixed"] for state in states]).astype(float)
   np.testing.assert_array_equal(seen["c"][0], seen["warp"][0])
+  np.testing.assert_array_equal(dark["c"]["pixels/fixed"], dark["warp"]["pixels/fixed"])
+  assert dark["c"]["pixels/fixed"].mean() < 0.8 * seen["c"][0].mean()
   assert (seen["c"][-1] != seen["c"][0]).sum() > 10  # the cart drives off
   assert (np.abs(seen["c"] - seen["warp"]) > 2).mean() < 0.01  # but for pixels on an edge
