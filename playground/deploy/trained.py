@@ -5,7 +5,6 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import mujoco
@@ -141,9 +140,9 @@ def load_on_c_physics(
   own.impl = "warp" if uses_vision(own) else "jax"  # the smallest model to build; it is not simulated
   env = registry.load(task, config=own)
   if model_seed is not None:
-    fields: Any = _startup(env, task).sample(jax.random.PRNGKey(model_seed))
+    fields = _startup(env, task).sample(jax.random.PRNGKey(model_seed))
     set_fields(env.mj_model, fields)
-    env.physics.model = env.mjx_model.tree_replace(fields)
+    env.physics.model = env.mjx_model.replace(**fields)
   return on_c_physics(env)
 
 
