@@ -142,9 +142,9 @@ class Randomizer:
     """Returns a sentence for each term that sets values in a range in which the nominal ones are not."""
     found = []
     for name, draw in self._draws.items():
-      nominal = np.concatenate([np.ravel(slot.sign * self._nominal[slot.field][slot.index]) for slot in draw.slots])
       if draw.term.operation == "set" and draw.term.range:
         low, high = draw.term.range
+        nominal = np.concatenate([np.ravel(slot.sign * self._nominal[slot.field][slot.index]) for slot in draw.slots])
         if others := sorted({f"{value:g}" for value in nominal if not low <= value <= high}):
           found.append(f"env.events.{name} draws {low:g} to {high:g}, and the nominal model has {', '.join(others)}.")
     return found

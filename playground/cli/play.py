@@ -131,10 +131,10 @@ def play(
     run = opened.trained.run_dir.path if opened.trained else None
     save(out, result, console, run)
   if film:
-    drawn_model = copy.copy(env.mj_model)
-    set_fields(drawn_model, {name: values[0] for name, values in models.items()})
+    filmed = copy.copy(env.mj_model)
+    set_fields(filmed, {name: values[0] for name, values in models.items()})
     render_video(
-      drawn_model,
+      filmed,
       out_path=film,
       dt=env.dt * env.action_repeat,
       camera=camera,
