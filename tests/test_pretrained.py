@@ -57,8 +57,8 @@ def test_a_task_without_one_is_refused() -> None:
 
 @pytest.mark.parametrize("change", [lambda file: file.unlink(), lambda file: file.write_bytes(b"other")])
 def test_another_file_is_refused(change: Any, policies: Path) -> None:
-  change(policies / TASK / "export/policy.onnx")
-  with pytest.raises(CheckpointError, match=r"policy\.onnx is not the file that was trained"):
+  change(next((policies / TASK).glob("checkpoints/*/policy/manifest.ocdbt")))
+  with pytest.raises(CheckpointError, match=r"manifest\.ocdbt is not the file that was trained"):
     locate(f"pretrained:{TASK}")
 
 

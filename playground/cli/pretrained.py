@@ -10,7 +10,6 @@ from playground import catalog, pretrained
 from playground.cli.list_tasks import wide_console
 from playground.cli.play import play
 from playground.config import task_names
-from playground.deploy.export import export_run
 from playground.deploy.scores import read_scores, result_name
 from playground.errors import ConfigError
 from playground.files import need_folder
@@ -42,7 +41,7 @@ def show_policies(console: Console | None = None) -> int:
 
 
 def add_policy(path: str, note: str = "", replace: bool = False) -> int:
-  """Exports a run's newest policy, measures it in C MuJoCo and copies it, with its card, into the package.
+  """Measures a run's newest policy in C MuJoCo and copies it, with its card, into the package.
 
   Args:
     path: a run directory, or that of a chain.
@@ -80,7 +79,6 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   need_folder(result.parent, str(result.parent), run.path)
   need_folder(pretrained.POLICIES, str(pretrained.POLICIES))
   scores = read_scores(result) if result.exists() else None
-  export_run(path)
   if scores is None:
     play(path, episodes=_EPISODES)
     scores = read_scores(result)

@@ -461,15 +461,15 @@ def of_a_better_one(named: str | Path, newest: Checkpoint) -> list[str]:
   return [f"The newest checkpoint returned {now:.4g} in training, {best} {reached:.4g}: name that one to take it."]
 
 
-def round_policy(folder: str | Path, bits: int, chosen: Callable[[str], bool]) -> None:
-  """Rounds arrays of a checkpoint's item 'policy' to fewer significant bits, and removes the path of its run.
+def round_policy(folder: str | Path, bits: Callable[[str], int | None]) -> None:
+  """Rounds arrays of a checkpoint's item 'policy' to fewer significant bits, and removes the paths of its run.
 
   The dtype stays. The files are compressed: those of arrays of 4 bits take about a fifth of the space.
 
   Args:
     folder: the checkpoint.
-    bits: significant bits that stay, of 24.
-    chosen: whether to round the array of that name, such as `.params.value['params']['hidden_0']['kernel']`.
+    bits: returns how many significant bits of 24 stay of the array of a name, such as
+      `.params.value['params']['hidden_0']['kernel']`; None keeps it as it is.
 
   Raises:
     CheckpointError: as `Checkpoint` does.
@@ -477,14 +477,14 @@ def round_policy(folder: str | Path, bits: int, chosen: Callable[[str], bool]) -
   checkpoint = Checkpoint(folder)
   arrays, meta = checkpoint.arrays("policy"), checkpoint.meta
   for i, (name, _, dtype) in enumerate(meta["leaves"]["policy"]):
-    if chosen(name):
+    if kept := bits(name):
       mantissa, exponent = np.frexp(arrays[i].astype(np.float64))
-      arrays[i] = np.ldexp(np.round(mantissa * 2**bits) / 2**bits, exponent).astype(dtype)
+      arrays[i] = np.ldexp(np.round(mantissa * 2**kept) / 2**kept, exponent).astype(dtype)
   with _quiet_threads(), ocp.StandardCheckpointer() as checkpointer:
     checkpointer.save(checkpoint.path / "policy", _numbered(arrays), force=True)
   compress(checkpoint.path / "policy")
   meta["sha256"]["policy"] = checksum(arrays)
-  meta["config"]["run_dir"] = None
+  meta["config"].update(run_dir=None, resume=None)
   meta["meta_sha256"] = _meta_checksum(meta)
   (checkpoint.path / "meta" / "metadata").write_text(json.dumps(meta))
 

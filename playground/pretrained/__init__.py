@@ -1,8 +1,8 @@
 """Policies that come with the package: `pretrained:<task>` wherever a run or a checkpoint is named.
 
 Each is a run directory in `policies/<task>/` without what only resuming needs: configuration, evaluations, the newest
-checkpoint's policy, the ONNX file with its contract, and `card.yaml`: how it was trained, what it reaches, and the
-SHA-256 of every file. `playground pretrained` lists them; `add` makes one from a run.
+checkpoint's policy, and `card.yaml`: how it was trained, what it reaches, and the SHA-256 of every file. `playground
+pretrained` lists them, `playground export` writes the ONNX file of one, and `add` makes one from a run.
 """
 
 import csv
@@ -24,6 +24,7 @@ from playground.settings import Plain, Section
 PREFIX = "pretrained:"
 POLICIES = Path(__file__).parent / "policies"
 CARD = "card.yaml"
+ACTOR_BITS = 11  # of kernels: what TensorFloat-32, in which GPUs multiply, reads of them
 CRITIC_BITS = 4
 _COPIES = Path("results/pretrained")
 _PATIENCE_S = 60.0  # for the copies of other processes
@@ -141,9 +142,11 @@ def copy_policy(run: Path, folder: Path) -> None:
   shutil.copytree(step, folder / "checkpoints" / step.name, ignore=shutil.ignore_patterns("state", "replay"))
 
 
-def _is_critic(name: str) -> bool:
-  """Whether an array of a checkpoint is learned and not the actor's: acting does not read it, fine-tuning does."""
-  return name.startswith(".params.") and not name.startswith(".params.policy")
+def _bits(name: str) -> int | None:
+  """Significant bits that a policy keeps of an array; None keeps all, of the actor's biases and of statistics."""
+  if name.startswith(".params.policy"):
+    return ACTOR_BITS if "kernel" in name else None
+  return CRITIC_BITS if name.startswith(".params.") else None  # acting does not read it, fine-tuning does
 
 
 def _forget_machine(folder: Path) -> None:
@@ -173,11 +176,12 @@ def _keep_evaluations(metrics: Path) -> None:
 def add(run: Path, task: str, entries: Section) -> Path:
   """Copies a run's policy into the package and writes its card.
 
-  The critic is rounded to `CRITIC_BITS` significant bits, which makes its files a quarter; actions stay the same, and
-  values of the G1's critic change by 4 % of their standard deviation.
+  The actor's kernels are rounded to `ACTOR_BITS` significant bits, which makes its files half: actions, of -1 to 1,
+  change by 0.0001 to 0.0005 on average. The critic is rounded to `CRITIC_BITS`, which makes its files a quarter:
+  values of the G1's change by 4 % of their standard deviation.
 
   Args:
-    run: a run directory with `export/policy.onnx`.
+    run: a run directory.
     task: its task.
     entries: entries of the card beside the files' hashes.
 
@@ -196,12 +200,9 @@ def _build(run: Path, folder: Path, entries: Section) -> Path:
 
   copy_policy(run, folder)
   for checkpoint in (folder / "checkpoints").iterdir():
-    round_policy(checkpoint, CRITIC_BITS, _is_critic)
+    round_policy(checkpoint, _bits)
   _forget_machine(folder)
   _keep_evaluations(folder / "metrics.csv")
-  (folder / "export").mkdir()
-  for name in ("policy.onnx", "policy.yaml"):
-    shutil.copyfile(run / "export" / name, folder / "export" / name)
   files = sorted(path for path in folder.rglob("*") if path.is_file())
   hashes = {str(path.relative_to(folder)): _sha256(path) for path in files}
   (folder / CARD).write_text(yaml.safe_dump({**entries, "sha256": hashes}, sort_keys=False, width=120))
