@@ -50,11 +50,13 @@ API = {
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-  """Puts the generated pages into the navigation."""
+  """Puts the generated pages into the navigation, and removes links to edit a page where there is no repository."""
   assert config.nav is not None, "mkdocs.yml has one"
   api = [{title: [{name: _api_uri(name)} for name in names]} for title, names in _api().items()]
   terms = {"terms": [{kind: _uri("configs", f"terms {kind}")} for kind in MODULES]}
   config.nav.append({"Reference": [{"Python": api}, {"Configuration": [*_navigation(), terms]}]})
+  if not config.repo_url:
+    config.edit_uri = None  # MkDocs warns of each page's otherwise, and warnings end the build
   return config
 
 

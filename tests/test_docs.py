@@ -366,6 +366,15 @@ def test_every_key_of_the_reference_has_a_meaning_on_a_short_page():
 
 
 @pytest.mark.slow
+def test_the_site_builds_without_a_repository(tmp_path: Path):
+  command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(tmp_path / "site")]
+  environment = {name: value for name, value in os.environ.items() if name != "REPOSITORY"}
+  done = subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
+  assert done.returncode == 0, done.stdout + done.stderr
+  assert "edit/main" not in (tmp_path / "site/tutorial.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
 def test_the_site_builds_with_every_link_and_reference_found(tmp_path: Path):
   command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(tmp_path / "site")]
   environment = os.environ | {"REPOSITORY": "https://example.org/me/fork"}
