@@ -96,10 +96,11 @@ def _environment(config: HardwareConfig) -> None:
   exported = os.environ.get("XLA_FLAGS", "").split()
   added = [flag for flag in config.xla_flags.split() if known(flag) and flag not in exported]
   if added:  # a chain calls this often
-    os.environ["XLA_FLAGS"] = " ".join([*exported, *added])
     from jax._src.xla_bridge import backends_are_initialized  # JAX has no public name for it
 
-    if backends_are_initialized():
+    if not backends_are_initialized():
+      os.environ["XLA_FLAGS"] = " ".join([*exported, *added])
+    else:  # the variable stays: processes started from here, and keys of JAX's cache, read it
       what = "does not act: JAX has started in this process already. Train in a new process, or export XLA_FLAGS first."
       warnings.warn(f"hardware.xla_flags={' '.join(added)} {what}", stacklevel=3)
 
