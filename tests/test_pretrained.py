@@ -148,5 +148,4 @@ def test_what_the_card_says_is_met(task: str, tmp_path: Path, monkeypatch: pytes
   scores = json.loads(next(Path(path).glob("export/play_step_*_seed_1_*.json")).read_text())["scores"]
   # A task that begins alike every time has hardly a deviation: another machine may differ by a thousandth.
   standard_error = max(card["return_std"] / card["episodes"] ** 0.5, 1e-3 * abs(card["return"]))
-  fall = card["return"] / card["episodes"]  # at most: the card's episodes may have been without a rare one
-  assert scores["episode_reward"] >= card["return"] - 4 * standard_error - fall
+  assert scores["episode_reward"] >= card["return"] - 4 * standard_error
