@@ -148,7 +148,10 @@ def _parser() -> argparse.ArgumentParser:
   pretrained = add("pretrained", _pretrained, "List the policies that come with the package, or add a run's.")
   pretrained.add_argument("--add", metavar="RUN", help="measure a run's policy in C MuJoCo and put it into the package")
   pretrained.add_argument(
-    "--note", default="", metavar="TEXT", help="with --add: a remark on the training, for its card"
+    "--note",
+    default="",
+    metavar="TEXT",
+    help="with --add: a remark on the training, for its card; 'solved: <why>' sets its status",
   )
   pretrained.add_argument("--replace", action="store_true", help="with --add: replace the policy of the same task")
   sweep = add("sweep", _sweep, "Show a sweep, collect its results, or run its missing jobs.")

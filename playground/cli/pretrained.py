@@ -89,7 +89,7 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   card = {
     "task": task,
     "agent": config["choices"]["agent"],
-    "status": _status(scores),
+    "status": _status(scores, note),
     "steps": steps,
     "seed": config["seed"],
     "command": " ".join(["playground-run", *(o for o in started.overrides if not o.startswith("run_dir="))]),
@@ -118,8 +118,8 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   return 0
 
 
-def _status(scores: dict[str, float]) -> catalog.Status:
-  """Returns the catalogue's status for a policy's scores in C MuJoCo."""
+def _status(scores: dict[str, float], note: str) -> catalog.Status:
+  """Returns the catalogue's status for a policy's scores in C MuJoCo, and the note of its card."""
   measured = {"falls_per_episode": "episode_fall", "success": "episode_success"}
   row = {column: str(scores[name]) for column, name in measured.items() if name in scores}
-  return catalog.status({"note": "", "final_return": str(scores["episode_reward"]), **row})
+  return catalog.status({"note": note, "final_return": str(scores["episode_reward"]), **row})

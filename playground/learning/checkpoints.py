@@ -464,7 +464,7 @@ def of_a_better_one(named: str | Path, newest: Checkpoint) -> list[str]:
 def round_policy(folder: str | Path, bits: Callable[[str], int | None]) -> None:
   """Rounds arrays of a checkpoint's item 'policy' to fewer significant bits, and removes the paths of its run.
 
-  The dtype stays. The files are compressed: those of arrays of 4 bits take about a fifth of the space.
+  The dtype stays. The files are compressed: those of arrays of 3 bits take about a fifth of the space.
 
   Args:
     folder: the checkpoint.
