@@ -641,6 +641,20 @@ def test_resume_takes_the_runs_own_configuration(run: Path):
   assert resumed.resume == resumed.run_dir == str(run)
 
 
+def test_a_group_of_hardware_keeps_a_resumed_runs_precision_and_flags(configs: Path, tmp_path: Path):
+  """Else `resume=<run> hardware=multi_node` would not end with the bits of an uninterrupted run."""
+  flags = "--xla_cpu_use_fusion_emitters=false"
+  line = ["env=CartpoleBalance", f"hardware.xla_flags='{flags}'", "hardware.network_precision=high"]
+  started = compose(line, configs)
+  run = RunDirectory.create(tmp_path / "exact", started.resolved).path
+  kept = compose([f"resume={run}", "hardware=gpu_x2"], configs).hardware
+  assert (kept.devices, kept.xla_flags, kept.network_precision) == (2, flags, "high")
+  mine = "# @package hardware\ndefaults: [gpu_x2, _self_]\nmatmul_precision: float32\n"
+  (configs / "hardware/mine.yaml").write_text(mine)
+  other = compose([f"resume={run}", "hardware=mine", "hardware.xla_flags="], configs).hardware
+  assert (other.matmul_precision, other.xla_flags, other.network_precision) == ("float32", "", "high")
+
+
 def test_a_resumed_run_may_train_longer_with_evaluations_as_far_apart(run: Path):
   before = compose([f"resume={run}"]).agent
   after = compose([f"resume={run}", f"agent.num_timesteps={3 * before.num_timesteps}"]).agent

@@ -66,6 +66,7 @@ from playground.config.schema import check_key, check_removed, fit, is_term, is_
 from playground.config.sweep_options import SweepSettings
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
+from playground.hardware.options import HardwareConfig
 from playground.learning.hyperparameters import config_class
 from playground.mdp.options import is_model_field
 from playground.pretrained import locate
@@ -73,9 +74,11 @@ from playground.settings import Plain, Section, build, defaults, select
 from playground.text import first_line, format_value, join, wrong_type
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ in a resumed run
+_NUMERICS = ("matmul_precision", "network_precision", "xla_flags")  # of `hardware`: results depend on them
 _BUDGET = "agent.num_timesteps"  # may be larger in one
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that define the keys, in this order
 _SWEEP_SECTIONS = ("launcher", "search")
+_HARDWARE = defaults(HardwareConfig)
 _CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
@@ -447,6 +450,10 @@ def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path
   schema = _plain(fresh)
   chosen = {o.key for o in parsed if o.is_group}
   sections = {s: schema[s] if s in chosen else saved[s] for s in _RESUMABLE}
+  if "hardware" in chosen:  # what the group does not set stays the run's
+    group, before = schema["hardware"], saved["hardware"]
+    kept = {key: before[key] for key in _NUMERICS if key in before and group[key] == _HARDWARE[key]}
+    sections["hardware"] = {**group, **kept}
   values = [o for o in parsed if not o.is_group and o.key not in ("resume", _BUDGET)]
   changed = _apply(_literal(sections), values, {s: schema[s] for s in sections})
   for longer in (o for o in parsed if o.key == _BUDGET):

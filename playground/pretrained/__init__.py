@@ -177,8 +177,8 @@ def add(run: Path, task: str, entries: Section) -> Path:
   """Copies a run's policy into the package and writes its card.
 
   The actor's kernels are rounded to `ACTOR_BITS` significant bits, which makes its files half: actions, of -1 to 1,
-  change by 0.0001 to 0.0005 on average. The critic is rounded to `CRITIC_BITS`, which makes its files a fifth: values of
-  Barkour's change by 7 % of their standard deviation, with random observations.
+  change by 0.0001 to 0.0005 on average. The critic is rounded to `CRITIC_BITS`, which makes its files a fifth: values
+  of Barkour's change by 7 % of their standard deviation, with random observations.
 
   Args:
     run: a run directory.
