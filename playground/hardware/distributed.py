@@ -226,7 +226,7 @@ class _Watch:
     self.notes: list[Callable[[str], None]] = []
     self.client: Any = None  # JAX has no public type for it
     self._index, self._count, self._coordinator = index, count, coordinator
-    self._leaving, self._first_left = threading.Event(), threading.Event()
+    self._leaving = threading.Event()
     self._lock = threading.Lock()
 
   def start(self) -> None:
@@ -266,8 +266,6 @@ class _Watch:
       time.sleep(2 * _PERIOD_S)  # the store ends with this process: the others must read it first
 
   def _part(self) -> None:
-    if self._index > 0 and not self._leaving.is_set():
-      self._first_left.wait()  # it may render videos for long; JAX aborts a process that waits for others for 300 s
     self._leaving.set()
     self._thread.join()  # a thread that returns from JAX while Python ends aborts the process
     with contextlib.suppress(Exception):  # process 0 may have gone
@@ -289,8 +287,6 @@ class _Watch:
           seen[i] = time.monotonic()
         if signs[i] != _LEFT and time.monotonic() - seen[i] > self.lost_after:
           self._lost(f"process {i} has given no sign of life for hardware.distributed.lost_after={self.lost_after:g} s")
-      if signs[0] == _LEFT:
-        self._first_left.set()
       if self._leaving.wait(_PERIOD_S):
         return
 
