@@ -157,7 +157,7 @@ def reached_return(row: dict[str, str]) -> float:
 
 
 def run_name(row: dict[str, str]) -> str:
-  """Returns a run's agent, with a chain's stage, its first policy's task, mirrored data, and pushes that are off."""
+  """Returns a run's agent, with a chain's stage, its first policy's task, Warp, mirrored data, and absent pushes."""
   setting = row["setting"]
   chain = f", {row['experiment']}'s {stage}" if (stage := _stage_of(row)) else ""
   start = re.search(r"init_from=<(\w+)>", setting)
@@ -165,6 +165,7 @@ def run_name(row: dict[str, str]) -> str:
     row["agent"].split(",")[0].replace("agent.", "")
     + chain
     + (f", from {start.group(1)}" if start else "")
+    + ", on Warp" * ("env.impl=warp" in setting)
     + ", mirrored data" * ("agent.mirror_augmentation=true" in setting)
     + ", without mirrored data" * ("agent.mirror_augmentation=false" in setting)
     + ", no pushes, nothing randomised" * bool(_NO_PUSHES.search(setting))

@@ -37,7 +37,7 @@ _NUMBERS = {  # columns of a table of runs -> whether each row has one
   **dict.fromkeys(("final_mode_return", "success", "turns", "falls_per_episode"), False),
 }
 # Settings that have columns of their own.
-_BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env=\w+| \(learning\)")
+_BUDGET = re.compile(r"(agent\.num_timesteps|agent\.num_evals)=\S+|env(\.impl)?=\w+| \(learning\)")
 _SHORT = {"agent.": "", "curriculum.": ""}
 _COLUMNS, _FIGURE = ("task", "run", "physics", "M steps", "return"), "success or falls"
 _LONG = 60  # characters of a setting
