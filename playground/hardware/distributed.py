@@ -30,7 +30,8 @@ from playground.text import first_line
 
 T = TypeVar("T")
 
-PREFLIGHT = "preflight"  # name of the threads that may hang
+PREFLIGHT = "preflight"  # name of threads that may hang: a process that has one does not wait for it at its end
+_HEARTBEAT = "heartbeat"  # of the watch's, which waits for it
 _STORE = "playground"  # our folder in the coordinator's key-value store
 _WEEK_MS = 7 * 24 * 3600 * 1000  # longer than processes wait for each other; JAX wants a limit
 _PERIOD_S = 1.0  # s between two heartbeats
@@ -276,7 +277,7 @@ class _Watch:
     seen = dict.fromkeys(signs, time.monotonic())
     for beat in itertools.count():
       try:
-        store = _within(lambda beat=beat: self._exchange(str(beat)), self.lost_after, "")
+        store = _within(lambda beat=beat: self._exchange(str(beat)), self.lost_after, "", _HEARTBEAT)
       except HardwareError:  # process 0 does not answer: its heartbeat is missing, too
         store = {}
       if _FAILED in store:
@@ -342,7 +343,7 @@ def _sign_of(index: int) -> str:
 _watch: _Watch | None = None  # this process's, once it has joined others
 
 
-def _within(call: Callable[[], T], seconds: float | None, otherwise: str) -> T:
+def _within(call: Callable[[], T], seconds: float | None, otherwise: str, name: str = PREFLIGHT) -> T:
   """Returns the result of a call that a signal can interrupt; raises HardwareError if it hangs or fails."""
   outcome: Future[T] = Future()
 
@@ -352,7 +353,7 @@ def _within(call: Callable[[], T], seconds: float | None, otherwise: str) -> T:
     except Exception as error:  # any error of the runtime
       outcome.set_exception(error)
 
-  _start_thread(run, PREFLIGHT).join(seconds)
+  _start_thread(run, name).join(seconds)
   if not outcome.done():
     raise HardwareError(f"hardware=multi_node: {otherwise}.")
   try:

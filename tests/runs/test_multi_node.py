@@ -69,6 +69,26 @@ def test_processes_with_different_checkpoints_are_refused(tmp_path: Path) -> Non
   assert all(out.strip().endswith(sentence) for out in said), said
 
 
+SLOW_HEARTBEATS = """
+import time
+from playground.hardware.distributed import _Watch
+
+exchange = _Watch._exchange
+
+def slow(self, sign):
+  time.sleep(8 * (self._index == 0))
+  return exchange(self, sign)
+
+_Watch._exchange = slow
+"""
+
+
+def test_a_heartbeat_under_way_does_not_end_process_0_before_the_others(tmp_path: Path) -> None:
+  """The others would lose their coordinator, and end with an error after a training that is finished."""
+  ended(two_processes(tmp_path, SLOW_HEARTBEATS + COMMAND, *LINE))
+  assert RunDirectory(tmp_path / "run").status["status"] == "finished"
+
+
 CHAIN = """
 # @package curriculum
 defaults:
