@@ -320,12 +320,15 @@ class _Watch:
       self._lost_coordinator()
 
   def _lost_coordinator(self) -> NoReturn:
-    self._lost(f"process 0 at {self._coordinator} is lost")
+    if ending := self._leaving.is_set():
+      time.sleep(self.lost_after)  # a normal end closes the connection, too; without process 0, JAX would wait for it
+    self._lost(f"process 0 at {self._coordinator} is lost", ending)
 
-  def _lost(self, sentence: str) -> NoReturn:
+  def _lost(self, sentence: str, ending: bool = False) -> NoReturn:
+    """Ends this process; one that ends by itself only with `ending`."""
     with self._lock:  # kept: one thread ends the process
-      if self._leaving.is_set():
-        raise SystemExit  # of this thread: the process ends by itself
+      if self._leaving.is_set() and not ending:
+        raise SystemExit  # of this thread
       sentence = f"hardware=multi_node: {sentence.removesuffix('.')}."
       try:
         for note in self.notes:

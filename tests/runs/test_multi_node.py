@@ -89,6 +89,29 @@ def test_a_heartbeat_under_way_does_not_end_process_0_before_the_others(tmp_path
   assert RunDirectory(tmp_path / "run").status["status"] == "finished"
 
 
+KILLED_AT_ITS_END = """
+import os, time
+from playground.hardware.distributed import _Watch
+
+part = _Watch._part
+
+def killed(self):
+  part(self)
+  if self._index == 0:
+    time.sleep(3)  # the other one is waiting in JAX
+    os._exit(9)
+
+_Watch._part = killed
+"""
+
+
+def test_the_others_do_not_wait_for_a_process_0_that_is_killed_at_its_end(tmp_path: Path) -> None:
+  processes = two_processes(tmp_path, KILLED_AT_ITS_END + COMMAND, *LINE, LOST_AFTER)
+  said = [process.communicate(timeout=200)[0] for process in processes]
+  assert [process.returncode for process in processes] == [9, 2], said
+  assert said[1].splitlines()[-1].endswith(" is lost.") and "Traceback" not in said[1]
+
+
 CHAIN = """
 # @package curriculum
 defaults:
