@@ -30,8 +30,7 @@ from playground.text import first_line
 
 T = TypeVar("T")
 
-PREFLIGHT = "preflight"  # name of threads that may hang: a process that has one does not wait for it at its end
-_HEARTBEAT = "heartbeat"  # of the watch's, which waits for it
+PREFLIGHT = "preflight"  # name of threads that nobody waits for any more: a process that has one ends at once
 _STORE = "playground"  # our folder in the coordinator's key-value store
 _WEEK_MS = 7 * 24 * 3600 * 1000  # longer than processes wait for each other; JAX wants a limit
 _PERIOD_S = 1.0  # s between two heartbeats
@@ -277,7 +276,7 @@ class _Watch:
     seen = dict.fromkeys(signs, time.monotonic())
     for beat in itertools.count():
       try:
-        store = _within(lambda beat=beat: self._exchange(str(beat)), self.lost_after, "", _HEARTBEAT)
+        store = _within(lambda beat=beat: self._exchange(str(beat)), self.lost_after, "")
       except HardwareError:  # process 0 does not answer: its heartbeat is missing, too
         store = {}
       if _FAILED in store:
@@ -346,7 +345,7 @@ def _sign_of(index: int) -> str:
 _watch: _Watch | None = None  # this process's, once it has joined others
 
 
-def _within(call: Callable[[], T], seconds: float | None, otherwise: str, name: str = PREFLIGHT) -> T:
+def _within(call: Callable[[], T], seconds: float | None, otherwise: str) -> T:
   """Returns the result of a call that a signal can interrupt; raises HardwareError if it hangs or fails."""
   outcome: Future[T] = Future()
 
@@ -356,7 +355,12 @@ def _within(call: Callable[[], T], seconds: float | None, otherwise: str, name: 
     except Exception as error:  # any error of the runtime
       outcome.set_exception(error)
 
-  _start_thread(run, name).join(seconds)
+  thread = _start_thread(run)
+  try:
+    thread.join(seconds)
+  finally:  # a signal may have interrupted it
+    if not outcome.done():
+      thread.name = PREFLIGHT
   if not outcome.done():
     raise HardwareError(f"hardware=multi_node: {otherwise}.")
   try:
@@ -367,8 +371,8 @@ def _within(call: Callable[[], T], seconds: float | None, otherwise: str, name: 
     raise HardwareError(f"hardware=multi_node: {otherwise if late else text}.") from error
 
 
-def _start_thread(target: Callable[[], None], name: str = "watch") -> threading.Thread:
-  thread = threading.Thread(target=target, name=name, daemon=True)
+def _start_thread(target: Callable[[], None]) -> threading.Thread:
+  thread = threading.Thread(target=target, name="watch", daemon=True)
   thread.start()
   return thread
 
