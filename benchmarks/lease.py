@@ -5,8 +5,8 @@
   python benchmarks/lease.py pack FOLDER OUT [MIB PARTS]        OUT/pack.000 ...: at most PARTS files of MIB MiB (15, 4)
 
 A pack has metrics, configuration, policy and first non-finite state of each job that has ended since the last pack. It
-lacks the training state, which only a resume needs. At home: `cat pack.* | tar x`, or a pack after the other, each its
-own archive.
+lacks training state and replay buffer, which only a resume needs. At home: `cat pack.* | tar x`, or a pack after the
+other, each its own archive.
 """
 
 import io
@@ -73,7 +73,7 @@ def pack(folder: Path, out: Path, part: int, parts: int) -> list[str]:
 
 
 def _members(job: Path) -> list[Path]:
-  """Returns a job's small files, its newest and best checkpoint without the training state, and its first dump.
+  """Returns a job's small files, its newest and best policy, and its first dump.
 
   A curriculum's stages are folders of the job, each with the same.
   """
@@ -82,7 +82,7 @@ def _members(job: Path) -> list[Path]:
   found = [job / name for name in FILES if (job / name).is_file()] + [best] * best.is_symlink()
   found += sorted((job / "nan_dump").glob("*.npz"))[:1]
   for step in {*steps[-1:], *[step for step in steps if best.exists() and step == best.resolve().name]}:
-    parts = [path for path in (checkpoints / step).iterdir() if path.name != "state"]
+    parts = [path for path in (checkpoints / step).iterdir() if path.name not in ("state", "replay")]
     found += [path for part in parts for path in (part, *part.rglob("*")) if path.is_file()]
   stages = sorted(path.parent for path in job.glob("*/status.json"))
   return found + [path for stage in stages for path in _members(stage)]

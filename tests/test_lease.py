@@ -18,7 +18,7 @@ spec.loader.exec_module(lease)
 def make_job(sweep: Path, name: str, status: str = "finished", size: int = 1000) -> None:
   job = sweep / "jobs" / name
   for step in ("000", "100", "200"):
-    for part in ("policy/d/x", "state/d/x", "meta/m"):
+    for part in ("policy/d/x", "state/d/x", "replay/d/x", "meta/m"):
       path = job / "checkpoints" / step / part
       path.parent.mkdir(parents=True)
       path.write_bytes(b"x" * size)
@@ -61,7 +61,7 @@ def test_a_pack_has_the_policies_of_a_chains_stages(tmp_path: Path) -> None:
   assert lease.pack(tmp_path, tmp_path / "out", 2**20, 1) == ["0_chain"]
   names = packed(tmp_path / "out", tmp_path)
   assert {"0_chain/metrics.csv", "0_chain/1_dense/metrics.csv", "0_chain/1_dense/checkpoints/200/policy/d/x"} <= names
-  assert not any("/state/" in name for name in names)
+  assert not any("/state/" in name or "/replay/" in name for name in names)
 
 
 def test_no_part_is_larger_than_allowed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
