@@ -13,6 +13,7 @@ The folder is laid out like our `configs/`: `env/MyTask.yaml`, and whatever else
 Classes of any other package are refused unless the user trusts it (`playground.trust`).
 """
 
+import dataclasses
 import functools
 import inspect
 import typing
@@ -31,7 +32,7 @@ from playground.config import (
   override_section,
   task_names,
 )
-from playground.envs.options import uses_vision
+from playground.envs.options import EnvConfig, TaskKeys, TermsConfig, uses_vision
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.settings import Section, plain, problem
 from playground.text import format_value
@@ -95,19 +96,42 @@ def load(
 
 
 def build(env_config: TaskConfig) -> "Env":
-  """Builds the task that a composed env section describes, with a camera if `env.vision` enables it."""
-  cls = task_class(str(env_config.task))
-  for name, hint in typing.get_type_hints(cls.keys, include_extras=True).items():
-    if name not in env_config:
-      raise ConfigError(f"env.{name} is missing: {cls.__name__} needs it.")
-    if wanted := problem(env_config[name], hint):
-      raise ConfigError(f"env.{name}={format_value(env_config[name])} must be {wanted}.")
-  env = cast("Callable[[ConfigDict], Env]", cls)(env_config)
+  """Builds the task that a composed env section describes, with a camera if `env.vision` enables it.
+
+  Raises:
+    ConfigError: as `check`, and what only the task's model shows, such as the name of a joint that it lacks.
+  """
+  env = cast("Callable[[ConfigDict], Env]", check(env_config))(env_config)
   if not uses_vision(env_config):
     return env
   from playground.rendering.vision import Vision
 
   return cast("Env", Vision(env))  # it has the interface of `Env`, without being a subclass
+
+
+def check(env_config: TaskConfig) -> "type[Env]":
+  """Checks keys, terms and numbers of a composed env section, and returns the task's class; it builds no model.
+
+  Raises:
+    ConfigError: a key that is unknown or missing, or an invalid value.
+  """
+  if "task" not in env_config:
+    raise ConfigError("env.task is missing: the task's file names its class, task: module:Class.")
+  cls = task_class(str(env_config.task))
+  own = typing.get_type_hints(cls.keys, include_extras=True)
+  shared = [field.name for keys in (EnvConfig, TermsConfig, TaskKeys) for field in dataclasses.fields(keys)]
+  known = [*own, *shared, "observations"]
+  for name in env_config:
+    if name not in known:
+      remedy = f"a task's own key has its type in its class's `keys`.{nearest(name, known)}"
+      raise UnknownNameError(f"env.{name} is no key of {cls.__name__}: {remedy}")
+  for name, hint in own.items():
+    if name not in env_config:
+      raise ConfigError(f"env.{name} is missing: {cls.__name__} needs it.")
+    if wanted := problem(env_config[name], hint):
+      raise ConfigError(f"env.{name}={format_value(env_config[name])} must be {wanted}.")
+  cls.settings_of(env_config)
+  return cls
 
 
 def task_class(task: str) -> "type[Env]":

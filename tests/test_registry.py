@@ -249,6 +249,20 @@ class Long(Cartpole):
   with pytest.raises(ConfigError, match=r"^env\.tags=3 must be a list of texts"):
     build(config | {"rail_length": 2.0, "tags": 3})
   assert build(config | {"rail_length": 2.0}).config.rail_length == 2.0
+  with pytest.raises(UnknownNameError, match=r"^env\.rail_lenght is no key of Long: .* Did you mean 'rail_length'"):
+    build(config | {"rail_length": 2.0, "rail_lenght": 3.0})
+
+
+@pytest.mark.parametrize("wrong", ["terminatons", "episod_length", "njmaxx"])
+def test_a_misspelt_key_of_a_tasks_file_is_one_sentence(wrong: str) -> None:
+  config = registry.config("CartpoleBalance").to_dict() | {wrong: {}}
+  with pytest.raises(UnknownNameError, match=rf"^env\.{wrong} is no key of Cartpole: .* Did you mean"):
+    registry.build(config_dict(config))
+
+
+def test_a_file_without_a_task_is_one_sentence() -> None:
+  with pytest.raises(ConfigError, match=r"^env\.task is missing"):
+    registry.build(config_dict({"ctrl_dt": 0.01}))
 
 
 @pytest.mark.parametrize(
@@ -389,7 +403,10 @@ def site(tmp_path: Path) -> Path:
     "tiny/__init__.py": "import pathlib\ndef configs():\n  return pathlib.Path(__file__).parent / 'configs'\n",
     "tiny/task.py": """
       from playground.envs.dm_control.cartpole import Cartpole
+      class Keys:
+        bonus: float
       class Tiny(Cartpole):
+        keys = Keys
         def __init__(self, config):
           super().__init__(config)
           self.bonus = config.bonus

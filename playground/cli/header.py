@@ -25,7 +25,8 @@ def _rows(config: RunConfig) -> Iterator[tuple[str, str]]:
   else:
     yield "budget", f"{_steps(config)} in {agent.num_envs:,} environments, {agent.num_evals} evaluations"
   tuned = choices.get("tuned")
-  yield "agent", f"tuned set {tuned}" if tuned else "default hyperparameters: no tuned set for this task"
+  why = " (tuned=null)" if "tuned=null" in config.overrides else ": no tuned set for this task"
+  yield "agent", f"tuned set {tuned}" if tuned else f"default hyperparameters{why}"
   backend = "jax, or warp on a GPU" if (env.impl, env.cuda_impl) == ("auto", "warp") else env.impl
   yield "hardware", f"{choices.get('hardware')}; physics backend {backend.replace('auto', 'jax')}; seed {config.seed}"
   given = [text.lstrip("+") for text in config.overrides if not is_hydras(text)]  # Hydra's form has ++ before terms

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
@@ -109,6 +110,9 @@ class Env(abc.ABC):
     """Advances one control step of `dt` seconds."""
     state = self.pre_step(state)
     ctrl = self.action_to_ctrl(state, action)
+    if jnp.shape(ctrl) != (self.mj_model.nu,):
+      returned = f"action_to_ctrl returns shape {list(jnp.shape(ctrl))}"
+      raise ConfigError(f"{type(self).__name__}.{returned}, and the model has {self.mj_model.nu} actuators.")
     data = self.physics.step(self.model_of(state.info, model), state.data, ctrl, self.n_substeps)
     return self.post_step(data, state.info, action)
 

@@ -176,7 +176,7 @@ class Task(Env):
     rewards = self.rewards.compute(c)
     obs, buffers = self.observations.compute(c, obs_key, info.get("observation_buffers"))
     after = {**info, "rng": rng, "last_act": action, "last_last_act": info["last_act"]}
-    after |= self.commands.step(c, command_key) | self.next_info(c, own_key)
+    after |= self.commands.step(c, command_key) | self._checked(self.next_info(c, own_key), info)
     after |= {"observation_buffers": buffers} if buffers else {}
     reward = self.clipped(self.total(rewards))
     done, ended = self.terminations.end(c)
@@ -205,7 +205,23 @@ class Task(Env):
     metrics = {f"reward/{name}": value for name, value in rewards.items()}
     metrics |= {f"termination/{name}": value for name, value in ended.items()}
     failures = [ended[t.name] for t in self.terminations.terms if not (t.options.success or t.options.time_out)]
-    return metrics | {"fall": jnp.array(failures, jnp.float32).max(initial=0.0)} | self.measure(c)
+    measured = self.measure(c)
+    for name, value in measured.items():
+      if jnp.ndim(value):
+        what = f"has shape {list(jnp.shape(value))}, and a metric is one number"
+        raise ConfigError(f"{type(self).__name__}.measure: {name!r} {what}: add .sum() or .mean().")
+    return metrics | {"fall": jnp.array(failures, jnp.float32).max(initial=0.0)} | measured
+
+  def _checked(self, own: dict[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what `next_info` returned; raises ConfigError for entries that `info` lacks or has with another type."""
+    described = lambda entry: jax.tree.map(lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}", entry)
+    for name, entry in own.items():
+      if name not in info:
+        raise ConfigError(f"{type(self).__name__}.next_info returns {name!r}, which first_info lacks: add it there.")
+      if (new := described(entry)) != (old := described(info[name])):
+        what = f"{name!r} as {new}, where an episode starts with {old}"
+        raise ConfigError(f"{type(self).__name__}.next_info returns {what}: make them the same.")
+    return own
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:

@@ -394,7 +394,7 @@ def find_checkpoints(path: str | Path) -> list[Path]:
   found = _by_step(folder)
   if not found:
     folders = [*path.glob("*/"), *path.glob("jobs/*/")]  # `path` may be that of a sweep
-    if runs := sorted(run for run in folders if (run / "checkpoints").is_dir()):
+    if runs := sorted(run for run in folders if (run / "checkpoints").is_dir() or find_stages(run)):
       raise NoCheckpointError(f"{path} is a folder of runs: name one, such as the newest, {runs[-1]}.")
     if path.suffix == ".onnx" or (path / "policy.onnx").is_file():
       what = "holds no checkpoint, but an exported policy, which only `playground play` takes"

@@ -87,7 +87,11 @@ class TerminationManager(_Manager):
 
   def compute(self, c: StepContext) -> dict[str, jax.Array]:
     """Returns whether each term ends the episode, by name, each a bool of shape []."""
-    return {term.name: term.scalar(c).astype(bool) for term in self.terms}
+    values = {term.name: term.scalar(c) for term in self.terms}
+    for term in self.terms:
+      if (kind := values[term.name].dtype) != bool:  # any number but 0 would end the episode
+        raise ConfigError(f"{term.key} must return a bool, and returns {kind}: compare it with a limit.")
+    return values
 
   def any(self, c: StepContext, time_out: bool = False) -> jax.Array:
     """Returns whether any of the terms with that `time_out` ends the episode, a bool of shape []."""
@@ -294,9 +298,20 @@ class EventManager(_Manager):
         self.groups[mode].append(term)
 
   def start(self, key: jax.Array, env: Any, initial: Any) -> Any:
-    """Applies the reset events, in order, to the state that an episode starts with."""
+    """Applies the reset events, in order, to the state that an episode starts with.
+
+    Raises ConfigError where one returns no such state, or parts of another shape.
+    """
     for term, k in _with_keys(self.groups["reset"], key):
-      initial = term(k, env, initial)
+      changed = term(k, env, initial)
+      if not isinstance(changed, type(initial)):
+        what = f"and returns {type(changed).__name__}: return initial.replace(...)"
+        raise ConfigError(f"{term.key} must return the state that an episode starts with, {what}.")
+      for name, value in vars(initial).items():
+        old, new = jnp.shape(value), jnp.shape(vars(changed)[name])
+        if value is not None and new != old:
+          raise ConfigError(f"{term.key} returns {name} of shape {list(new)}, and this task's is {list(old)}.")
+      initial = changed
     return initial
 
   def reset(self, key: jax.Array, model: Any) -> Info:

@@ -69,7 +69,10 @@ class Term(NamedTuple):
 
   def __call__(self, *args: Any) -> Any:
     with self.reading(*args):
-      return self.func(*args, **self.params)
+      value = self.func(*args, **self.params)
+    if value is None:
+      raise ConfigError(f"{self.key} returns nothing: {self.func.__name__} lacks a `return`.")
+    return value
 
   def scalar(self, *args: Any) -> jax.Array:
     """Returns the function's value, shape []; raises ConfigError where it has another shape."""

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from playground import config as configs
+from playground import registry
 from playground.config import RunConfig
 from playground.config.sweep_options import GridConfig, SweepSettings
 from playground.errors import CheckpointError, ConfigError
@@ -55,6 +56,8 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
       Job.of_run(number, job, varying, config)
       for number, (job, config) in enumerate(zip(combinations, composed, strict=True))
     ]
+    for job, config in zip(combinations, composed, strict=True):
+      _check_task(job, config)
   lines = [line for line in lines if not configs.is_of_command(line)]
   found = _find(chosen.sweep_dir, name, settings, lines, jobs)
   command = ["playground-run", "-m", *overrides]
@@ -66,6 +69,15 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
   path = chosen.sweep_dir or ROOT / name / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
   new = SweepDirectory.create(path, name, command, settings, lines, jobs, numbered=chosen.sweep_dir is None)
   return new, chosen
+
+
+def _check_task(job: Sequence[str], config: RunConfig) -> None:
+  """Raises ConfigError, with the job's overrides, for a key, term or number of its task that is invalid."""
+  try:
+    for one in config.stages or [config]:
+      registry.check(one.env)
+  except ConfigError as error:
+    raise type(error)(f"Job {' '.join(job)}: {error}") from None
 
 
 def _lines(overrides: Sequence[str]) -> tuple[list[str], SweepSettings, list[list[str]]]:

@@ -107,21 +107,31 @@ def test_a_term_with_time_out_cuts_an_episode_unless_another_ends_it() -> None:
 
 
 @pytest.mark.parametrize(
-  ("manager", "half"),
+  ("manager", "value"),
   [
     (RewardManager({"mine": {"func": "joint_vel_l2", "weight": 1.0}}), 0.5),
     (TerminationManager({"mine": {"func": "nonfinite_state"}}), True),
   ],
 )
-def test_a_term_returns_one_number(manager: RewardManager | TerminationManager, half: float) -> None:
+def test_a_term_returns_one_number(manager: RewardManager | TerminationManager, value: float) -> None:
   def compute(func: Any) -> Any:
     manager.groups = {kind: [term._replace(func=func)]}
     return manager.compute(context())["mine"]
 
   ((kind, (term,)),) = manager.groups.items()
-  assert compute(lambda c: 0.5) == half
+  assert compute(lambda c: value) == value
+  with pytest.raises(ConfigError, match=rf"^env\.{kind}\.mine returns nothing: <lambda> lacks a `return`"):
+    compute(lambda c: None)
   with pytest.raises(ConfigError, match=rf"^env\.{kind}\.mine must return one number, and returns 2 of them: add .sum"):
     compute(lambda c: c.joint_vel)
+
+
+@pytest.mark.parametrize("value", [0.5, 1])
+def test_a_termination_returns_a_bool(value: float) -> None:
+  manager = TerminationManager({"mine": {"func": "nonfinite_state"}})
+  manager.groups = {"terminations": [manager.terms[0]._replace(func=lambda c: value)]}
+  with pytest.raises(ConfigError, match=r"^env\.terminations\.mine must return a bool, and returns (float|int)32: "):
+    manager.compute(context())
 
 
 @pytest.mark.parametrize(
