@@ -1,6 +1,7 @@
 """Task names to tasks: ours, and those of an outside package."""
 
 import copy
+import json
 import os
 import pickle
 import subprocess
@@ -470,6 +471,8 @@ def test_an_outside_package_adds_tasks(site: Path):
     assert playground.load("TinyBalance", overrides={{"bonus": 2.5}}).bonus == 2.5
     bare = playground.registry.build(compose(["env=joystick", "robot=bare_go1"]).env).mj_model
     assert (bare.actuator_gainprm[:, 0] == 35).all(), "pd: null keeps the gains of the MJCF"
+    from playground.cli.list_tasks import list_tasks
+    list_tasks(names, {{}}, as_json=True)
     sys.argv = ["playground-run", "experiment=tiny", "--cfg", "job", "--package", "env"]
     from playground.cli.run import main
     main()
@@ -478,3 +481,7 @@ def test_an_outside_package_adds_tasks(site: Path):
   done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], env=env, capture_output=True, text=True)
   assert done.returncode == 0, done.stderr
   assert "bonus: 1.5" in done.stdout
+  listed, _ = json.JSONDecoder().raw_decode(done.stdout)
+  assert [(row["task"], row["robot"], row["agent"], row["backend"]) for row in listed] == [
+    ("TinyBalance", "", "ppo", "jax"), ("TinyWalk", "go1", "ppo", "jax"),
+  ]  # fmt: skip

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from playground.catalog import entries
+from playground.config import compose
 from playground.errors import UnknownNameError, nearest
 from playground.settings import Section
 from playground.text import millions
@@ -20,7 +21,7 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   """Prints the tasks that match the filters.
 
   Args:
-    names: tasks to list; a task of another package has only its name.
+    names: tasks to list; of another package's, what composing tells: robot, backend, agent and budget.
     filters: the value that a task must have, by name of `FILTERS`; None takes any.
     as_json: whether to print JSON instead of a table.
 
@@ -36,7 +37,7 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
     values = sorted({getattr(entry, name) for entry in known.values()} - {""})
     if value not in values:
       raise UnknownNameError(f"--{name}={value}: choose from {', '.join(values)}.{nearest(value, values)}")
-  rows: list[Section] = [dataclasses.asdict(known[name]) if name in known else {"task": name} for name in names]
+  rows: list[Section] = [dataclasses.asdict(known[name]) if name in known else _composed(name) for name in names]
   rows = [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
   if as_json:
     print(json.dumps(rows, indent=1))
@@ -46,6 +47,13 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   count = f"{len(rows)} task{'s' * (len(rows) != 1)}"
   console.print(f"{count}. Train one with playground train env=<task>.", soft_wrap=True)
   return 0
+
+
+def _composed(name: str) -> Section:
+  """Returns what the configuration tells of a task that the catalogue lacks."""
+  config = compose([f"env={name}"])
+  settings = {"agent": config.agent_name, "budget": config.agent.num_timesteps}
+  return {"task": name, "robot": config.choices.get("robot") or "", "backend": config.env.cuda_impl, **settings}
 
 
 def wide_console(columns: int = 240) -> Console:

@@ -18,6 +18,7 @@ from playground.mdp.context import Robot, StepContext
 from playground.mdp.managers import (
   CommandManager,
   EventManager,
+  Info,
   ObservationManager,
   RewardManager,
   TerminationManager,
@@ -212,7 +213,7 @@ class Task(Env):
         raise ConfigError(f"{type(self).__name__}.measure: {name!r} {what}: add .sum() or .mean().")
     return metrics | {"fall": jnp.array(failures, jnp.float32).max(initial=0.0)} | measured
 
-  def _checked(self, own: dict[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
+  def _checked(self, own: Info, info: Mapping[str, object]) -> Info:
     """Returns what `next_info` returned; raises ConfigError for entries that `info` lacks or has with another type."""
     described = lambda entry: jax.tree.map(lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}", entry)
     for name, entry in own.items():

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from playground.envs.base import Env, State
+from playground.errors import lookup
 from playground.mdp.managers import TIME_OUT
 from playground.physics.backend import STATE_FIELDS, WORLDS, BufferUse, mjx
 
@@ -160,6 +161,8 @@ class Episode(Wrapper):
 
   def __init__(self, env: Any, length: int, action_repeat: int = 1):
     super().__init__(env)
+    for name, kind in env.summaries.items():
+      lookup(_SUMMARIES, kind, f"{type(env.unwrapped).__name__}.summaries[{name!r}]")
     self.length = length
     self.repeat = action_repeat
 

@@ -89,7 +89,8 @@ class TerminationManager(_Manager):
     """Returns whether each term ends the episode, by name, each a bool of shape []."""
     values = {term.name: term.scalar(c) for term in self.terms}
     for term in self.terms:
-      if (kind := values[term.name].dtype) != bool:  # any number but 0 would end the episode
+      kind = values[term.name].dtype
+      if not jnp.issubdtype(kind, jnp.bool_):  # any number but 0 would end the episode
         raise ConfigError(f"{term.key} must return a bool, and returns {kind}: compare it with a limit.")
     return values
 

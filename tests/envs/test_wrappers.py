@@ -12,6 +12,7 @@ import pytest
 
 from playground.envs import wrappers
 from playground.envs.base import State
+from playground.errors import ConfigError
 from tests.dummy import PointTask
 
 N, LENGTH = 3, 4
@@ -179,6 +180,14 @@ def test_a_summary_is_of_the_steps_taken_where_an_episode_begins_at_a_random_age
   for _ in range(2):
     state = jax.jit(wrapped.step)(state, jnp.full((N, 2), 0.1))
     np.testing.assert_allclose(state.info["episode_metrics"]["constant"], expected)
+
+
+def test_an_unknown_summary_is_one_sentence() -> None:
+  class Wrong(Counting):
+    summaries: ClassVar[Mapping[str, str]] = {"constant": "avg"}
+
+  with pytest.raises(ConfigError, match=r"^Wrong\.summaries\['constant'\]: 'avg' is unknown; choose from sum, mean"):
+    wrappers.wrap_for_training(Wrong(episode_length=LENGTH))
 
 
 def test_action_repeat_sums_rewards_and_stops_at_a_termination() -> None:

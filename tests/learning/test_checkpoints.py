@@ -523,6 +523,14 @@ def test_a_sweeps_folder_holds_runs(tmp_path: Path) -> None:
     find_checkpoints(tmp_path)
 
 
+def test_the_newest_run_of_a_folder_may_be_a_chain(tmp_path: Path) -> None:
+  save(tmp_path / "2026-01-01", 10)
+  save(tmp_path / "2026-01-02" / "1_near", 10)
+  (tmp_path / "2026-01-02" / "config.yaml").touch()
+  with pytest.raises(CheckpointError, match=r"is a folder of runs: name one, .* \S+/2026-01-02\."):
+    find_checkpoints(tmp_path)
+
+
 def test_those_of_a_chain(tmp_path: Path) -> None:
   """They are the last stage's that has any: one that is about to save its first has none."""
   save(tmp_path / "2_near", 20)

@@ -155,3 +155,16 @@ def test_nothing_is_written_when_a_job_cannot_work(here: Path) -> None:
   with pytest.raises(ConfigError, match=r"^Job experiment=quickstart agent\.num_envs=7: "):
     plan(["agent.num_envs=128,7"])
   assert list(here.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+  ("override", "message"),
+  [
+    ("action_rate_l2.weight=-0.1,x", r"weight=x: env\.rewards\.action_rate_l2\.weight=x must be a number"),
+    ("joint_powr_l1.weight=1,2", r"weight=1: env\.rewards\.joint_powr_l1: no function .* 'joint_power_l1'"),
+  ],
+)
+def test_a_jobs_terms_are_checked_before_anything_is_written(here: Path, override: str, message: str) -> None:
+  with pytest.raises(ConfigError, match=f"^Job .*{message}"):
+    plan(["env=Go1JoystickFlatTerrain", f"env.rewards.{override}", "sweep_dir=mine"])
+  assert not list(here.iterdir())
