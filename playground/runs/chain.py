@@ -10,7 +10,7 @@ start JAX and the device again for every stage, and would have to forward signal
 
 import contextlib
 import gc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 from playground import registry
@@ -54,16 +54,21 @@ def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) 
   """
   if config.resume is None:
     _check(config)
-    chain, stages = _lay_out(config)
+    opened = _laid_out(config)
   else:
-    chain, stages = RunDirectory.open(config.resume), list(config.stages)
+    chain = RunDirectory.open(config.resume)
     if chain.status.get("status") == "finished":
       print(f"{chain.path} is finished: nothing to resume (init_from={chain.path} trains on from its weights).")
       return 0
+    opened = contextlib.nullcontext((chain, list(config.stages)))
   setup(config.hardware)  # afterwards a process knows whether it writes
   folders = stage_folders(config.curriculum)
   began_s, before = 0.0, None  # the config of the first stage names its weights
-  with chain.recorded() if is_main() else contextlib.nullcontext(), noting_loss(chain.note_loss):
+  with (
+    opened as (chain, stages),
+    chain.recorded() if is_main() else contextlib.nullcontext(),
+    noting_loss(chain.note_loss),
+  ):
     try:
       for stage, (name, folder) in zip(stages, folders.items(), strict=True):
         run_dir = RunDirectory(chain.path / folder)
@@ -126,30 +131,33 @@ def _compare(env: str, sizes: dict[str, object], before: str, theirs: dict[str, 
       raise ConfigError(f"{env} cannot start from the weights of stage {before}: {key} is {here}, and {there} there.")
 
 
-def _lay_out(config: RunConfig) -> tuple[RunDirectory, list[RunConfig]]:
-  """Makes the directories of the chain and its stages; returns the stages' configurations, as for resumed runs.
+@contextlib.contextmanager
+def _laid_out(config: RunConfig) -> Iterator[tuple[RunDirectory, list[RunConfig]]]:
+  """Makes the directories of the chain and its stages; yields the stages' configurations, as for resumed runs.
 
-  Process 0 makes the directories; the other processes wait.
+  Process 0 makes the directories, and locks the chain for the block; the other processes wait.
   """
-  if is_main():
-    chain = RunDirectory.claim(str(config.run_dir), numbered=config.resolved["run_dir"] is None)
-  else:
-    chain = RunDirectory(share())
-  before, stages = config.init_from, []
-  for stage, folder in zip(config.stages, stage_folders(config.curriculum).values(), strict=True):
-    path = str(chain.path / folder)
-    tracking = stage.resolved["tracking"]
-    wandb = {**tracking["wandb"], "group": tracking["wandb"]["group"] or chain.path.resolve().name}
-    resolved = {**stage.resolved, "tracking": {**tracking, "wandb": wandb}, "run_dir": path, "init_from": before}
+  with contextlib.ExitStack() as claim:
     if is_main():
-      RunDirectory(path).write_config(resolved, stage.overrides)
-    going_on = {**resolved, "resume": path, "init_from": None}
-    stages.append(replace(stage, resolved=going_on, run_dir=path, resume=path, init_from=None))
-    before = path
-  if is_main():
-    chain.write_config(config.resolved, config.overrides)  # last: the chain can be resumed from here on
-    share(str(chain.path.absolute()))
-  return chain, stages
+      numbered = config.resolved["run_dir"] is None
+      chain = claim.enter_context(RunDirectory.claimed(str(config.run_dir), numbered))
+    else:
+      chain = RunDirectory(share())
+    before, stages = config.init_from, []
+    for stage, folder in zip(config.stages, stage_folders(config.curriculum).values(), strict=True):
+      path = str(chain.path / folder)
+      tracking = stage.resolved["tracking"]
+      wandb = {**tracking["wandb"], "group": tracking["wandb"]["group"] or chain.path.resolve().name}
+      resolved = {**stage.resolved, "tracking": {**tracking, "wandb": wandb}, "run_dir": path, "init_from": before}
+      if is_main():
+        RunDirectory(path).write_config(resolved, stage.overrides)
+      going_on = {**resolved, "resume": path, "init_from": None}
+      stages.append(replace(stage, resolved=going_on, run_dir=path, resume=path, init_from=None))
+      before = path
+    if is_main():
+      chain.write_config(config.resolved, config.overrides)  # last: the chain can be resumed from here on
+      share(str(chain.path.absolute()))
+    yield chain, stages
 
 
 def _write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:

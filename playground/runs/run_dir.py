@@ -57,13 +57,18 @@ class RunDirectory:
     Raises:
       CheckpointError: the folder already holds a run (unless numbered), or making it failed.
     """
-    run = cls.claim(path, numbered)
-    run.write_config(config, overrides)
+    with cls.claimed(path, numbered) as run:
+      run.write_config(config, overrides)
     return run
 
   @classmethod
-  def claim(cls, path: str | Path, numbered: bool = False) -> "RunDirectory":
-    """Makes the folder, as `create` does; the folder becomes a run when `write_config` is called."""
+  @contextlib.contextmanager
+  def claimed(cls, path: str | Path, numbered: bool = False) -> Iterator["RunDirectory"]:
+    """Makes the folder, as `create` does, and locks it for the block, in which `write_config` makes it a run.
+
+    Raises:
+      CheckpointError: see `create`, or another process makes a run of the folder in this moment.
+    """
     run = cls(path)
     if not numbered:
       run.must_be_new()
@@ -71,7 +76,9 @@ class RunDirectory:
       if numbered:
         run = cls(make_numbered(run.path))
       run.path.mkdir(parents=True, exist_ok=True)
-    return run
+    with run.locked():
+      run.must_be_new()  # still, now that nobody else can make one
+      yield run
 
   def write_config(self, config: Section, overrides: Sequence[str] = ()) -> None:
     """Writes the resolved `config` and the command line's `overrides`; raises CheckpointError if that fails."""

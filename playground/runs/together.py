@@ -133,9 +133,10 @@ def _train_group(
       _set_damaged_apart(configs, plans)
       runs.close()
       return _train_groups(_groups(configs, population), interrupts, hardware)
-    members = [Member(open_run(config, plan), interrupts) for config, plan in zip(configs, plans, strict=True)]
-    for member in members:
-      runs.enter_context(member)
+    members = [
+      runs.enter_context(Member(open_run(config, plan), interrupts))
+      for config, plan in zip(configs, plans, strict=True)
+    ]
     progress = runs.enter_context(Progress(training.steps))
     machine = {"impl": training.env.impl, "agents_in_program": len(configs), **hardware.machine}
     for config, plan, member in zip(configs, plans, members, strict=True):
@@ -201,20 +202,22 @@ class Member:
   """Implements the loop's callbacks for one agent's run, which ends at its first error while other runs continue.
 
   Attributes:
-    run_dir: the run's directory, locked while the context lasts.
+    run_dir: the run's directory, open and locked while the context lasts.
     name: name of that directory.
     error: reason of the run's failure; None without a failure.
   """
 
-  def __init__(self, run_dir: RunDirectory, interrupts: Interrupts):
-    self.run_dir, self.name = run_dir, run_dir.path.name
+  def __init__(self, opened: contextlib.AbstractContextManager[RunDirectory], interrupts: Interrupts):
     self.error: str | None = None
-    self._interrupts = interrupts
+    self._opened, self._interrupts = opened, interrupts
     self._callbacks: RunCallbacks | None = None
-    self._record = contextlib.ExitStack()
 
   def __enter__(self) -> Self:
-    self._record.enter_context(self.run_dir.recorded())
+    with contextlib.ExitStack() as record:
+      self.run_dir = record.enter_context(self._opened)
+      self.name = self.run_dir.path.name
+      record.enter_context(self.run_dir.recorded())
+      self._record = record.pop_all()
     return self
 
   def __exit__(

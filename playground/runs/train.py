@@ -209,9 +209,13 @@ def _train_locked(
       loop = Loop(training.trainer, program, training.events, [config.seed], [callbacks])
       _, completed = training.run(loop, [plan], interrupts)
     return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
-  run_dir = open_run(config, plan)
-  share(str(run_dir.path.absolute()))
-  with run_dir.recorded(), noting_loss(run_dir.note_loss), Progress(training.steps) as progress:
+  with (
+    open_run(config, plan) as run_dir,
+    run_dir.recorded(),
+    noting_loss(run_dir.note_loss),
+    Progress(training.steps) as progress,
+  ):
+    share(str(run_dir.path.absolute()))
     if plan.longer:  # not before it is recorded as running
       run_dir.note_budget(config.agent.num_timesteps, config.agent.num_evals)
     run_dir.write_manifest(seed=config.seed, task=config.choices["env"], impl=training.env.impl, **hardware.machine)
@@ -236,11 +240,15 @@ def _train_locked(
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
 
 
-def open_run(config: RunConfig, plan: RestorePlan) -> RunDirectory:
-  """Returns the run's directory; makes it for a new run."""
-  return plan.run_dir or RunDirectory.create(
-    str(config.run_dir), config.resolved, config.overrides, numbered=config.resolved["run_dir"] is None
-  )
+@contextlib.contextmanager
+def open_run(config: RunConfig, plan: RestorePlan) -> Iterator[RunDirectory]:
+  """Yields the run's directory, which is locked; makes it for a new run."""
+  if plan.run_dir is not None:
+    yield plan.run_dir
+    return
+  with RunDirectory.claimed(str(config.run_dir), numbered=config.resolved["run_dir"] is None) as run_dir:
+    run_dir.write_config(config.resolved, config.overrides)
+    yield run_dir
 
 
 def timings_of(program: CompiledFunctions, began_s: float) -> dict[str, float]:

@@ -343,3 +343,13 @@ def test_a_chain_takes_no_directory_that_holds_a_run(whole: Path, composed: Call
   for path in (whole, whole / "1_near"):
     with pytest.raises(ValueError, match=re.escape(f"run_dir={path} already holds a run: give resume={path}")):
       train(composed(f"run_dir={path}"))
+
+
+def test_of_two_chains_that_start_in_one_folder_the_second_changes_nothing(
+  composed: Callable[..., RunConfig], tmp_path: Path
+) -> None:
+  """Both found it free."""
+  with RunDirectory(tmp_path).locked():
+    with pytest.raises(CheckpointError, match=f"^{tmp_path} is being written by process"):
+      train(composed(f"run_dir={tmp_path}"))
+    assert [path.name for path in tmp_path.iterdir()] == ["run.lock"]

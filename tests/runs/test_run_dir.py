@@ -7,6 +7,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -46,6 +47,22 @@ def test_runs_named_alike_in_the_same_moment_get_folders_of_their_own(tmp_path: 
   names = {path.name, *(f"{path.name}_{number}" for number in range(2, 9))}
   assert {run.path.name for run in runs} == names
   assert [run.config["seed"] for run in runs] == list(range(8))
+
+
+def test_of_runs_that_start_in_one_folder_in_the_same_moment_one_is_made(tmp_path: Path):
+  together = threading.Barrier(8)
+
+  def create(seed: int) -> bool:
+    together.wait()
+    try:
+      return bool(RunDirectory.create(tmp_path / "run", {"seed": seed}, [f"seed={seed}"]))
+    except CheckpointError:
+      return False
+
+  with ThreadPoolExecutor(8) as pool:
+    (winner,) = (seed for seed, made in enumerate(pool.map(create, range(8))) if made)
+  run = RunDirectory.open(tmp_path / "run")
+  assert (run.config, run.overrides) == ({"seed": winner}, [f"seed={winner}"])
 
 
 def test_create_takes_an_empty_or_unrelated_folder(tmp_path: Path):

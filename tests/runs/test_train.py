@@ -23,6 +23,7 @@ import pandas as pd
 import pytest
 
 from playground.config import compose
+from playground.errors import CheckpointError
 from playground.files import is_locked
 from playground.hardware.setup import setup
 from playground.learning import checkpoints
@@ -31,7 +32,7 @@ from playground.learning.loop import Loop, schedule
 from playground.runs import train as train_module
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
-from playground.runs.train import cut_short, say_where, train
+from playground.runs.train import cut_short, open_run, say_where, train
 from tests.processes import WITHOUT_WARP
 from tests.runs.helpers import TASK, resume, truncate
 
@@ -432,6 +433,17 @@ def test_a_run_that_trains_longer_ends_as_one_of_that_budget(tmp_path: Path, mon
   assert one.summary["params_sha256"] == other.summary["params_sha256"]
   steps = [pd.read_csv(run.metrics_csv)["step"].to_numpy()[-1] for run in (one, other)]
   assert steps == [1600, 1600] and one.status["status"] == one.summary["status"] == "finished"
+
+
+def test_of_two_starts_in_one_folder_the_second_changes_nothing(tmp_path: Path) -> None:
+  """Both found it free."""
+  config = compose([*TASK, f"run_dir={tmp_path}"])
+  with RunDirectory(tmp_path).locked():
+    with pytest.raises(CheckpointError, match=f"^{tmp_path} is being written by process"):
+      train(config)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.lock"]
+  with open_run(config, RestorePlan.find(config)) as run:
+    assert is_locked(tmp_path / "run.lock") and run.config["seed"] == 1
 
 
 def test_more_devices_than_there_are(tmp_path: Path, refused: Callable[..., str]) -> None:
