@@ -137,13 +137,14 @@ def _laid_out(config: RunConfig) -> Iterator[tuple[RunDirectory, list[RunConfig]
 
   Process 0 makes the directories, and locks the chain for the block; the other processes wait.
   """
+  whole = RestorePlan(weights=weights_of(config.init_from) if config.init_from else None).to_write(config)
   with contextlib.ExitStack() as claim:
     if is_main():
       numbered = config.resolved["run_dir"] is None
       chain = claim.enter_context(RunDirectory.claimed(str(config.run_dir), numbered))
     else:
       chain = RunDirectory(share())
-    before, stages = config.init_from, []
+    before, stages = whole["init_from"], []
     for stage, folder in zip(config.stages, stage_folders(config.curriculum).values(), strict=True):
       path = str(chain.path / folder)
       tracking = stage.resolved["tracking"]
@@ -155,7 +156,7 @@ def _laid_out(config: RunConfig) -> Iterator[tuple[RunDirectory, list[RunConfig]
       stages.append(replace(stage, resolved=going_on, run_dir=path, resume=path, init_from=None))
       before = path
     if is_main():
-      chain.write_config(config.resolved, config.overrides)  # last: the chain can be resumed from here on
+      chain.write_config(whole, config.overrides)  # last: the chain can be resumed from here on
       share(str(chain.path.absolute()))
     yield chain, stages
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
@@ -22,10 +23,10 @@ from playground.learning.checkpoints import (
 )
 from playground.learning.loop import Draw
 from playground.learning.trainer import Settings, Trainer, TrainState
-from playground.pretrained import check_task, is_pretrained, locate, other_meaning
+from playground.pretrained import PREFIX, check_task, is_pretrained, locate, other_meaning
 from playground.pytree import PyTree
 from playground.runs.run_dir import RunDirectory
-from playground.settings import Section
+from playground.settings import Plain, Section
 from playground.text import format_value
 
 _ONLY_AT_FIRST = ("value_dtype", "policy_output_scale")  # keys of networks that their weights do not depend on
@@ -119,7 +120,22 @@ class RestorePlan:
     assert self.run_dir is not None, "only a resumed run can start over"
     # Only a chain sets this in the `config` of a resumed run; the chain may have been moved.
     weights = config.init_from or _first_policy(self.run_dir)
+    if weights and not Path(os.path.expanduser(locate(weights))).exists():
+      raise CheckpointError(
+        f"{self.run_dir.path} cannot start again from {weights}, which is no longer there: "
+        f"init_from=<run or checkpoint> starts a new run."
+      )
     self.checkpoints, self.weights = [], weights_of(weights) if weights else None
+
+  def to_write(self, config: RunConfig) -> dict[str, Plain]:
+    """Returns the configuration that a new run's directory holds: `init_from` names the checkpoint that is used.
+
+    What the user gave may name another one by the time the run is resumed: in another working directory, or when the
+    run that it names has trained on. A pretrained policy keeps its name.
+    """
+    if self.weights is None or str(config.init_from).startswith(PREFIX):
+      return config.resolved
+    return {**config.resolved, "init_from": str(self.weights.path.resolve())}
 
   @contextlib.contextmanager
   def locked(self, config: RunConfig) -> Iterator[Self]:

@@ -247,7 +247,7 @@ def open_run(config: RunConfig, plan: RestorePlan) -> Iterator[RunDirectory]:
     yield plan.run_dir
     return
   with RunDirectory.claimed(str(config.run_dir), numbered=config.resolved["run_dir"] is None) as run_dir:
-    run_dir.write_config(config.resolved, config.overrides)
+    run_dir.write_config(plan.to_write(config), config.overrides)
     yield run_dir
 
 

@@ -297,6 +297,10 @@ def test_a_chain_starts_at_a_stage_from_someones_weights(
   assert train(composed("curriculum.start_at=far", f"init_from={weights}", f"run_dir={path}")) == 0
   assert checksum(jax.tree.leaves(policies)) == Checkpoint(find_checkpoints(weights)[0]).meta["sha256"]["policy"]
   assert sorted(folder.name for folder in path.glob("[0-9]*")) == ["2_far"]
+  for folder in ("", "2_far"):
+    assert RunDirectory(path / folder).config["init_from"] == str(find_checkpoints(weights)[0]), (
+      "wherever it is resumed"
+    )
   assert RunDirectory(path).summary["params_sha256"] == RunDirectory(whole).summary["params_sha256"]
 
 

@@ -563,6 +563,30 @@ def test_resumed_before_its_first_checkpoint_it_starts_from_the_weights_again(wh
   assert found.weights.path == find_checkpoints(whole)[0]
 
 
+def test_what_its_weights_are_does_not_change_until_it_is_resumed(
+  copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  """Their run trains on, and the command is given in another folder."""
+  newest, path = find_checkpoints(copy)[0], tmp_path / "run"
+  monkeypatch.chdir(tmp_path)
+  config = compose([*TASK, f"init_from={copy.name}", f"run_dir={path}"])
+  with open_run(config, RestorePlan.find(config)):
+    pass
+  shutil.copytree(newest, newest.with_name("999999999999"))
+  (tmp_path / "elsewhere").mkdir()
+  monkeypatch.chdir("elsewhere")
+  found = RestorePlan.find(compose([f"resume={path}"]))
+  assert found.weights is not None and found.weights.path == newest
+  shutil.rmtree(newest)
+  with pytest.raises(CheckpointError, match=f"^{path} cannot start again from {newest}, which is no longer there: "):
+    RestorePlan.find(compose([f"resume={path}"]))
+
+
+def test_a_pretrained_policy_keeps_its_name() -> None:
+  config = compose([*TASK, "init_from=pretrained:CartpoleBalance"])
+  assert RestorePlan.find(config).to_write(config)["init_from"] == "pretrained:CartpoleBalance"
+
+
 def test_a_run_whose_fresh_starts_end_every_episode_early_says_so() -> None:
   """Spot's commands last 201 control steps: a policy of such a run has never seen one change."""
 
