@@ -52,17 +52,18 @@ def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) 
     PlaygroundError: a stage failed; the message names the stage. An invalid stage raises before anything is trained
       or written.
   """
+  folders = stage_folders(config.curriculum)
   if config.resume is None:
     _check(config)
     opened = _laid_out(config)
   else:
     chain = RunDirectory.open(config.resume)
-    if chain.status.get("status") == "finished":
+    # Else a stage was trained longer by itself, or is to be: it was interrupted in that.
+    if chain.status.get("status") == "finished" and chain.summary.get("stages") == _stages(chain, folders):
       print(f"{chain.path} is finished: nothing to resume (init_from={chain.path} trains on from its weights).")
       return 0
     opened = contextlib.nullcontext((chain, list(config.stages)))
   setup(config.hardware)  # afterwards a process knows whether it writes
-  folders = stage_folders(config.curriculum)
   began_s, before = 0.0, None  # the config of the first stage names its weights
   with (
     opened as (chain, stages),
@@ -168,10 +169,9 @@ def _write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
     chain: directory of the chain.
     folders: names of the stages' folders, by stage.
   """
-  runs = {name: RunDirectory(chain.path / folder) for name, folder in folders.items()}
-  _write_metrics(chain, runs)
+  _write_metrics(chain, folders)
   plot_learning_curve(chain.metrics_csv, chain.plots)
-  stages = [_stage(name, run) for name, run in runs.items()]
+  stages = _stages(chain, folders)
   begun = [stage for stage in stages if stage["steps"] is not None]
   open_ = [stage["status"] for stage in stages if stage["status"] != "finished"]
   last: Section = begun[-1] if begun else {}
@@ -191,19 +191,23 @@ def _write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
   )
 
 
-def _stage(name: str, run: RunDirectory) -> dict[str, Plain]:
-  """Returns the result of a stage; values that the stage has not reached are None."""
-  status, summary = run.status.get("status", "not begun"), run.summary
-  return {"name": name, "folder": run.path.name, "status": status, **{key: summary.get(key) for key in _OF_A_RUN}}
+def _stages(chain: RunDirectory, folders: Mapping[str, str]) -> list[dict[str, Plain]]:
+  """Returns the result of each stage; values that a stage has not reached are None."""
+  stages = []
+  for name, folder in folders.items():
+    run = RunDirectory(chain.path / folder)
+    status, summary = run.status.get("status", "not begun"), run.summary
+    stages.append({"name": name, "folder": folder, "status": status, **{key: summary.get(key) for key in _OF_A_RUN}})
+  return stages
 
 
-def _write_metrics(chain: RunDirectory, runs: Mapping[str, RunDirectory]) -> None:
+def _write_metrics(chain: RunDirectory, folders: Mapping[str, str]) -> None:
   """Writes one table of all stages: steps and wall-clock time accumulate, column `stage` names the stage."""
   import pandas as pd
 
   tables, steps, seconds = [], 0, 0.0
-  for name, run in runs.items():
-    table = read_metrics(run.metrics_csv)
+  for name, folder in folders.items():
+    table = read_metrics(RunDirectory(chain.path / folder).metrics_csv)
     if table.empty:
       break
     table.insert(1, STAGE, name)

@@ -269,6 +269,30 @@ def test_a_finished_chain_is_not_resumed(whole: Path, capsys: pytest.CaptureFixt
   assert (whole / "status.json").read_bytes() == before
 
 
+def test_a_finished_chain_takes_in_that_its_last_stage_trains_longer(whole: Path, tmp_path: Path) -> None:
+  path = shutil.copytree(whole, tmp_path / "longer", symlinks=True)
+  chain, far = RunDirectory(path), RunDirectory(path / "2_far")
+  on_metrics = RunCallbacks.on_metrics
+
+  def row(job: RunCallbacks, reached: int, *args: Any) -> None:
+    on_metrics(job, reached, *args)
+    if reached == 480:
+      kill()
+
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(RunCallbacks, "on_metrics", row)
+    assert train(compose([f"resume={far.path}", "agent.num_timesteps=640"])) == 128 + signal.SIGTERM
+  assert (chain.status["status"], far.status["status"]) == ("finished", "preempted")
+  assert resume(path) == 0
+  assert chain.status["status"] == chain.summary["status"] == far.status["status"] == "finished"
+  assert (far.summary["steps"], chain.summary["steps"]) == (640, 960)
+  assert pd.read_csv(path / "metrics.csv")["step"].to_list()[-3:] == [800, 880, 960]
+
+  far.write_summary({**far.summary, "final_return": 7.0})  # as if it had been finished by itself
+  assert resume(path) == 0
+  assert chain.summary["final_return"] == 7.0
+
+
 def test_a_stage_that_fails_is_named(composed: Callable[..., RunConfig], tmp_path: Path) -> None:
   path = tmp_path / "chain"
   with pytest.MonkeyPatch.context() as patch:
