@@ -89,12 +89,15 @@ class RestorePlan:
     """Finds the runs and checkpoints of `resume`, `init_from` and `run_dir`.
 
     Raises:
-      CheckpointError: no usable checkpoint, or `run_dir` holds a run already.
+      CheckpointError: no usable checkpoint, `run_dir` holds a run already, or a run to train longer has a damaged
+        overrides.yaml.
     """
     if config.resume is not None:
       run_dir = RunDirectory.open(config.resume)
       now = config.agent.num_timesteps
       longer = run_dir.config["agent"].get("num_timesteps", now) < now  # a key that is not there has its default
+      if longer:
+        _ = run_dir.overrides  # damaged ones could not be written again, and raise before anything is changed
       plan = cls(run_dir=run_dir, began_s=began_s, longer=longer)
       try:
         plan.checkpoints = find_checkpoints(config.resume)

@@ -132,8 +132,23 @@ class RunDirectory:
 
   @property
   def overrides(self) -> list[str]:
-    """The command line's overrides that the run was started with."""
-    return yaml.safe_load(self.overrides_path.read_text(encoding="utf-8")) if self.overrides_path.is_file() else []
+    """The command line's overrides that the run was started with; none without the file.
+
+    Raises:
+      CheckpointError: the file is unreadable, or is no list of texts.
+    """
+    if not self.overrides_path.is_file():
+      return []
+    try:
+      found = yaml.safe_load(self.overrides_path.read_text(encoding="utf-8"))
+    except OSError as error:
+      raise CheckpointError(f"{self.overrides_path} cannot be read: {error.strerror}.") from error
+    except (yaml.YAMLError, ValueError, RecursionError):
+      found = None
+    if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
+      why = "it is no list of overrides"
+      raise CheckpointError(f"{self.overrides_path} is damaged ({why}): move it away to go on without it.")
+    return found
 
   @property
   def manifest(self) -> dict[str, Plain]:

@@ -107,6 +107,24 @@ def test_a_damaged_file(name: str, how: str, run: Path, read: Read) -> None:
     assert resumed == "error: all is read."
 
 
+NO_OVERRIDES = (b"", b"{a: b", b"[1, 2]", b"\xff\0", b"{a: b}", b"text", b"[" * 100_000)
+
+
+@pytest.mark.parametrize("content", NO_OVERRIDES, ids=lambda content: repr(content[:9]))
+def test_damaged_overrides_do_not_change_a_run_that_is_to_train_longer(
+  content: bytes, run: Path, refused: Callable[..., str]
+) -> None:
+  RunDirectory(run).set_status("finished")
+  (run / "overrides.yaml").write_bytes(content)
+  before = {path: path.read_bytes() for path in run.glob("*.*") if path.name != "run.lock"}
+  damaged = (
+    f"error: {run / 'overrides.yaml'} is damaged (it is no list of overrides): move it away to go on without it."
+  )
+  assert refused(f"resume={run}", "agent.num_timesteps=640") == damaged
+  assert {path: path.read_bytes() for path in before} == before
+  assert RunDirectory(run).status["status"] == "finished"
+
+
 VALUES: tuple[Any, ...] = (None, [], {}, "text", -1, True, {"a": [None]}, "missing")
 
 
