@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
@@ -17,7 +18,9 @@ from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import (
   Checkpoint,
   DamagedCheckpointError,
+  Leaf,
   NoCheckpointError,
+  describe,
   find_checkpoints,
   of_a_better_one,
 )
@@ -184,7 +187,13 @@ class RestorePlan:
             f"{self.weights.path} was trained with {key}={there[key]}: "
             f"a run with {key}={here[key]} cannot start from it."
           )
-      self.policy = self.weights.restore("policy", trainer.policy_shape())
+      template = trainer.policy_shape()
+      there, here = _observations(self.weights.meta["leaves"].get("policy", [])), _observations(describe(template))
+      if there and there != here:
+        raise CheckpointError(
+          f"{self.weights.path} was trained with the observation {there}: a run with {here} cannot start from it."
+        )
+      self.policy = self.weights.restore("policy", template)
       source = f"{self.weights.path} ({self.weights.meta['env']}, {self.weights.step:,} steps)"
       self.notices.append(f"Starting from the weights and observation statistics of {source}; the optimiser is new.")
       saved, env = self.weights.meta["config"].get("env", {}), config.resolved["env"]
@@ -220,6 +229,12 @@ def networks_of(agent: Section) -> dict[str, str]:
   found = {f"network.{name}": value for name, value in agent.get("network", {}).items() if name not in _ONLY_AT_FIRST}
   found |= {name: agent[name] for name in _OF_NETWORKS if name in agent}
   return {f"agent.{key}": format_value(value) for key, value in found.items()}
+
+
+def _observations(policy: list[Leaf]) -> str:
+  """Returns the sizes of the observation groups that a policy normalises, such as `state 48, privileged_state 123`."""
+  means = ((re.fullmatch(r"\.normalizer\.mean\['(.+)'\]", name), shape) for name, shape, _ in policy)
+  return ", ".join(f"{found[1]} {' x '.join(map(str, shape))}" for found, shape in means if found)
 
 
 def _first_policy(run_dir: RunDirectory) -> str | None:

@@ -479,8 +479,8 @@ def test_weights_of_another_task_are_refused(whole: Path, tmp_path: Path, refuse
   sentence = refused(
     "env=Go1JoystickFlatTerrain", *TASK[1:], "randomization=none", f"init_from={whole}", f"run_dir={tmp_path / 'run'}"
   )
-  assert f"{find_checkpoints(whole)[0]} does not fit this run: .params.policy" in sentence
-  assert "float32[5, 16] there and float32[48, 16] here" in sentence
+  there, here = "the observation state 5", "a run with state 48 cannot start from it."
+  assert f"{find_checkpoints(whole)[0]} was trained with {there}: {here}" in sentence
   assert not (tmp_path / "run").exists(), "nothing was compiled or begun"
 
 
