@@ -198,15 +198,14 @@ def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 
 def _train(config: RunConfig, verbose: bool) -> int:
-  from rich.console import Console
-
+  from playground.console import lasting_console  # imports rich
   from playground.envs.options import impl_on_gpu
   from playground.physics.warp_kernels import prestart
 
   prestart(impl_on_gpu(config.env), config.hardware.platform)
   print("\n".join(header(config)), flush=True)
   if verbose:
-    Console().print(tree(config))
+    lasting_console().print(tree(config))
   with gc_paused(stays=True):
     from playground.runs.train import train  # imports JAX
 

@@ -1,14 +1,13 @@
 """Shows training progress: a bar on a terminal, an occasional plain line in a log file."""
 
-import errno
-import sys
 import time
-from collections.abc import Callable
-from typing import Self, TextIO
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn
 from rich.progress import Progress as RichProgress
+
+from playground.console import lasting_console
 
 PLAIN_INTERVAL_S = 5.0
 
@@ -36,7 +35,7 @@ class Progress:
     self._total = total_steps
     self._activity = activity
     self._enabled = enabled
-    self._console = console or Console(file=_Terminal(sys.stdout))  # pyright: ignore[reportArgumentType]
+    self._console = console or lasting_console()
     self._live = enabled and self._console.is_terminal
     self._step: int | None = None
     self._step_at = 0.0
@@ -111,30 +110,6 @@ class Progress:
   def _print_plain(self, line: str) -> None:
     self.print(line)
     self._line, self._line_at = "", time.monotonic()
-
-
-class _Terminal:
-  """Ignores write errors of a terminal that is gone: SIGHUP follows, and the run saves."""
-
-  def __init__(self, stream: TextIO):
-    self._stream = stream
-
-  def write(self, text: str) -> None:
-    self._unless_gone(self._stream.write, text)
-
-  def flush(self) -> None:
-    self._unless_gone(self._stream.flush)
-
-  def __getattr__(self, name: str) -> object:
-    return getattr(self._stream, name)
-
-  @staticmethod
-  def _unless_gone(call: Callable[..., object], *args: str) -> None:
-    try:
-      call(*args)
-    except OSError as error:
-      if error.errno != errno.EIO:
-        raise
 
 
 def format_return(value: float | None) -> str:

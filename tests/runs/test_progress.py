@@ -1,4 +1,6 @@
 import io
+import os
+import sys
 
 import pytest
 from rich.console import Console
@@ -74,3 +76,14 @@ def test_disabled_prints_only_what_is_asked(terminal: bool):
     bar.update(100)
     bar.print("done")
   assert out.getvalue() == "done\n"
+
+
+def test_a_run_goes_on_where_nobody_reads_its_output(monkeypatch: pytest.MonkeyPatch):
+  reader, writer = os.pipe()
+  os.close(reader)
+  with os.fdopen(writer, "w") as stream:
+    monkeypatch.setattr(sys, "stdout", stream)
+    with Progress(100) as bar:
+      bar.print("a line")
+      print("another one, without the console", flush=True)
+      bar.update(100)

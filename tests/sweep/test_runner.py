@@ -3,14 +3,17 @@
 import json
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from playground.cli import sweep as command
+from playground.config import compose_settings
 from playground.errors import CheckpointError, ConfigError
 from playground.sweep.folder import SweepDirectory
+from playground.sweep.runner import run_sweep
 from playground.sweep.worker import Worker
 from tests.sweep.helpers import STUB, controller, make_sweep, output, run, starts, statuses, wait_for
 
@@ -137,6 +140,17 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
   assert folder.locked() and folder.state().status == "running", "the job itself is still at work"
   assert process.wait(60) == 0
   assert folder.state().status == "finished"
+
+
+def test_a_sweep_goes_on_where_nobody_reads_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0, 1)
+  reader, writer = os.pipe()
+  os.close(reader)
+  with os.fdopen(writer, "w") as stream:
+    monkeypatch.setattr(sys, "stdout", stream)
+    assert run_sweep(sweep, compose_settings(["launcher.cores_per_job=1"]), STUB) == 0
+  assert set(statuses(sweep).values()) == {"finished"}
+  assert (sweep.path / "sweep.csv").is_file() and not sweep.stop_file.exists()
 
 
 def test_one_process_at_a_time(tmp_path: Path) -> None:
