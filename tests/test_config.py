@@ -27,6 +27,7 @@ from playground.learning.hyperparameters import config_class
 from playground.mdp.options import is_model_field
 from playground.runs.run_dir import RunDirectory
 from playground.settings import plain
+from tests.aliases import LAUGHS
 from tests.sampling import some
 
 TUNED = ["experiment=cartpole_balance"]
@@ -282,7 +283,7 @@ def test_saved_configuration_reads_back(tmp_path: Path):
 
 
 def test_foreign_configuration_is_refused(tmp_path: Path):
-  for text in ("a: 1", "[1]", "a: [", "${"):
+  for text in ("a: 1", "[1]", "a: [", "${", LAUGHS):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(ConfigError, match=rf"^{tmp_path}/config\.yaml"):  # a chain has one for each stage
       config.load(tmp_path / "config.yaml")

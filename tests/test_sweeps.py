@@ -22,6 +22,7 @@ from playground.config import (
 )
 from playground.config.sweep_options import LAUNCHERS, SEARCHES
 from playground.errors import ConfigError, UnknownNameError
+from tests.aliases import LAUGHS
 
 
 @pytest.fixture
@@ -76,6 +77,11 @@ def test_a_file_spelt_out(folder: Path):
   env = ",".join(["CartpoleBalance", *(name for name in task_names() if name.startswith("Go1"))])
   assert expand(["sweep=mine"]) == [f"env={env}", "agent=ppo", "seed=range(2)"]
   assert combinations(expand(["sweep=mine"]))[0] == ["env=CartpoleBalance", "agent=ppo", "seed=0"]
+
+
+def test_a_file_may_use_anchors(folder: Path):
+  (folder / "two.yaml").write_text("params: {seed: &few [1, 2], agent.num_envs: *few}")
+  assert expand(["sweep=two"]) == ["seed=1,2", "agent.num_envs=1,2"]
 
 
 def test_the_command_line_replaces_what_the_file_says(folder: Path):
@@ -153,6 +159,7 @@ def test_what_is_refused(folder: Path, line: str, message: str):
     "params: {env: CartpoleBalanc}": "env=CartpoleBalanc does not exist",
     "jobs: ['seed=\"1']": "sweep=bad: its job 'seed=\"1' cannot be read: No closing quotation.",
     "params: &a {seed: *a}": "sweep=bad: its file cannot be read: ",
+    LAUGHS: "sweep=bad: its file cannot be read: its aliases stand for more than 10,000 values.",
     "params: {seed: é}": "sweep=bad: its file cannot be read: ",
   }.items(),
 )

@@ -23,7 +23,7 @@ from playground.errors import ConfigError
 from playground.hardware.options import HardwareConfig
 from playground.learning.hyperparameters import AgentConfig, read_config
 from playground.settings import Plain, Section, build, config_dict
-from playground.text import dump_yaml, first_line, format_value
+from playground.text import check_aliases, dump_yaml, first_line, format_value
 
 if TYPE_CHECKING:
   from rich.tree import Tree
@@ -132,6 +132,7 @@ def load(path: Path) -> RunConfig:
   if path.exists() and not path.is_file():  # a read of a named pipe would wait for ever
     raise ConfigError(f"{path} is not a file.")
   try:
+    check_aliases(path)
     resolved = OmegaConf.to_container(OmegaConf.load(path))
   except (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError) as error:
     raise ConfigError(f"{path} cannot be read: {first_line(error)}.") from None

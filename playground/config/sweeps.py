@@ -34,7 +34,7 @@ from yaml import YAMLError
 from playground.config.files import config_roots, groups, listed_options, shipped
 from playground.config.overrides import is_hydras, is_of_command, is_of_sweep, parse, parse_with_hydra
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.text import first_line, format_value
+from playground.text import check_aliases, first_line, format_value
 
 _HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper")
 
@@ -218,6 +218,7 @@ def _read(name: str) -> tuple[list[str], list[str]]:
     choices = f"choose from {', '.join(known)}, or give the path of a .yaml file"
     raise UnknownNameError(f"sweep={name} does not exist: {choices}.{nearest(name, known)}")
   try:
+    check_aliases(path)
     content = OmegaConf.to_container(OmegaConf.load(path))
   except (YAMLError, OmegaConfBaseException, ValueError, RecursionError, OSError) as error:
     raise ConfigError(f"sweep={name}: its file cannot be read: {first_line(error)}.") from None

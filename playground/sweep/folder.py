@@ -20,7 +20,7 @@ from playground.files import is_locked, lock_holder, locking, make_numbered, rea
 from playground.runs.csv_tracker import RETURN
 from playground.runs.run_dir import RunDirectory, now
 from playground.settings import Plain, select
-from playground.text import dump_yaml, first_line
+from playground.text import check_aliases, dump_yaml, first_line
 
 Status = Literal["queued", "submitted", "running", "finished", "failed", "timeout", "preempted", "killed"]
 ENDED = ("finished", "failed", "timeout", "preempted", "killed")
@@ -235,6 +235,7 @@ class SweepDirectory:
       near = "" if path.is_dir() else nearest(path.name, siblings)
       raise CheckpointError(f"{path} is not the folder of a sweep: it has no sweep.yaml.{near}")
     try:
+      check_aliases(file)
       content = yaml.safe_load(file.read_text(encoding="utf-8"))
       _check(content)
       return cls(path, **content | {"jobs": [Job(**job) for job in content["jobs"]], "cwd": Path(content["cwd"])})

@@ -13,6 +13,7 @@ from playground.sweep.folder import SweepDirectory
 from playground.sweep.plan import settings_of
 from playground.sweep.slurm import SlurmLauncher
 from playground.sweep.worker import COMMAND
+from tests.aliases import LAUGHS
 from tests.sweep.helpers import make_sweep, run, statuses
 
 PACKAGE = Path(__file__).parents[2] / "playground"
@@ -135,4 +136,10 @@ def test_a_damaged_sweep_is_one_sentence(tmp_path: Path, content: object) -> Non
 def test_a_sweep_nested_too_deeply_is_one_sentence(tmp_path: Path) -> None:
   (tmp_path / "sweep.yaml").write_text("[" * 100_000)
   with pytest.raises(CheckpointError, match=r"sweep\.yaml is damaged: maximum recursion depth"):
+    SweepDirectory.open(tmp_path)
+
+
+def test_a_sweep_of_endless_aliases_is_one_sentence(tmp_path: Path) -> None:
+  (tmp_path / "sweep.yaml").write_text(LAUGHS)
+  with pytest.raises(CheckpointError, match=r"sweep\.yaml is damaged: its aliases stand for more than 10,000 values\."):
     SweepDirectory.open(tmp_path)
