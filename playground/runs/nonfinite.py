@@ -58,13 +58,19 @@ class Dump:
     self._state, self.model, self.after = part("state"), part("model/"), part("after/")
 
   def state(self, env: Env) -> State:
-    """Returns the last finite state, for the task of the dump."""
-    template = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    names = [name for name, _ in _named(template)]
-    missing = [name for name in names if name not in self._state]
-    if missing:
-      raise CheckpointError(f"The dump does not fit this task: it has no {missing[0]}.")
-    return jax.tree.unflatten(jax.tree.structure(template), [self._state[name] for name in names])
+    """Returns the last finite state, for the task of the dump.
+
+    Raises:
+      CheckpointError: an array is missing, unknown, or not of the shape and kind that the task has.
+    """
+    template, model = jax.eval_shape(lambda: (env.reset(jax.random.PRNGKey(0)), env.mjx_model))
+    fields = {name.removeprefix("."): field for name, field in _named(model)}
+    _must_fit("action", self.action, jax.ShapeDtypeStruct((env.action_size,), np.float32))
+    for name, value in self.model.items():
+      _must_fit(f"model/{name}", value, fields.get(name))
+    for name, leaf in _named(template):
+      _must_fit(f"state{name}", self._state.get(name), leaf)
+    return jax.tree.unflatten(jax.tree.structure(template), [self._state[name] for name, _ in _named(template)])
 
   def replay(self, env: Env) -> State:
     """Repeats the step on this machine's backend."""
@@ -80,6 +86,18 @@ def nonfinite_fields(tree: PyTree) -> list[str]:
     if bad.any():
       lines.append(f"{name}: {int(bad.sum())} of {values.size}")
   return lines
+
+
+def _must_fit(name: str, found: np.ndarray | None, expected: np.ndarray | jax.ShapeDtypeStruct | None) -> None:
+  """Raises CheckpointError unless an array of a dump has the shape and kind that the task expects."""
+  if found is None or expected is None:
+    why = f"it has no {name}" if found is None else f"the task has no {name}"
+  elif (found.shape, found.dtype.kind) != (expected.shape, expected.dtype.kind):
+    described = [f"{array.dtype}{list(array.shape)}" for array in (found, expected)]
+    why = f"its {name} is {described[0]}, the task's is {described[1]}"
+  else:
+    return
+  raise CheckpointError(f"The dump does not fit this task: {why}.")
 
 
 def _named(tree: PyTree) -> list[tuple[str, np.ndarray]]:

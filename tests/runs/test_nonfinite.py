@@ -11,11 +11,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from playground import registry
 from playground.cli.replay import replay
 from playground.config import compose
+from playground.errors import CheckpointError
 from playground.learning import algorithm
 from playground.learning.checkpoints import find_checkpoints
+from playground.learning.rollout import Step
 from playground.runs.callbacks import NonfiniteError
+from playground.runs.nonfinite import Dump, write_dump
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.runs.helpers import TASK, resume
@@ -57,6 +61,27 @@ def test_nan_is_counted_dumped_and_kept_out(
   RunDirectory(run).set_status("running")
   assert resume(run) == 0
   assert list((run / "nan_dump").iterdir()) == [dump], "one dump a run, however often it is resumed"
+
+
+def test_a_dump_of_another_task_is_one_sentence(tmp_path: Path) -> None:
+  config = compose(TASK)
+  env = registry.load("CartpoleBalance", config=config.env)
+  state = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(env.reset, jax.random.PRNGKey(0)))
+  arrays: dict[str, Any] = {"action": np.zeros(1, np.float32), "model": {"body_mass": np.ones(3, np.float32)}}
+
+  def refusal(**changed: Any) -> str:
+    step = Step(**{"state": state, "after": {}, **arrays, **changed})
+    dump = Dump(str(write_dump(tmp_path, 0, jax.tree.map(lambda leaf: leaf[None], step), config.resolved)))
+    with pytest.raises(CheckpointError, match=r"^The dump does not fit this task: ") as raised:
+      dump.state(env)
+    return str(raised.value).partition(": ")[2]
+
+  assert refusal(action=np.zeros(7, np.float32)) == "its action is float32[7], the task's is float32[1]."
+  assert refusal(action=np.array(["a"])) == "its action is <U1[1], the task's is float32[1]."
+  assert refusal(model={"body_mass": np.ones(99)}).startswith("its model/body_mass is float64[99], the task's is")
+  assert refusal(model={"nosuch": np.ones(1)}) == "the task has no model/nosuch."
+  assert refusal(state=state.replace(done=np.zeros(3))) == "its state.done is float64[3], the task's is float32[]."
+  assert refusal(state=state.replace(metrics={})).startswith("it has no state.metrics")
 
 
 @pytest.mark.parametrize("agent", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
