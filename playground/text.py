@@ -12,6 +12,7 @@ import yaml
 from playground.errors import ConfigError, nearest
 
 _MOST_ALIASED = 10_000
+_MOST_BITS = 10_000  # of a number in decimals: Python refuses to write more than 4300 digits
 
 
 def format_value(value: object) -> str:
@@ -20,7 +21,9 @@ def format_value(value: object) -> str:
     return {None: "null", True: "true", False: "false"}[value]
   if items := getattr(value, "items", None):  # of a ConfigDict, too, which is no Mapping
     return "{" + ", ".join(f"{k}: {format_value(v)}" for k, v in items()) + "}"
-  return f"[{', '.join(map(format_value, value))}]" if isinstance(value, list | tuple) else str(value)
+  if isinstance(value, list | tuple):
+    return f"[{', '.join(map(format_value, value))}]"
+  return hex(value) if isinstance(value, int) and value.bit_length() > _MOST_BITS else str(value)
 
 
 def millions(steps: float) -> str:

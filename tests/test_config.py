@@ -294,6 +294,14 @@ def test_foreign_configuration_is_refused(tmp_path: Path):
     config.load(tmp_path / "pipe")
 
 
+def test_a_saved_number_of_any_length_is_refused(tmp_path: Path):
+  resolved = compose(["env=CartpoleBalance"]).resolved
+  text = config.values_to_yaml({**resolved, "seed": "length"}).replace("seed: length", f"seed: 0x{'f' * 9000}")
+  (tmp_path / "config.yaml").write_text(text)
+  with pytest.raises(ConfigError, match=r"seed=0xf+ "):
+    compose([f"resume={tmp_path}"])
+
+
 def test_null_keys_can_be_assigned():
   run = compose()
   run.env.vision.camera = "side"
@@ -403,6 +411,7 @@ ERRORS = {
   "run_dir=${oc.env:NO_SUCH_FOLDER}": ["run_dir: ", "'NO_SUCH_FOLDER' not found"],
   "init_from=${oc.env:NO_SUCH_FOLDER}": ["init_from: ", "'NO_SUCH_FOLDER' not found"],
   "run_dir=3": ["run_dir=3", "must be text (put quotes around a number)."],
+  f"seed={'9' * 5000}": ["seed cannot be a whole number of more than 4300 digits: "],
   "agent=[1": ["'agent=[1' is not an override: its value does not parse; a list is [1, 2], "],
   "agent.num_envs": ["'agent.num_envs' is not an override: write key=value, such as env=CartpoleBalance"],
   "hardware.xla_flags=--a=b": ["quote its value, in a shell 'hardware.xla_flags=\"--a=b\"'."],

@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -74,10 +75,15 @@ def parse_with_hydra(text: str) -> HydraOverride:
   first.
   """
   key, _, value = text.partition("=")
-  with contextlib.suppress(HydraException):
+  try:
     parsed = OverridesParser.create().parse_override(text)
     if key and (key not in _PATHS or parsed.is_sweep_override() or not isinstance(parsed.value(), list | dict)):
       return parsed
+  except ValueError:  # of Python
+    most = sys.get_int_max_str_digits()
+    raise ConfigError(f"{key} cannot be a whole number of more than {most} digits: write a smaller one.") from None
+  except HydraException:
+    pass
   if key in _PATHS:
     with contextlib.suppress(HydraException):
       return OverridesParser.create().parse_override(f"{key}={quoted(value)}")
