@@ -12,7 +12,7 @@ from playground.config import RunConfig
 from playground.envs.base import Env
 from playground.errors import PlaygroundError
 from playground.learning.algorithm import Policy
-from playground.learning.checkpoints import CheckpointStore, checksum
+from playground.learning.checkpoints import BEST, Checkpoint, CheckpointStore, checksum, find_checkpoints
 from playground.learning.evaluation import Recording
 from playground.learning.loop import Loop, Metrics
 from playground.learning.population import PARENT
@@ -171,7 +171,7 @@ class RunCallbacks:
       self._trackers.close(status)
 
   def _scores(self) -> dict[str, float | None]:
-    """Returns the result from metrics.csv, which covers all starts of the run."""
+    """Returns the result from metrics.csv, which covers all starts of the run, and the best checkpoint."""
     table = read_metrics(self._run_dir.metrics_csv)
     column = lambda name: np.asarray(table[name] if name in table else np.full(len(table), np.nan), float)
     steps, returns, rate = (column(name) for name in ("step", RETURN, "time/steps_per_second"))
@@ -180,6 +180,10 @@ class RunCallbacks:
     chosen = "mode" if acts_by_mode else "sampled"
     own = np.isfinite(returns) & ~np.isfinite(column(PARENT))
     scores = [(float(value), int(step)) for value, step in zip(returns[own], steps[own], strict=True)]
+    best = self._run_dir.checkpoints / BEST
+    if best.is_dir():  # metrics.csv may have lost its row
+      checkpoint = Checkpoint(find_checkpoints(best)[0])
+      scores.append((checkpoint.meta["return"], checkpoint.step))
     # As for `checkpoints/best`: the last of equal returns, and no policy without a checkpoint (the untrained one).
     best_return, best_step = max((score for score in scores if score[1] > 0), default=(None, None))
     trained = np.isfinite(rate)

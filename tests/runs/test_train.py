@@ -281,6 +281,13 @@ def test_damaged_metrics_are_rebuilt(whole: Path, copy: Path, capsys: pytest.Cap
   assert_same_result(copy, whole)
 
 
+def test_lost_metrics_lose_not_the_best(whole: Path, copy: Path) -> None:
+  (copy / "metrics.csv").write_text("")
+  assert resume(copy) == 0
+  ours, theirs = (RunDirectory(run).summary for run in (copy, whole))
+  assert (ours["best_return"], ours["best_step"]) == (theirs["best_return"], theirs["best_step"])
+
+
 def test_a_best_policy_whose_metrics_are_gone_is_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
   run = RunDirectory(copy)
   run.write_summary({"status": "finished", "final_return": 1.0, "steps": 1, "best_step": None, "best_return": None})
