@@ -9,9 +9,15 @@ from typing import TextIO
 from rich.console import Console
 
 
-def lasting_console() -> Console:
+def lasting_console(columns: int | None = None) -> Console:
   """Returns a console whose user goes on, without output, once the terminal or the reader of the pipe is gone."""
-  return Console(file=_Lasting(sys.stdout))  # pyright: ignore[reportArgumentType]
+  return Console(file=_Lasting(sys.stdout), width=columns)  # pyright: ignore[reportArgumentType]
+
+
+def wide_console(columns: int = 240) -> Console:
+  """Returns a console for tables: as wide as the terminal, or of so many columns where there is none."""
+  console = lasting_console()
+  return console if console.is_terminal else lasting_console(columns)
 
 
 class _Lasting:

@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from playground.cli.list_tasks import wide_console
 from playground.config import RunConfig, compose, compose_settings, config_roots, format_value, is_of_sweep
 from playground.config.comments import keys_and_comments, meaning
 from playground.config.definitions import chosen_names, definition
 from playground.config.files import find_file, groups, lineage, listed_options
 from playground.config.overrides import SHORT_KEYS
 from playground.config.schema import check_key
+from playground.console import wide_console
 from playground.errors import UnknownNameError, nearest
 from playground.mdp.options import OPTIONS
 from playground.settings import Plain, Section, Setting

@@ -4,12 +4,12 @@ import dataclasses
 import json
 from collections.abc import Iterable, Mapping
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from playground.catalog import entries
 from playground.config import compose
+from playground.console import wide_console
 from playground.errors import UnknownNameError, nearest
 from playground.settings import Section
 from playground.text import millions
@@ -54,12 +54,6 @@ def _composed(name: str) -> Section:
   config = compose([f"env={name}"])
   settings = {"agent": config.agent_name, "budget": config.agent.num_timesteps}
   return {"task": name, "robot": config.choices.get("robot") or "", "backend": config.env.cuda_impl, **settings}
-
-
-def wide_console(columns: int = 240) -> Console:
-  """Returns a console for tables: as wide as the terminal, or of so many columns where there is none."""
-  console = Console()
-  return console if console.is_terminal else Console(width=columns)
 
 
 def _table(rows: Iterable[Section]) -> Table:

@@ -7,9 +7,9 @@ from rich.console import Console
 from rich.table import Table
 
 from playground import catalog, pretrained
-from playground.cli.list_tasks import wide_console
 from playground.cli.play import play
 from playground.config import task_names
+from playground.console import wide_console
 from playground.deploy.scores import read_scores, result_name
 from playground.errors import ConfigError
 from playground.files import need_folder

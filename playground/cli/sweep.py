@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 
-from rich.console import Console
-
 from playground.config import is_of_command
+from playground.console import wide_console
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.plan import settings_of
 from playground.sweep.report import write_result
@@ -16,7 +15,7 @@ from playground.sweep.worker import job_command
 def status(folder: str) -> int:
   """Prints the status of every job."""
   sweep = SweepDirectory.open(folder)
-  Console().print(status_table(sweep, sweep.states(), rows=None))
+  wide_console().print(status_table(sweep, sweep.states(), rows=None))
   return 0
 
 

@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as ConsoleTable
 
+from playground.console import wide_console
 from playground.files import replacing, write_text
 from playground.reporting.page import (
   Block,
@@ -55,7 +55,7 @@ def write_result(sweep: SweepDirectory, notify: Callable[[str], None] = print) -
     shown = ConsoleTable(*header, title="mean ± 95 % confidence interval")
     for row in rows:
       shown.add_row(*map(escape, row))
-    Console().print(shown)
+    wide_console().print(shown)
   files += [*curves, page]
   notify(f"Result of {sweep.path}: {', '.join(str(path.relative_to(sweep.path)) for path in files)}")
   return files

@@ -73,6 +73,16 @@ def test_a_sweep_that_has_only_begun_has_a_result(tmp_path: Path) -> None:
   assert list(pd.read_csv(tmp_path / "sweep.csv")["status"]) == ["queued"]
 
 
+def test_a_log_shows_the_whole_key_and_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  jobs = [Job(value, [], {"env.rewards.action_rate_l2.weight": value}) for value in ("-0.000711", "-0.000712")]
+  sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], jobs)
+  for job in jobs:
+    sweep.folder(job).write(status="finished")
+  write_result(sweep, lambda text: None)
+  words = capsys.readouterr().out.split()
+  assert {"env.rewards.action_rate_l2.weight", "-0.000711", "-0.000712"} <= set(words)
+
+
 def test_a_list_of_texts_is_no_markup(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
   jobs = [Job(name, [], {"a.joints": f"[{name}]"}) for name in ("hip", "knee")]
   sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], jobs)
