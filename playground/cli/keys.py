@@ -47,6 +47,8 @@ def show_keys(prefix: str, overrides: Sequence[str]) -> int:
   roots = config_roots()
   console = wide_console(160)
   prefix = SHORT_KEYS.get(prefix.strip("."), prefix.strip("."))
+  if not prefix:
+    raise UnknownNameError(f"A section, a key or a group is missing: choose from {', '.join(values)}, or one in them.")
   if prefix in groups(roots):
     names = [name for name in listed_options(prefix, roots) if not name.split("/")[-1].startswith("_")]
     console.print(Text(f"{prefix}=<option>", style="bold"), Text(f"one of {', '.join(names)}"), sep=": ")

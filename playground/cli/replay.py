@@ -1,5 +1,7 @@
 """`playground replay <dump>`: repeats a step that was NaN, infinite or too large, and shows where."""
 
+from pathlib import Path
+
 import jax
 from rich.console import Console
 
@@ -19,7 +21,7 @@ def replay(file: str) -> int:
     0 if the replay is not finite either, 1 if this machine does not reproduce it.
   """
   console = Console()
-  dump = Dump(file)
+  dump = Dump(Path(file))
   run = configs.from_saved(dump.config)
   hardware = setup(this_machine(run.hardware))
   env = registry.load(run.choices["env"], config=run.env)

@@ -198,6 +198,8 @@ def test_keys_refuses(command: Command, capsys: pytest.CaptureFixture[str]):
   assert "its term is not one of the task's. Did you mean 'velocity'?" in capsys.readouterr().err
   assert command("keys", "env.vision.brightness.0") == 2
   assert "a key before 0 holds a value" in capsys.readouterr().err
+  assert command("keys", ".") == 2
+  assert capsys.readouterr().err.startswith("error: A section, a key or a group is missing: choose from ")
 
 
 def test_doctor(command: Command, monkeypatch: pytest.MonkeyPatch):

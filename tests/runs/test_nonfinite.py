@@ -63,6 +63,11 @@ def test_nan_is_counted_dumped_and_kept_out(
   assert list((run / "nan_dump").iterdir()) == [dump], "one dump a run, however often it is resumed"
 
 
+def test_no_dump_at_all_is_one_sentence() -> None:
+  with pytest.raises(CheckpointError, match=r"^\. is not a dump"):
+    replay("")
+
+
 def test_a_dump_of_another_task_is_one_sentence(tmp_path: Path) -> None:
   config = compose(TASK)
   env = registry.load("CartpoleBalance", config=config.env)
