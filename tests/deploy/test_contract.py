@@ -1,6 +1,7 @@
 """What `policy.yaml` says of tasks, against their models and their own functions (nothing is compiled)."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -8,12 +9,13 @@ import pytest
 import yaml
 
 from playground import registry
-from playground.deploy.contract import check_contract, describe_policy
+from playground.deploy.contract import check_contract, describe_policy, read_contract
 from playground.envs.base import State
 from playground.errors import CheckpointError
 from playground.files import plain
 from playground.mdp.terms import registered
 from playground.text import first_docstring_line
+from tests.aliases import LAUGHS
 
 
 def contract(
@@ -168,3 +170,8 @@ def test_a_camera_that_sees_depth_beside_a_vector() -> None:
     ("pixels_lookatcart", [1, 64, 64, 1]), ("obs", [1, 5]),
   ]  # fmt: skip
   assert [term["name"] for term in said["observation"]] == ["cart_position", "pole_cos", "pole_sin", "velocity"]
+
+
+def test_a_file_of_endless_aliases_is_no_contract(tmp_path: Path) -> None:
+  (tmp_path / "policy.yaml").write_text(LAUGHS)
+  assert read_contract(tmp_path / "policy.yaml") is None
