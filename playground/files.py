@@ -1,23 +1,30 @@
 """Files that are either complete or absent: whatever kills a run never leaves half of one under its real name.
 
-And locks: files that say which process is at work on a run, a job or a sweep.
+And locks: files that say which process is at work on a run, a job or a sweep. And readers of files that another user
+may have written.
 """
 
 import csv
 import errno
 import fcntl
+import itertools
 import json
 import os
 import shutil
 import socket
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import yaml
+
 from playground.errors import CheckpointError, ConfigError
 from playground.settings import Plain, plain
+
+_MOST_ALIASED = 10_000
 
 
 def need_folder(folder: Path, option: str, within: Path | None = None) -> None:
@@ -195,3 +202,26 @@ def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Plain]:
     why = f"its {wrong[0]!r} has the wrong type" if wrong else "it is no JSON object"
     raise CheckpointError(f"{path} is damaged ({why}): move it away to go on without it.")
   return content
+
+
+def check_aliases(path: Path) -> None:
+  """Raises YAMLError if the aliases of a file stand for so many values that reading them might take for ever."""
+  sizes: dict[int, int] = {}  # values that a node stands for
+
+  def size(node: yaml.Node) -> int:
+    if id(node) not in sizes:
+      sizes[id(node)] = sys.maxsize  # for an alias inside of what it stands for
+      inner = itertools.chain(*node.value) if isinstance(node, yaml.MappingNode) else node.value
+      sizes[id(node)] = 1 + (0 if isinstance(node, yaml.ScalarNode) else sum(map(size, inner)))
+    return sizes[id(node)]
+
+  with path.open(encoding="utf-8") as file:
+    node = yaml.compose(file, yaml.SafeLoader)
+  if node is not None and size(node) > len(sizes) + _MOST_ALIASED:
+    raise yaml.YAMLError(f"its aliases stand for more than {_MOST_ALIASED:,} values")
+
+
+def read_yaml(path: Path) -> Plain:
+  """Reads a YAML file that another user may have written; raises as `check_aliases` does, OSError and ValueError."""
+  check_aliases(path)
+  return yaml.safe_load(path.read_text(encoding="utf-8"))

@@ -1,17 +1,13 @@
 """Values and errors in the words of the command line."""
 
 import hashlib
-import itertools
 import re
-import sys
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import yaml
 
 from playground.errors import ConfigError, nearest
 
-_MOST_ALIASED = 10_000
 _MOST_BITS = 10_000  # of a number in decimals: Python refuses to write more than 4300 digits
 
 
@@ -68,23 +64,6 @@ _Dumper.add_representer(str, _represent_text)
 def dump_yaml(values: object) -> str:
   """Returns plain dicts, lists and scalars as YAML, which reads back the same."""
   return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
-
-
-def check_aliases(path: Path) -> None:
-  """Raises YAMLError if the aliases of a file stand for so many values that reading them might take for ever."""
-  sizes: dict[int, int] = {}  # values that a node stands for
-
-  def size(node: yaml.Node) -> int:
-    if id(node) not in sizes:
-      sizes[id(node)] = sys.maxsize  # for an alias inside of what it stands for
-      inner = itertools.chain(*node.value) if isinstance(node, yaml.MappingNode) else node.value
-      sizes[id(node)] = 1 + (0 if isinstance(node, yaml.ScalarNode) else sum(map(size, inner)))
-    return sizes[id(node)]
-
-  with path.open(encoding="utf-8") as file:
-    node = yaml.compose(file, yaml.SafeLoader)
-  if node is not None and size(node) > len(sizes) + _MOST_ALIASED:
-    raise yaml.YAMLError(f"its aliases stand for more than {_MOST_ALIASED:,} values")
 
 
 def first_line(error: BaseException) -> str:

@@ -11,8 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from playground import registry
-from playground.cli.list_tasks import wide_console
 from playground.config import RunConfig, compose, format_value
+from playground.console import wide_console
 from playground.errors import ConfigError
 from playground.mdp.options import MODEL_FIELD, is_model_field
 from playground.settings import Plain, Section

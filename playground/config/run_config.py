@@ -20,10 +20,11 @@ from playground.config.run_options import (
 )
 from playground.envs.options import EnvConfig
 from playground.errors import ConfigError
+from playground.files import check_aliases
 from playground.hardware.options import HardwareConfig
 from playground.learning.hyperparameters import AgentConfig, read_config
 from playground.settings import Plain, Section, build, config_dict
-from playground.text import check_aliases, dump_yaml, first_line, format_value
+from playground.text import dump_yaml, first_line, format_value
 
 if TYPE_CHECKING:
   from rich.tree import Tree

@@ -34,7 +34,8 @@ from yaml import YAMLError
 from playground.config.files import config_roots, groups, listed_options, shipped
 from playground.config.overrides import is_hydras, is_of_command, is_of_sweep, parse, parse_with_hydra
 from playground.errors import ConfigError, UnknownNameError, nearest
-from playground.text import check_aliases, first_line, format_value
+from playground.files import check_aliases
+from playground.text import first_line, format_value
 
 _HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper")
 

@@ -14,11 +14,12 @@ from playground.config import format_value
 from playground.deploy.graph import OUTPUT, input_names
 from playground.envs.base import PIXELS, Env, State
 from playground.errors import CheckpointError
+from playground.files import read_yaml
 from playground.mdp.commands import Gait, UniformVelocity, VelocityWalk
 from playground.mdp.managers import ACTOR
 from playground.mdp.options import OPTIONS, ObservationOptions
 from playground.settings import plain
-from playground.text import check_aliases, first_docstring_line
+from playground.text import first_docstring_line
 
 FORMAT = "playground-policy/3"
 Contract = dict[str, Any]  # the content of the YAML file, or of its section `env`
@@ -93,8 +94,7 @@ def describe_policy(
 def read_contract(file: Path) -> Contract | None:
   """Returns the mapping in a YAML file, unchecked; None if there is none. Raises OSError if it cannot be read."""
   try:
-    check_aliases(file)
-    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    content = read_yaml(file)
   except (yaml.YAMLError, ValueError, RecursionError):  # such as an invalid date
     return None
   return content if isinstance(content, dict) else None

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 import yaml
 
 from playground.errors import CheckpointError, PlaygroundError, nearest
-from playground.files import lock_holder, locking, make_numbered, read_json, write_json, write_text
+from playground.files import lock_holder, locking, make_numbered, read_json, read_yaml, write_json, write_text
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
 from playground.settings import Plain, Section, plain
@@ -128,7 +128,7 @@ class RunDirectory:
   @property
   def config(self) -> dict[str, Plain]:
     """The resolved config that the run was started with."""
-    return yaml.safe_load(self.config_path.read_text(encoding="utf-8"))
+    return read_yaml(self.config_path)
 
   @property
   def overrides(self) -> list[str]:
@@ -140,7 +140,7 @@ class RunDirectory:
     if not self.overrides_path.is_file():
       return []
     try:
-      found = yaml.safe_load(self.overrides_path.read_text(encoding="utf-8"))
+      found = read_yaml(self.overrides_path)
     except OSError as error:
       raise CheckpointError(f"{self.overrides_path} cannot be read: {error.strerror}.") from error
     except (yaml.YAMLError, ValueError, RecursionError):

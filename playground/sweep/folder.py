@@ -16,11 +16,20 @@ import yaml
 from playground.config import RunConfig, format_value, is_of_command
 from playground.config.overrides import SHORT_KEYS
 from playground.errors import CheckpointError, ConfigError, nearest
-from playground.files import is_locked, lock_holder, locking, make_numbered, read_json, write_json, write_text
+from playground.files import (
+  is_locked,
+  lock_holder,
+  locking,
+  make_numbered,
+  read_json,
+  read_yaml,
+  write_json,
+  write_text,
+)
 from playground.runs.csv_tracker import RETURN
 from playground.runs.run_dir import RunDirectory, now
 from playground.settings import Plain, select
-from playground.text import check_aliases, dump_yaml, first_line
+from playground.text import dump_yaml, first_line
 
 Status = Literal["queued", "submitted", "running", "finished", "failed", "timeout", "preempted", "killed"]
 ENDED = ("finished", "failed", "timeout", "preempted", "killed")
@@ -235,8 +244,7 @@ class SweepDirectory:
       near = "" if path.is_dir() else nearest(path.name, siblings)
       raise CheckpointError(f"{path} is not the folder of a sweep: it has no sweep.yaml.{near}")
     try:
-      check_aliases(file)
-      content = yaml.safe_load(file.read_text(encoding="utf-8"))
+      content = read_yaml(file)
       _check(content)
       return cls(path, **content | {"jobs": [Job(**job) for job in content["jobs"]], "cwd": Path(content["cwd"])})
     except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:

@@ -18,6 +18,7 @@ from playground.errors import PlaygroundError
 from playground.runs import train as train_module
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
+from tests.aliases import MERGED
 from tests.runs.helpers import TASK
 
 MUTATIONS: dict[str, Callable[[bytes], bytes]] = {
@@ -107,7 +108,7 @@ def test_a_damaged_file(name: str, how: str, run: Path, read: Read) -> None:
     assert resumed == "error: all is read."
 
 
-NO_OVERRIDES = (b"", b"{a: b", b"[1, 2]", b"\xff\0", b"{a: b}", b"text", b"[" * 100_000)
+NO_OVERRIDES = (MERGED.encode(), b"", b"{a: b", b"[1, 2]", b"\xff\0", b"{a: b}", b"text", b"[" * 100_000)
 
 
 @pytest.mark.parametrize("content", NO_OVERRIDES, ids=lambda content: repr(content[:9]))
