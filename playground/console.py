@@ -1,23 +1,33 @@
-"""Consoles on standard output."""
+"""Standard output: what commands print to."""
 
+import contextlib
 import errno
 import os
 import sys
-from collections.abc import Callable
-from typing import TextIO
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, TextIO
 
-from rich.console import Console
-
-
-def lasting_console(columns: int | None = None) -> Console:
-  """Returns a console whose user goes on, without output, once the terminal or the reader of the pipe is gone."""
-  return Console(file=_Lasting(sys.stdout), width=columns)  # pyright: ignore[reportArgumentType]
+if TYPE_CHECKING:
+  from rich.console import Console
 
 
-def wide_console(columns: int = 240) -> Console:
+def wide_console(columns: int = 240) -> "Console":
   """Returns a console for tables: as wide as the terminal, or of so many columns where there is none."""
-  console = lasting_console()
-  return console if console.is_terminal else lasting_console(columns)
+  from rich.console import Console
+
+  console = Console()
+  return console if console.is_terminal else Console(width=columns)
+
+
+@contextlib.contextmanager
+def lasting_stdout() -> Iterator[None]:
+  """Lets a command go on, without output, once its terminal or the reader of its pipe is gone (`| head`)."""
+  stream = _Lasting(sys.stdout)
+  with contextlib.redirect_stdout(stream):  # pyright: ignore[reportArgumentType]
+    try:
+      yield
+    finally:
+      stream.flush()
 
 
 class _Lasting:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from playground import __version__
 from playground.benchmark.arguments import help_of, parse
+from playground.console import lasting_stdout
 from playground.errors import PlaygroundError, UnknownNameError, nearest, one_sentence
 
 # Measurements are in one module; each other command is a module with `Options` and `run(options) -> exit code`.
@@ -17,10 +18,8 @@ def main() -> None:
   """Runs a command and exits: 0 done, 1 failed, 2 an error that the user can act on, 3 time up with jobs left."""
   signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # SystemExit ends the child processes
   try:
-    code = _main(sys.argv[1:])
-  except BrokenPipeError:  # `playground-bench --help | head`
-    sys.stderr.close()
-    code = 0
+    with lasting_stdout():
+      code = _main(sys.argv[1:])
   except (PlaygroundError, OSError) as error:
     print(one_sentence(error), file=sys.stderr)
     code = 2

@@ -9,6 +9,7 @@ from typing import Any
 
 from playground import __version__, registry
 from playground.cli.completion import SHELLS, commands_of
+from playground.console import lasting_stdout
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest, one_sentence
 from playground.limits import SEED, count
 from playground.pretrained import working_copy
@@ -44,15 +45,13 @@ def main() -> None:
     importlib.import_module(_PROGRAMS[sys.argv.pop(1)][0]).main()
   withhold_gl()
   try:
-    args = _arguments()
-    trust(*args.trust)
-    _check_numbers(args)
-    code = args.command(args)
+    with lasting_stdout():
+      args = _arguments()
+      trust(*args.trust)
+      _check_numbers(args)
+      code = args.command(args)
   except KeyboardInterrupt:
     code = 130  # the code of a shell for SIGINT
-  except BrokenPipeError:  # `playground list | head`
-    sys.stderr.close()
-    code = 0
   except (PlaygroundError, OSError) as error:
     print(one_sentence(error), file=sys.stderr)
     code = 2

@@ -36,6 +36,7 @@ from playground.config import (
   tree,
   values_to_yaml,
 )
+from playground.console import lasting_stdout
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError, one_sentence
 from playground.gc_pause import gc_paused
 from playground.rendering.gl import withhold_gl
@@ -53,10 +54,8 @@ def main() -> None:
   withhold_gl()
   os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # any other error is a bug: show the traceback
   try:
-    code = _main(sys.argv[1:])
-  except BrokenPipeError:  # `playground-run --help | head`
-    sys.stderr.close()
-    code = 0
+    with lasting_stdout():
+      code = _main(sys.argv[1:])
   except (PlaygroundError, HydraException, OSError) as error:
     code = _report(error)
   except KeyboardInterrupt:  # before training listens for signals
@@ -198,14 +197,15 @@ def _check_flags(args: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 
 def _train(config: RunConfig, verbose: bool) -> int:
-  from playground.console import lasting_console  # imports rich
+  from rich.console import Console
+
   from playground.envs.options import impl_on_gpu
   from playground.physics.warp_kernels import prestart
 
   prestart(impl_on_gpu(config.env), config.hardware.platform)
   print("\n".join(header(config)), flush=True)
   if verbose:
-    lasting_console().print(tree(config))
+    Console().print(tree(config))
   with gc_paused(stays=True):
     from playground.runs.train import train  # imports JAX
 

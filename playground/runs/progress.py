@@ -7,8 +7,6 @@ from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn
 from rich.progress import Progress as RichProgress
 
-from playground.console import lasting_console
-
 PLAIN_INTERVAL_S = 5.0
 
 
@@ -35,7 +33,7 @@ class Progress:
     self._total = total_steps
     self._activity = activity
     self._enabled = enabled
-    self._console = console or lasting_console()
+    self._console = console or Console()
     self._live = enabled and self._console.is_terminal
     self._step: int | None = None
     self._step_at = 0.0

@@ -10,7 +10,6 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from playground.console import lasting_console
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
 
 ROWS = 30  # rows of the table, running and failed jobs first
@@ -22,7 +21,7 @@ class View:
 
   def __init__(self, sweep: SweepDirectory, console: Console | None = None):
     self._sweep = sweep
-    self._console = console or lasting_console()
+    self._console = console or Console()
     self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
     self._seen: dict[str, tuple[str, int]] = {}
     self._drawn_at = 0.0

@@ -5,6 +5,7 @@ import sys
 import pytest
 from rich.console import Console
 
+from playground.console import lasting_stdout
 from playground.runs import progress
 from playground.runs.progress import Progress
 
@@ -83,7 +84,7 @@ def test_a_run_goes_on_where_nobody_reads_its_output(monkeypatch: pytest.MonkeyP
   os.close(reader)
   with os.fdopen(writer, "w") as stream:
     monkeypatch.setattr(sys, "stdout", stream)
-    with Progress(100) as bar:
+    with lasting_stdout(), Progress(100) as bar:
       bar.print("a line")
       print("another one, without the console", flush=True)
       bar.update(100)

@@ -11,6 +11,7 @@ import pytest
 
 from playground.cli import sweep as command
 from playground.config import compose_settings
+from playground.console import lasting_stdout
 from playground.errors import CheckpointError, ConfigError
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.runner import run_sweep
@@ -148,7 +149,8 @@ def test_a_sweep_goes_on_where_nobody_reads_its_output(tmp_path: Path, monkeypat
   os.close(reader)
   with os.fdopen(writer, "w") as stream:
     monkeypatch.setattr(sys, "stdout", stream)
-    assert run_sweep(sweep, compose_settings(["launcher.cores_per_job=1"]), STUB) == 0
+    with lasting_stdout():
+      assert run_sweep(sweep, compose_settings(["launcher.cores_per_job=1"]), STUB) == 0
   assert set(statuses(sweep).values()) == {"finished"}
   assert (sweep.path / "sweep.csv").is_file() and not sweep.stop_file.exists()
 
