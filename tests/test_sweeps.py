@@ -219,6 +219,12 @@ def test_combinations(lines: str, count: int, keys: list[str]):
   compose_all(combinations(overrides))
 
 
+@pytest.mark.parametrize(("lines", "count"), [(["seed=range(1e6)"], "1,000,000"), (["seed=range(999)"] * 2, "998,001")])
+def test_too_many_jobs(lines: list[str], count: str):
+  with pytest.raises(ConfigError, match=f"^This sweep has {count} jobs, more than 10,000: list fewer values"):
+    combinations(lines)
+
+
 @pytest.mark.parametrize(
   ("line", "message"),
   {

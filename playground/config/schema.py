@@ -195,6 +195,8 @@ def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section)
   if owners and meant not in node:
     own = key if meant == part else f"{key} is {join(parent, meant)}, which"
     return UnknownNameError(f"{own} does not exist for {parent}={node['name']}, only for {', '.join(owners)}.")
+  if parent == "env" and part in OPTIONS:
+    return UnknownNameError(f"{key} does not exist: this task has no terms in env.{part}.")
   known = [str(k) for k in node] if parent else [*schema, "robot", *DELTAS]
   near = nearest_in(parent, meant, known)
   if not parent and meant not in known:  # perhaps only the section is missing

@@ -21,6 +21,7 @@ jobs:
 """
 
 import itertools
+import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -37,6 +38,7 @@ from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.files import check_aliases
 from playground.text import first_line, format_value
 
+MAX_JOBS = 10_000  # of a sweep; 1,000 take 10 s to compose
 _HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper")
 
 
@@ -144,13 +146,16 @@ def combinations(*sets: Sequence[str]) -> list[list[str]]:
   """Returns the overrides of each job of a sweep: every combination of values, for each set of lines.
 
   Raises:
-    ConfigError: an interval, which has no values to combine, or no combination.
+    ConfigError: an interval, which has no values to combine; no combination, or more than `MAX_JOBS`.
   """
   for line in itertools.chain(*sets):
     override = parse_with_hydra(line)
     if override.is_sweep_override() and not override.is_discrete_sweep():
       raise ConfigError(f"{line} is a range to draw from: add search=optuna, or list values.")
-  jobs = dict.fromkeys(job for lines in sets for job in itertools.product(*map(_values, lines)))
+  values = [[_values(line) for line in lines] for lines in sets]
+  if (count := sum(math.prod(map(len, each)) for each in values)) > MAX_JOBS:
+    raise ConfigError(f"This sweep has {count:,} jobs, more than {MAX_JOBS:,}: list fewer values, or search=optuna.")
+  jobs = dict.fromkeys(job for each in values for job in itertools.product(*each))
   if not jobs:
     raise ConfigError("This sweep has no job: one of its keys has no value.")
   return [list(job) for job in jobs]

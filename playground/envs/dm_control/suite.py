@@ -9,11 +9,13 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from playground.envs.base import Env, State
-from playground.errors import ConfigError
+from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.mdp.context import StepContext
 from playground.mdp.managers import RewardManager, TerminationManager
+from playground.mdp.terms import registered
 from playground.mdp.tolerance import tolerance
 from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
 from playground.text import format_value
@@ -52,6 +54,15 @@ class SuiteTask(Env):
     self.body = {model.body(i).name: i for i in range(model.nbody)}
     self.site = {model.site(i).name: i for i in range(model.nsite)}
     self.geom = {model.geom(i).name: i for i in range(model.ngeom)}
+
+  @classmethod
+  def settings_of(cls, config: Any) -> dict[str, np.ndarray]:
+    known = registered("rewards")
+    for name, entry in (config.get("rewards") or {}).items():
+      if hasattr(entry, "get") and not entry.get("func") and name not in known:
+        fixed = "the reward of DM Control's tasks is fixed, and a term that is added to it names its function"
+        raise UnknownNameError(f"env.rewards.{name} has no func: {fixed}.{nearest(name, known)}")
+    return super().settings_of(config)
 
   def scene(self, config: Any) -> mujoco.MjSpec:
     """Returns the scene to compile: the domain's MJCF, changed by the config."""

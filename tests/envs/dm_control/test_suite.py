@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from playground import registry
+from playground.config import compose
+from playground.errors import UnknownNameError
 from tests.envs.dm_control.states import state_at
 from tests.envs.dm_control.suite import COSTLY, DOMAIN, facts_of
 from tests.envs.golden import BATCH, KEYS, compiled_task
@@ -78,3 +80,10 @@ def test_the_first_observation_shows_the_drawn_state(roll: Roll) -> None:
     data = jax.tree.map(lambda x, i=i: x[i], roll.first.data)
     expected = roll.env.observe(state_at(roll.env, qpos=data.qpos, qvel=data.qvel, mocap_pos=data.mocap_pos))
     np.testing.assert_allclose(roll.first.obs[i, seen], expected[seen], rtol=1e-5, atol=1e-5)
+
+
+def test_the_reward_is_fixed() -> None:
+  with pytest.raises(UnknownNameError, match=r"^env.rewards.upright has no func: the reward of DM Control"):
+    registry.check(compose(["env=WalkerWalk", "env.rewards.upright.weight=2"]).env)
+  with pytest.raises(UnknownNameError, match=r"^env.observations.state does not exist: .* no terms"):
+    compose(["env=WalkerWalk", "env.observations.state=null"])
