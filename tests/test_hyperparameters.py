@@ -101,6 +101,11 @@ def test_hyperparameters_are_those_of_the_source(agent: str, task: str):
   of = {key: section for section, keys in sections.items() for key in keys}
   resolved = {**run.resolved, "network": run.resolved["agent"].get("network")}
   assert {key: resolved[of.get(key, "agent")][key] for key in expected} == expected
+  own = defaults(config_class(run.agent_name))
+  left = {key: value for key, value in run.resolved["agent"].items() if key not in ("name", "network", *row)}
+  assert left == {key: own[key] for key in left}, "what the source has not is off"
+  task_alone = compose([f"env={task}", f"agent={agent}", "tuned=null"]).resolved["env"]
+  assert {**run.resolved["env"], **{key: task_alone[key] for key in OF_THE_TASK}} == task_alone
   assert run.agent_name == agent.partition("_")[0]  # so that checkpoints of all variants go together
   assert run.choices["tuned"] == f"{run.choices['agent']}/{task}"
 
