@@ -151,6 +151,14 @@ def select(values: Plain, key: str) -> Plain:
   return values
 
 
+def nodes(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
+  """Yields all dotted keys with their values, a mapping before its own keys."""
+  for name, value in node.items():
+    yield join(prefix, name), value
+    if isinstance(value, Mapping):
+      yield from nodes(value, join(prefix, name))
+
+
 def plain(value: Plain, finite: bool = False) -> Plain:
   """Returns a value (dataclass, ConfigDict, tuple, path, array, …) as the dicts, lists and scalars of YAML and JSON.
 

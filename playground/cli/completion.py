@@ -10,7 +10,7 @@ from playground.config.definitions import chosen_names, definition
 from playground.config.files import groups, listed_options
 from playground.config.run_config import SCALARS, SECTIONS
 from playground.errors import PlaygroundError
-from playground.settings import Plain, Section
+from playground.settings import Section, select
 
 PROGRAMS = ("playground", "playground-run")
 _FLAGS = ("-m", "--multirun", "--cfg", "--help", "--verbose", "--version", "--package")
@@ -126,9 +126,7 @@ def _of_run(current: str, overrides: Sequence[str]) -> Iterator[str]:
     yield from (f"{name}." for name in SECTIONS)
   else:
     parent = key.rpartition(".")[0]
-    node: Plain = _resolved(overrides)
-    for part in parent.split("."):
-      node = node.get(part) if isinstance(node, Mapping) else None
+    node = select(_resolved(overrides), parent)
     for name, inner in node.items() if isinstance(node, Mapping) else ():
       yield f"{parent}.{name}" + ("." if isinstance(inner, Mapping) and inner else "=")
 

@@ -15,7 +15,7 @@ from playground.config import RunConfig, compose, format_value
 from playground.console import wide_console
 from playground.errors import ConfigError
 from playground.mdp.options import MODEL_FIELD, is_model_field
-from playground.settings import Plain, Section
+from playground.settings import Plain, Section, nodes
 from playground.text import first_docstring_line
 
 if TYPE_CHECKING:
@@ -76,7 +76,10 @@ def describe(config: RunConfig, env: "Env") -> Iterator[RenderableType]:
   chosen = choices.get("randomization")
   yield _table(f"events (randomization: {chosen})" if chosen else "events", list(_events(config.env.get("events"))))
   origin = f"tuned/{choices['tuned']}.yaml" if choices.get("tuned") else "defaults, not tuned for this task"
-  yield _facts(f"{config.agent_name} ({origin})", _flat(config.resolved["agent"]))
+  yield _facts(
+    f"{config.agent_name} ({origin})",
+    ((k, v) for k, v in nodes(config.resolved["agent"]) if not isinstance(v, Mapping)),
+  )
 
 
 def _facts_of(env: "Env", section: Section, choices: Section) -> Iterator[tuple[str, Plain]]:
@@ -183,14 +186,6 @@ def function_and_source(func: Callable[..., object], known: str = "") -> str:
 
 def _params(params: Section) -> str:
   return ", ".join(f"{name} {format_value(value)}" for name, value in params.items())
-
-
-def _flat(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
-  for key, value in node.items():
-    if isinstance(value, Mapping):
-      yield from _flat(value, f"{prefix}{key}.")
-    else:
-      yield f"{prefix}{key}", value
 
 
 _COLUMNS = (

@@ -51,7 +51,7 @@ from playground.config.files import (
   search_path_override,
   task_experiments,
 )
-from playground.config.limits import check_limits, check_vision, nodes
+from playground.config.limits import check_limits, check_vision
 from playground.config.overrides import (
   Override,
   canonical,
@@ -70,7 +70,7 @@ from playground.hardware.options import HardwareConfig
 from playground.learning.hyperparameters import config_class
 from playground.mdp.options import is_model_field
 from playground.pretrained import locate
-from playground.settings import Plain, Section, build, defaults, select
+from playground.settings import Plain, Section, build, defaults, nodes, select
 from playground.text import first_line, format_value, join, wrong_type
 
 _RESUMABLE = ("hardware", "tracking", "video")  # sections that may differ in a resumed run

@@ -2,15 +2,15 @@
 
 import operator
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 
 from playground.config.definitions import chosen_names, definition
 from playground.config.schema import is_of_terms
 from playground.envs.options import CubeKeys, PdKeys, TargetRangeKeys, uses_vision
 from playground.errors import ConfigError
 from playground.limits import Limit
-from playground.settings import Plain, Section, build, check_value
-from playground.text import format_value, join, wrong_type
+from playground.settings import Plain, Section, build, check_value, nodes
+from playground.text import format_value, wrong_type
 
 _OF_A_ROBOT = {"pd": PdKeys, "target_range": TargetRangeKeys, "cube": CubeKeys}  # mappings that have no other keys
 _XLA_SWITCH = re.compile(r"--xla_\w+(=(true|false|-?\d+(\.\d+)?))?")
@@ -90,11 +90,3 @@ def _numbers(value: object) -> list[float]:
   if isinstance(value, list):
     return [number for entry in value for number in _numbers(entry)]
   return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
-
-
-def nodes(node: Section, prefix: str = "") -> Iterator[tuple[str, Plain]]:
-  """Yields all dotted keys with their values, a mapping before its own keys."""
-  for name, value in node.items():
-    yield join(prefix, name), value
-    if isinstance(value, Mapping):
-      yield from nodes(value, join(prefix, name))

@@ -1,14 +1,14 @@
 """Checks which keys exist and the types of their values. The schema is a nested dict of default values."""
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from playground.config.definitions import defined, definition
 from playground.config.files import DELTAS
 from playground.errors import UnknownNameError, nearest
 from playground.mdp.options import OPTIONS, keys
 from playground.moved import check_not_moved
-from playground.settings import Plain, Section
+from playground.settings import Plain, Section, nodes, select
 from playground.text import format_value, join, nearest_in, wrong_type
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", list: "a list"}
@@ -68,9 +68,7 @@ def check_removed(key: str, values: Section) -> None:
   *parents, name = key.split(".")
   if not is_term(key):
     return
-  node: Plain = values
-  for part in parents:
-    node = (node.get(part) if isinstance(node, Mapping) else None) or {}
+  node = select(values, ".".join(parents)) or {}
   if name not in node:
     raise unknown_term(key, list(node))
 
@@ -200,15 +198,8 @@ def _unknown_key(key: str, parent: str, part: str, node: Plain, schema: Section)
   known = [str(k) for k in node] if parent else [*schema, "robot", *DELTAS]
   near = nearest_in(parent, meant, known)
   if not parent and meant not in known:  # perhaps only the section is missing
-    whole = [name for name in _keys(schema) if name.endswith(f".{meant}")]
-    near = f" Did you mean {whole[0]!r}?" if whole else near or nearest(part, _keys(schema))
+    keys_of_all = [name for name, _ in nodes(schema)]
+    whole = [name for name in keys_of_all if name.endswith(f".{meant}")]
+    near = f" Did you mean {whole[0]!r}?" if whole else near or nearest(part, keys_of_all)
   has = f"has {', '.join(known)}" if len(known) <= 12 or not near else f"has {len(known)} keys (--cfg job shows them)"
   return UnknownNameError(f"{key} does not exist: {parent or 'the configuration'} {has}.{near}")
-
-
-def _keys(node: Plain, prefix: str = "") -> Iterable[str]:
-  """Yields the dotted names of everything in a nested mapping."""
-  if isinstance(node, Mapping):
-    for name, value in node.items():
-      yield join(prefix, name)
-      yield from _keys(value, join(prefix, name))

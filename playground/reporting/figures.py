@@ -48,8 +48,8 @@ def _height(names: Collection[str], least: float) -> float:
   return len(names) * max(least, *(0.2 * len(_wrapped(name).splitlines()) for name in names))
 
 
-def lines(title: str, series: Mapping[str, Points], x: str, y: str, log: bool = False) -> str:
-  """Lines over one pair of axes."""
+def lines(title: str, series: Mapping[str, Points], x: str, y: str) -> str:
+  """Lines over one pair of logarithmic axes."""
 
   def draw(figure: "Figure") -> None:
     axes = figure.subplots()
@@ -57,9 +57,8 @@ def lines(title: str, series: Mapping[str, Points], x: str, y: str, log: bool = 
       axes.plot(
         *zip(*sorted(points), strict=True), marker="o" if len(points) < 12 else "", label=_wrapped(name), color=colour
       )
-    if log:
-      axes.set_xscale("log", base=2)
-      axes.set_yscale("log")
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log")
     axes.set(title=title, xlabel=x, ylabel=y)
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(0, -0.2))

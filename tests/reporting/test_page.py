@@ -11,7 +11,7 @@ from playground.reporting.page import Heading, Image, Link, Table, Text, mean_an
 def test_a_long_setting_leaves_room_for_the_drawing():
   name = "CartpoleBalance " + " ".join(f"agent.some_long_key_{i}=64" for i in range(6))
   drawings = [
-    figures.lines("a", {name: [(1, 2.0), (2, 4.0)], f"{name}, training": [(1, 1.0)]}, "x", "y", log=True),
+    figures.lines("a", {name: [(1, 2.0), (2, 4.0)], f"{name}, training": [(1, 1.0)]}, "x", "y"),
     figures.bars("a", {name: {"fixed": 1.0, "scaled": 2.0}}, "x"),
     figures.stacked("a", {name: {"physics": 0.5, "update": 0.5}}, "x"),
   ]

@@ -143,7 +143,7 @@ def scaling(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     yield nothing("scaling")
     return
   points = {name: list(line.items()) for name, line in series.items()}
-  yield Image("scaling", figures.lines("steps/s", points, "environments", "steps/s", log=True), "Steps a second.")
+  yield Image("scaling", figures.lines("steps/s", points, "environments", "steps/s"), "Steps a second.")
   order = lambda row: (row[0], row[1], int(row[2]))
   yield Table(["task", "", "environments", "steps/s", "memory (GiB)", "device", "note"], sorted(rows, key=order))
 
