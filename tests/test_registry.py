@@ -380,7 +380,7 @@ def test_every_key_is_read_and_a_step_keeps_the_states_structure(overrides: list
   Randomizer(env.mj_model, recorder.get("events"))
   assert env.mj_model.ncam  # for env.vision
   env.physics = env.physics.without_dynamics()
-  settings = env.settings_of(config)  # as arguments: no branch in Python may depend on one
+  settings = env.settings_of(config_dict(config))  # as arguments: no branch in Python may depend on one
   episodes = lambda values: wrap_for_evaluation(env.with_settings(values))
   keys, actions = jax.random.split(jax.random.PRNGKey(0), 2), jnp.zeros((2, env.action_size))
   state = jax.eval_shape(lambda keys, values: episodes(values).reset(keys), keys, settings)

@@ -6,17 +6,18 @@ weights of `reward_total: product` stay constants, as their signs decide the for
 """
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from playground.limits import Limit
+from playground.mdp.managers import ObservationManager
 from playground.mdp.terms import MODULES, Term, annotation, bind
-from playground.settings import members
+from playground.settings import Section, members
 
 
-def traced_settings(config: Mapping[str, Any], kinds: Sequence[str]) -> dict[str, np.ndarray]:
+def traced_settings(config: Section, kinds: Sequence[str]) -> dict[str, np.ndarray]:
   """Returns the numbers of the terms of some kinds in a task's config.
 
   Returns:
@@ -30,15 +31,11 @@ def traced_settings(config: Mapping[str, Any], kinds: Sequence[str]) -> dict[str
   return {key: value for key, value in found.items() if value.any()}
 
 
-def _terms(config: Mapping[str, Any], kind: str) -> list[Term]:
-  section = config.get(kind) or {}
-  if kind != "observations":
-    return bind(kind, section)
-  noisy = lambda group: {name: entry for name, entry in (section[group] or {}).items() if entry and entry.get("noise")}
-  return [term for group in section for term in bind(kind, noisy(group), group)]
+def _terms(config: Section, kind: str) -> list[Term]:
+  return ObservationManager(config).terms if kind == "observations" else bind(kind, config.get(kind))
 
 
-def _numbers(config: Mapping[str, Any], kind: str, term: Term) -> Iterator[tuple[str, Any]]:
+def _numbers(config: Section, kind: str, term: Term) -> Iterator[tuple[str, Any]]:
   if kind == "rewards" and config.get("reward_total") != "product":
     yield f"{term.key}.weight", term.options.weight
   if kind == "observations":

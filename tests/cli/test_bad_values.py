@@ -113,6 +113,7 @@ WERE_TRACEBACKS = [
   "env=Go1JoystickFlatTerrain env.commands.velocity.params.min=1",
   "env=Go1JoystickFlatTerrain env.commands.velocity.params.max=[-1,1,1]",
   "env=Go1JoystickFlatTerrain env.observations.state=[]",
+  "env=Go1JoystickFlatTerrain env.observations.state.gravity.noise.uniform={}",
   "env=Go1JoystickFlatTerrain env.robot.feet=[]",
   "env=Go1JoystickFlatTerrain env.robot.foot_contact=[]",
   "env=Go1JoystickFlatTerrain env.robot.foot_contact=null",
