@@ -25,9 +25,9 @@ from playground.errors import ConfigError, UnknownNameError
 from playground.hardware.options import DistributedConfig
 from playground.learning.hyperparameters import config_class
 from playground.mdp.options import is_model_field
-from playground.runs.run_dir import RunDirectory
 from playground.settings import plain
 from tests.aliases import LAUGHS
+from tests.runs.helpers import make_run
 from tests.sampling import some
 
 TUNED = ["experiment=cartpole_balance"]
@@ -269,7 +269,7 @@ def test_overrides_are_what_hydra_takes():
 def test_saved_text_reads_back(name: str, tmp_path: Path):
   """A commit such as 1e3 is text for PyYAML and a number for OmegaConf."""
   resolved = {**compose([]).resolved, "name": name}
-  run = RunDirectory.create(tmp_path / "run", resolved)
+  run = make_run(tmp_path / "run", resolved)
   assert config.load(run.config_path).name == run.config["name"] == name
 
 
@@ -656,7 +656,7 @@ def test_a_group_of_hardware_keeps_a_resumed_runs_precision_and_flags(configs: P
   flags = "--xla_cpu_use_fusion_emitters=false"
   line = ["env=CartpoleBalance", f"hardware.xla_flags='{flags}'", "hardware.network_precision=high"]
   started = compose(line, configs)
-  run = RunDirectory.create(tmp_path / "exact", started.resolved).path
+  run = make_run(tmp_path / "exact", started.resolved).path
   kept = compose([f"resume={run}", "hardware=gpu_x2"], configs).hardware
   assert (kept.devices, kept.xla_flags, kept.network_precision) == (2, flags, "high")
   mine = "# @package hardware\ndefaults: [gpu_x2, _self_]\nmatmul_precision: float32\n"

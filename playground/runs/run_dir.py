@@ -24,7 +24,7 @@ RunStatus = Literal["running", "finished", "failed", "preempted"]
 
 
 class RunDirectory:
-  """Holds the paths and records of one run; `create` makes a new run, `open` finds an existing one."""
+  """Holds the paths and records of one run; `claimed` makes a new run, `open` finds an existing one."""
 
   def __init__(self, path: str | Path):
     self.path = Path(os.path.expanduser(path))
@@ -38,36 +38,18 @@ class RunDirectory:
     self._locked = False
 
   @classmethod
-  def create(
-    cls,
-    path: str | Path,
-    config: Section,
-    overrides: Sequence[str] = (),
-    numbered: bool = False,
-  ) -> "RunDirectory":
-    """Makes the folder and writes the resolved `config` and the command line's `overrides`.
+  @contextlib.contextmanager
+  def claimed(cls, path: str | Path, numbered: bool = False) -> Iterator["RunDirectory"]:
+    """Makes the folder and locks it for the block, in which `write_config` makes it a run.
 
     Args:
       path: the folder.
-      config: the resolved configuration.
-      overrides: overrides of the command line.
       numbered: whether to take a new folder `<path>_2`, `_3`, ... if the name is taken: for generated names, which
         several processes may choose in the same second.
 
     Raises:
-      CheckpointError: the folder already holds a run (unless numbered), or making it failed.
-    """
-    with cls.claimed(path, numbered) as run:
-      run.write_config(config, overrides)
-    return run
-
-  @classmethod
-  @contextlib.contextmanager
-  def claimed(cls, path: str | Path, numbered: bool = False) -> Iterator["RunDirectory"]:
-    """Makes the folder, as `create` does, and locks it for the block, in which `write_config` makes it a run.
-
-    Raises:
-      CheckpointError: see `create`, or another process makes a run of the folder in this moment.
+      CheckpointError: the folder already holds a run (unless numbered), making it failed, or another process makes a
+        run of it in this moment.
     """
     run = cls(path)
     if not numbered:

@@ -16,6 +16,7 @@ from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.files import locking, read_csv
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
+from tests.runs.helpers import make_run
 
 ROOT = Path(__file__).parents[2]
 TINY = ["env=CartpoleBalance", "debug=fast", "hardware=cpu", "tracking=csv", "seed=7"]
@@ -38,7 +39,7 @@ def make(tmp_path: Path) -> Make:
   """Makes a run directory as training leaves it, without checkpoints."""
 
   def made(*overrides: str, metrics: str, status: Any = "finished", name: str = "run") -> Path:
-    run = RunDirectory.create(tmp_path / name, compose(overrides).resolved, overrides)
+    run = make_run(tmp_path / name, compose(overrides).resolved, overrides)
     run.write_manifest(**MACHINE)
     run.set_status(status)
     run.metrics_csv.write_text(metrics)
@@ -151,7 +152,7 @@ def test_terms_that_were_removed_are_a_setting(reference: Path, make: Make) -> N
 
 def test_images_have_a_table_and_stages_a_setting(reference: Path, make: Make) -> None:
   images = make("env=CartpoleBalanceVision", metrics="step,eval/episode_reward,eval/mode/episode_reward\n100,24,24.5\n")
-  chain = RunDirectory.create(images.parent / "chain", {"name": "chain"}, ["curriculum.scale=0.4", "hardware=cpu"])
+  chain = make_run(images.parent / "chain", {"name": "chain"}, ["curriculum.scale=0.4", "hardware=cpu"])
   stage = make("env=Go1Getup", metrics=METRICS, name="chain/2_fast")
   assert record.run(Options(runs=(str(images), str(stage)), reference=str(reference))) == 0
   row = last_row(reference / "vision.csv")

@@ -14,9 +14,8 @@ from playground.config import compose
 from playground.errors import ConfigError
 from playground.learning.checkpoints import Checkpoint
 from playground.runs.restore_plan import weights_of
-from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
-from tests.runs.helpers import TASK
+from tests.runs.helpers import TASK, make_run
 
 ROUNDED = {".params.value": 3, "kernel": 11}  # significant bits
 
@@ -52,7 +51,7 @@ def test_a_run_becomes_a_pretrained_policy(tmp_path: Path, monkeypatch: pytest.M
   assert add_policy(str(run), "solved: as far as it goes", replace=True) == 0
   card = yaml.safe_load((folder / "card.yaml").read_text())
   assert (card["status"], card["training"]["steps"]) == ("solved", 0)
-  chain = RunDirectory.create(tmp_path / "chain", {}, ["experiment=my_chain", "run_dir=chain"]).path
+  chain = make_run(tmp_path / "chain", {}, ["experiment=my_chain", "run_dir=chain"]).path
   run = run.rename(chain / "1_stage")
   for given in (chain, run, run / "checkpoints" / checkpoint.path.name):
     assert add_policy(str(given), replace=True) == 0
@@ -69,7 +68,7 @@ def untrained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., 
   monkeypatch.setattr(pretrained, "POLICIES", tmp_path / "policies")
 
   def make(task: str, *overrides: str) -> Path:
-    run = RunDirectory.create(tmp_path / "run", compose([f"env={task}", *overrides]).resolved).path
+    run = make_run(tmp_path / "run", compose([f"env={task}", *overrides]).resolved).path
     (run / "checkpoints" / f"{100:012d}").mkdir(parents=True)
     (run / "manifest.json").write_text("{}")
     (run / "metrics.csv").write_text("step,eval/episode_reward\n100,1.0\n")

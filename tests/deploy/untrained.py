@@ -13,7 +13,7 @@ from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import CheckpointStore
 from playground.learning.trainer import Trainer
 from playground.registry import load
-from playground.runs.run_dir import RunDirectory
+from tests.runs.helpers import make_run
 
 
 class UntrainedRun:
@@ -22,7 +22,7 @@ class UntrainedRun:
   def __init__(self, path: Path, task: str, *overrides: str, scale: float = 1.0):
     """Makes it, without a checkpoint; `scale` multiplies the policy's weights, which are in [0.1, 0.5]."""
     config = compose([f"env={task}", "hardware=cpu", f"run_dir={path}", *overrides])
-    self.directory = RunDirectory.create(path, config.resolved)
+    self.directory = make_run(path, config.resolved)
     self._task = task
     trainer = Trainer(on_c_physics(load(task, config=config.env)), config.agent, make_mesh(1))
     rng = np.random.default_rng(0)

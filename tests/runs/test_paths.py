@@ -17,7 +17,7 @@ from playground.runs.trackers import make_trackers
 from playground.runs.train import train
 from playground.sweep.folder import SweepDirectory
 from playground.text import quoted
-from tests.runs.helpers import TASK
+from tests.runs.helpers import TASK, make_run
 from tests.sweep.helpers import make_sweep
 from tests.sweep.helpers import run as run_jobs
 
@@ -54,7 +54,7 @@ def resolved() -> dict[str, Any]:
 )
 def test_what_is_saved_is_read_again(shape: str, tmp_path: Path, resolved: dict[str, Any]) -> None:
   path = tmp_path / shape / "run"
-  run = RunDirectory.create(path, resolved)
+  run = make_run(path, resolved)
   policy, state = {"w": jnp.arange(12.0)}, {"b": np.arange(5)}
   meta: dict[str, Any] = {"update": 1, "wall_clock_s": 0.0, "env": "Point", "config": resolved}
   with run.locked():
@@ -88,7 +88,7 @@ def test_a_name_needs_no_quotes(
   key: str, shape: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resolved: dict[str, Any]
 ) -> None:
   monkeypatch.chdir(tmp_path)
-  RunDirectory.create(shape, resolved)
+  make_run(shape, resolved)
   config = compose([f"{key}={shape}"] if key == "resume" else [*TASK, f"{key}={shape}"])
   assert getattr(config, key) == shape
   if key == "run_dir":
@@ -100,7 +100,7 @@ def test_a_path_may_begin_at_home(
   key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resolved: dict[str, Any]
 ) -> None:
   monkeypatch.setenv("HOME", str(tmp_path))
-  RunDirectory.create(tmp_path / "run", resolved)
+  make_run(tmp_path / "run", resolved)
   config = compose(["resume=~/run"] if key == "resume" else [*TASK, "init_from=~/run"])
   assert Path(str(getattr(config, key))).expanduser() == tmp_path / "run"
 

@@ -18,12 +18,13 @@ from playground.errors import CheckpointError, one_sentence
 from playground.files import is_locked, lock_holder, replacing
 from playground.runs.provenance import git_state
 from playground.runs.run_dir import RunDirectory
+from tests.runs.helpers import make_run
 
 CONFIG = {"seed": 1, "agent": {"learning_rate": 1e-5, "layers": (32, 32), "decay": None}}
 
 
 def test_config_and_overrides_survive_the_round_trip(tmp_path: Path):
-  RunDirectory.create(tmp_path / "a" / "run", CONFIG, ["seed=1", "env=X"])
+  make_run(tmp_path / "a" / "run", CONFIG, ["seed=1", "env=X"])
   run = RunDirectory.open(tmp_path / "a" / "run")
   assert run.config == {"seed": 1, "agent": {"learning_rate": 1e-5, "layers": [32, 32], "decay": None}}
   assert isinstance(run.config["agent"]["learning_rate"], float)
@@ -34,7 +35,7 @@ def test_config_and_overrides_survive_the_round_trip(tmp_path: Path):
 def test_create_refuses_an_existing_run_and_names_both_verbs(tmp_path: Path, trace: str):
   (tmp_path / trace).mkdir() if trace == "checkpoints" else (tmp_path / trace).write_text("seed: 1\n")
   with pytest.raises(CheckpointError) as error:
-    RunDirectory.create(tmp_path, CONFIG)
+    make_run(tmp_path, CONFIG)
   message = str(error.value)
   assert f"resume={tmp_path}" in message and f"init_from={tmp_path}" in message and "run_dir=" in message
   assert "\n" not in message
@@ -43,7 +44,7 @@ def test_create_refuses_an_existing_run_and_names_both_verbs(tmp_path: Path, tra
 def test_runs_named_alike_in_the_same_moment_get_folders_of_their_own(tmp_path: Path):
   path = tmp_path / "results" / "2026-01-01_00-00-00"
   with ThreadPoolExecutor(8) as pool:
-    runs = list(pool.map(lambda seed: RunDirectory.create(path, {"seed": seed}, numbered=True), range(8)))
+    runs = list(pool.map(lambda seed: make_run(path, {"seed": seed}, numbered=True), range(8)))
   names = {path.name, *(f"{path.name}_{number}" for number in range(2, 9))}
   assert {run.path.name for run in runs} == names
   assert [run.config["seed"] for run in runs] == list(range(8))
@@ -55,7 +56,7 @@ def test_of_runs_that_start_in_one_folder_in_the_same_moment_one_is_made(tmp_pat
   def create(seed: int) -> bool:
     together.wait()
     try:
-      return bool(RunDirectory.create(tmp_path / "run", {"seed": seed}, [f"seed={seed}"]))
+      return bool(make_run(tmp_path / "run", {"seed": seed}, [f"seed={seed}"]))
     except CheckpointError:
       return False
 
@@ -67,17 +68,17 @@ def test_of_runs_that_start_in_one_folder_in_the_same_moment_one_is_made(tmp_pat
 
 def test_create_takes_an_empty_or_unrelated_folder(tmp_path: Path):
   (tmp_path / "notes.txt").write_text("mine")
-  assert RunDirectory.create(tmp_path, CONFIG).config["seed"] == 1
+  assert make_run(tmp_path, CONFIG).config["seed"] == 1
 
 
 def test_create_where_a_file_lies_is_one_sentence(tmp_path: Path):
   (tmp_path / "file").write_text("")
   with pytest.raises(CheckpointError, match="cannot be written"):
-    RunDirectory.create(tmp_path / "file" / "run", CONFIG)
+    make_run(tmp_path / "file" / "run", CONFIG)
 
 
 def test_open_names_what_is_missing(tmp_path: Path):
-  RunDirectory.create(tmp_path / "cartpole", CONFIG)
+  make_run(tmp_path / "cartpole", CONFIG)
   (tmp_path / "empty").mkdir()
   with pytest.raises(CheckpointError, match=r"no such folder\. Did you mean 'cartpole'"):
     RunDirectory.open(tmp_path / "cartpoel")
@@ -89,7 +90,7 @@ def test_open_names_what_is_missing(tmp_path: Path):
 
 
 def test_manifest_has_versions_merges_timings_and_keeps_earlier_starts(tmp_path: Path):
-  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run = make_run(tmp_path / "run", CONFIG)
   run.write_manifest(seed=1, device={"kind": "cpu", "count": 1}, timings={"trace_s": 0.5})
   run.update_manifest(timings={"compile_s": np.float32(2.0)})
   manifest = run.manifest
@@ -102,7 +103,7 @@ def test_manifest_has_versions_merges_timings_and_keeps_earlier_starts(tmp_path:
 
 
 def test_a_run_has_one_writer(tmp_path: Path):
-  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run = make_run(tmp_path / "run", CONFIG)
   code = f"""
 import time
 from playground.runs.run_dir import RunDirectory
@@ -132,12 +133,12 @@ def test_a_file_system_without_locks_locks_nothing(tmp_path: Path, monkeypatch: 
     raise OSError(errno.ENOSYS, "Function not implemented")
 
   monkeypatch.setattr(fcntl, "flock", flock)
-  with RunDirectory.create(tmp_path / "run", CONFIG).locked():
+  with make_run(tmp_path / "run", CONFIG).locked():
     pass
 
 
 def test_status_keeps_the_first_start_and_refuses_other_words(tmp_path: Path):
-  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run = make_run(tmp_path / "run", CONFIG)
   run.set_status("running")
   started = run.status["started"]
   run.set_status("preempted", reason="SIGTERM")
@@ -148,7 +149,7 @@ def test_status_keeps_the_first_start_and_refuses_other_words(tmp_path: Path):
 
 
 def test_what_the_system_denies_is_one_sentence(tmp_path: Path):
-  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run = make_run(tmp_path / "run", CONFIG)
   with pytest.raises(CheckpointError) as error, run.recorded():
     raise OSError(errno.ENOSPC, "No space left on device", str(run.metrics_csv))
   sentence = f"{run.path} cannot be written: No space left on device ({run.metrics_csv}). resume={run.path} goes on"
@@ -157,7 +158,7 @@ def test_what_the_system_denies_is_one_sentence(tmp_path: Path):
 
 
 def test_a_status_that_cannot_be_written_hides_no_error(tmp_path: Path):
-  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run = make_run(tmp_path / "run", CONFIG)
   with pytest.raises(CheckpointError, match="the cause"), run.recorded():
     shutil.rmtree(run.path)
     raise CheckpointError("the cause")
@@ -168,14 +169,14 @@ def test_a_status_that_cannot_be_written_hides_no_error(tmp_path: Path):
   "content", ["", "{", "[]", "5", "null", '"text"', '{"status": 5}', "\0", "\ufeff{}", "[" * 10_000, '{"status": []}']
 )
 def test_a_damaged_record_is_one_sentence(tmp_path: Path, content: str):
-  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run = make_run(tmp_path / "run", CONFIG)
   (run.path / "status.json").write_text(content)
   with pytest.raises(CheckpointError, match=r"status\.json is damaged \(.*\): move it away to go on without it\.$"):
     run.status  # noqa: B018
 
 
 def test_summary_is_strict_json(tmp_path: Path):
-  run = RunDirectory.create(tmp_path / "run", CONFIG)
+  run = make_run(tmp_path / "run", CONFIG)
   run.write_summary({"final_return": math.nan, "steps": np.int64(7), "curve": np.ones(2)})
   text = (run.path / "summary.json").read_text()
   assert json.loads(text, parse_constant=pytest.fail) == {"final_return": None, "steps": 7, "curve": [1.0, 1.0]}

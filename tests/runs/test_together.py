@@ -26,7 +26,7 @@ from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.together import Member, _groups, train_together  # pyright: ignore[reportPrivateUsage]
 from playground.runs.train import train
-from tests.runs.helpers import TASK, resume, truncate
+from tests.runs.helpers import TASK, make_run, resume, truncate
 
 STEPS = 2000
 EFFORT = "env.rewards.action_l2.weight"
@@ -228,7 +228,7 @@ POPULATION = Population(1, {}, 0)
 
 def saved(folder: Path, steps: list[int], status: str) -> RunConfig:
   """A run with checkpoints of these steps, by their names alone."""
-  run = RunDirectory.create(folder, compose([*BUDGET, f"run_dir={folder}"]).resolved)
+  run = make_run(folder, compose([*BUDGET, f"run_dir={folder}"]).resolved)
   run.set_status(status)  # pyright: ignore[reportArgumentType]
   for step in steps:
     (run.checkpoints / f"{step:012d}").mkdir(parents=True)
@@ -253,7 +253,7 @@ def test_a_run_that_is_behind_leaves_its_population(tmp_path: Path, lost: str) -
 
 def test_a_population_that_starts_over_starts_from_the_same_weights(tmp_path: Path, group: Path) -> None:
   """One was killed before its first checkpoint, the other after it."""
-  run = RunDirectory.create(tmp_path / "run", compose([*BUDGET, f"init_from={group / 'a'}"]).resolved)
+  run = make_run(tmp_path / "run", compose([*BUDGET, f"init_from={group / 'a'}"]).resolved)
   (run.checkpoints / f"{400:012d}").mkdir(parents=True)
   config = compose([f"resume={run.path}"])
   plan = RestorePlan.find(config)
@@ -267,7 +267,7 @@ def test_a_run_from_weights_is_not_joined_with_one_without(tmp_path: Path, group
   """Both were killed before their first checkpoint."""
   plain = saved(tmp_path / "plain", [], "running")
   with_weights = tmp_path / "weights"
-  RunDirectory.create(with_weights, compose([*BUDGET, f"init_from={group / 'a'}", f"run_dir={with_weights}"]).resolved)
+  make_run(with_weights, compose([*BUDGET, f"init_from={group / 'a'}", f"run_dir={with_weights}"]).resolved)
   weights = compose([f"resume={with_weights}"])
   assert _groups([plain, weights], None) == [([plain], None), ([weights], None)]
 

@@ -12,9 +12,9 @@ import wandb
 from playground import config
 from playground.runs import wandb_tracker
 from playground.runs.csv_tracker import CsvTracker
-from playground.runs.run_dir import RunDirectory
 from playground.runs.trackers import make_trackers
 from playground.runs.wandb_tracker import WandbTracker
+from tests.runs.helpers import make_run
 
 WANDB = {
   "enable": False,
@@ -110,7 +110,7 @@ def test_a_file_of_an_earlier_version_without_its_header_is_kept_aside(tmp_path:
 
 
 def test_rows_that_are_gone_are_said_to_be(tmp_path: Path):
-  run, said = RunDirectory.create(tmp_path / "run", CONFIG), []
+  run, said = make_run(tmp_path / "run", CONFIG), []
   for content in (None, "", ROWS.partition("30")[0]):
     if content is not None:
       run.metrics_csv.write_text(content)
@@ -162,7 +162,7 @@ def test_a_metric_called_step_is_refused(tmp_path: Path):
 def test_make_trackers_writes_csv_and_tensorboard(tmp_path: Path):
   config = copy.deepcopy(CONFIG)
   config["tracking"]["tensorboard"] = True
-  run = RunDirectory.create(tmp_path / "run", config)
+  run = make_run(tmp_path / "run", config)
   for resume_step in (None, 10):
     trackers = make_trackers(config, run, resume_step)
     trackers.log(10 if resume_step is None else 20, {"eval/episode_reward": 5.0})
@@ -175,7 +175,7 @@ def test_make_trackers_writes_csv_and_tensorboard(tmp_path: Path):
 def test_wandb_offline_writes_and_keeps_its_id(tmp_path: Path):
   config = copy.deepcopy(CONFIG)
   config["tracking"]["wandb"]["enable"] = True
-  run = RunDirectory.create(tmp_path / "run", config)
+  run = make_run(tmp_path / "run", config)
   ids, complaints = [], []
   for resume_step in (None, 10):
     trackers = make_trackers(config, run, resume_step, notify=complaints.append)

@@ -34,7 +34,7 @@ from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import cut_short, open_run, say_where, train
 from tests.processes import WITHOUT_WARP
-from tests.runs.helpers import TASK, resume, truncate
+from tests.runs.helpers import TASK, make_run, resume, truncate
 
 BATCH = 80  # environment steps of one training step with debug=fast
 STEPS = 240_000  # seconds of training, so that a signal finds the run at work
@@ -564,7 +564,7 @@ def test_weights_that_a_link_has_lost(copy: Path, refused: Callable[..., str]) -
 
 
 def test_resumed_before_its_first_checkpoint_it_starts_from_the_weights_again(whole: Path, tmp_path: Path) -> None:
-  run = RunDirectory.create(tmp_path / "run", compose([*TASK, f"init_from={whole}"]).resolved)
+  run = make_run(tmp_path / "run", compose([*TASK, f"init_from={whole}"]).resolved)
   found = RestorePlan.find(compose([f"resume={run.path}"]))
   assert found.weights is not None
   assert found.weights.path == find_checkpoints(whole)[0]

@@ -18,7 +18,7 @@ from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import LocalLauncher, Slot
 from playground.sweep.together import TogetherLauncher
 from tests.processes import WITHOUT_WARP
-from tests.runs.helpers import TASK
+from tests.runs.helpers import TASK, make_run
 from tests.sweep.helpers import STUB, run
 
 
@@ -134,7 +134,7 @@ def test_jobs_are_composed_where_they_run(
   tmp_path: Path, started: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
   monkeypatch.chdir(tmp_path)
-  store = RunDirectory.create(tmp_path / "mine", compose(TASK).resolved).checkpoints
+  store = make_run(tmp_path / "mine", compose(TASK).resolved).checkpoints
   (store / f"{400:012d}").mkdir(parents=True)
   sweep = make(tmp_path / "sweep", "seed=1 init_from=mine", "seed=2 init_from=mine", "seed=3")
   RunDirectory(sweep.folder(sweep.jobs[2]).path).path.mkdir(parents=True)
