@@ -16,7 +16,7 @@ import torch
 from rsl_rl import env as rsl_rl_env
 from tensordict import TensorDict
 
-from playground.envs.base import PIXELS, Env, Observation, State
+from playground.envs.base import PIXELS, Env, Observation, State, observation_groups
 from playground.envs.wrappers import FINAL_OBS, AutoReset, wrap_for_evaluation
 from playground.errors import ConfigError, lookup
 from playground.learning.rollout import episode_sums
@@ -92,7 +92,7 @@ class VecEnv(rsl_rl_env.VecEnv):
     return self._grouped(self.state.obs)
 
   def _grouped(self, obs: Observation) -> TensorDict:
-    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    entries = observation_groups(obs)
     return TensorDict({group: to_torch(entries[entry]) for group, entry in self.groups.items()}, [self.num_envs])
 
   def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Extra]]:
@@ -148,8 +148,7 @@ def group_entries(env: Env, groups: Mapping[str, str] | None = None) -> dict[str
     ConfigError: the task has images, which the adapter does not pass on.
     UnknownNameError: the task has no such observation group.
   """
-  sizes = env.observation_size
-  entries = sizes if isinstance(sizes, Mapping) else {"state": sizes}
+  entries = observation_groups(env.observation_size)
   for group, entry in (groups or {}).items():
     lookup(entries, entry, f"groups[{group!r}]")
   if groups:

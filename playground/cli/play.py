@@ -20,7 +20,7 @@ from playground.deploy.scores import measure, result_name, result_of
 from playground.deploy.scripted import ScriptedPolicy
 from playground.deploy.session import LATEST, Session
 from playground.deploy.trained import draw_models, export_policy, load_exact, load_on_c_physics, set_fields
-from playground.envs.base import Env
+from playground.envs.base import Env, observation_groups
 from playground.errors import CheckpointError, PlaygroundError
 from playground.extras import need
 from playground.hardware.mesh import make_mesh
@@ -202,8 +202,7 @@ def _task_of(
     config = configs.override_task(config, overrides)
   try:
     env = load_on_c_physics(task, config, interval_events=interval_events, model_seed=model_seed)
-    obs = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
-    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    entries = observation_groups(jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs)
     theirs = {row["entry"]: (tuple(row["shape"][1:]), row["type"]) for row in policy["inputs"]}
     ours = {name: (entry.shape, entry.dtype.name) for name, entry in entries.items() if name in theirs}
     if theirs != ours or policy["action_size"] != env.action_size:

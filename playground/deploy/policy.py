@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from playground.deploy.contract import FORMAT, Contract, check_contract, read_contract
-from playground.envs.base import Observation
+from playground.envs.base import Observation, observation_groups
 from playground.errors import CheckpointError, ConfigError
 from playground.extras import need
 
@@ -118,7 +118,7 @@ class ExportedPolicy:
 
   def _read(self, obs: Seen) -> dict[str, np.ndarray | jax.Array]:
     """Returns the groups that the actor reads; a flat observation counts as `state`."""
-    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    entries = observation_groups(obs)
     for row in self.contract["policy"]["inputs"]:
       name, shape = row["entry"], tuple(row["shape"][1:])
       if name not in entries:

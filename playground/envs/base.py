@@ -4,7 +4,7 @@ import abc
 import copy
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,12 @@ from playground.settings import Section, config_dict
 
 Observation = jax.Array | dict[str, jax.Array]
 PIXELS = "pixels/"  # prefix of image groups of an observation: [height, width, channels] uint8
+T = TypeVar("T", bound=jax.Array | np.ndarray | int | tuple[int, ...])
+
+
+def observation_groups(obs: T | Mapping[str, T]) -> Mapping[str, T]:
+  """Returns an observation, or its sizes, by group: one vector is the group "state"."""
+  return obs if isinstance(obs, Mapping) else {"state": obs}
 
 
 class State(struct.PyTreeNode):

@@ -15,7 +15,7 @@ from brax.training.types import UInt64
 from flax import linen, struct
 from jax.typing import DTypeLike
 
-from playground.envs.base import PIXELS, Observation
+from playground.envs.base import PIXELS, Observation, observation_groups
 from playground.errors import ConfigError, nearest
 from playground.hardware.mesh import AXIS
 from playground.learning.cnn import ESTIMATOR, Activation, PixelNetwork, check_cnn
@@ -147,7 +147,7 @@ class Actor:
 
   def select(self, obs: Observation) -> dict[str, jax.Array]:
     """Returns the groups of an observation that actor or critic reads."""
-    entries = obs if isinstance(obs, Mapping) else {"state": obs}
+    entries = observation_groups(obs)
     return {key: entries[key] for key in (*self.obs_keys, *self.pixel_sizes)}
 
   def vectors(self, obs: Mapping[str, jax.Array]) -> dict[str, jax.Array]:

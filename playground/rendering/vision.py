@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from playground.envs.base import PIXELS, Env, State
+from playground.envs.base import PIXELS, Env, State, observation_groups
 from playground.envs.wrappers import Wrapper
 from playground.errors import ConfigError, nearest
 from playground.physics.backend import PhysicsData, mjx
@@ -117,5 +117,4 @@ class Vision(Wrapper):
 
   def _with(self, state: State, frames: jax.Array) -> State:
     """Returns the state with images in its observation."""
-    own = state.obs if isinstance(state.obs, Mapping) else {"state": state.obs}
-    return state.replace(obs={**own, PIXELS + self._camera: frames})
+    return state.replace(obs={**observation_groups(state.obs), PIXELS + self._camera: frames})

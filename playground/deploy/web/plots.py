@@ -11,6 +11,7 @@ from matplotlib.colors import to_hex
 
 from playground.deploy.player import Player
 from playground.deploy.session import Session
+from playground.envs.base import observation_groups
 
 _SECONDS = 10.0  # that a chart shows
 _POINTS = 250  # on a line, at most
@@ -85,8 +86,7 @@ class Plots:
 
 def _groups(player: Player) -> Mapping[str, np.ndarray]:
   """Returns the observation groups that are vectors, by name."""
-  obs = player.state.obs
-  groups = obs if isinstance(obs, Mapping) else {"state": obs}
+  groups = observation_groups(player.state.obs)
   return {name: np.asarray(value) for name, value in groups.items() if np.ndim(value) == 1}
 
 
