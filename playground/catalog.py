@@ -71,11 +71,11 @@ def measure(task: str) -> Entry:
   from playground import registry
   from playground.config import compose
   from playground.config.files import experiment_name
+  from playground.envs.base import observation_groups
 
   config = compose([f"env={task}"])
   env = registry.build(config.env)
-  observations = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs
-  groups = observations if isinstance(observations, dict) else {"state": observations}
+  groups = observation_groups(jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs)
   shown = ", ".join(f"{name} {' x '.join(map(str, group.shape))}" for name, group in groups.items())
   rows = [row for name in _TABLES for row in read_csv(_REFERENCE / f"{name}.csv")]
   best = best_runs(rows, task)
@@ -138,7 +138,7 @@ def _stage_of(row: dict[str, str]) -> str:
 def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]:
   """Returns our runs of a task with the agent, setting, backend and steps of the highest mean of `reached_return`.
 
-  Of several within 2 % of the highest, those with the most runs count. A chain counts by its last stage. Runs without
+  Of several within 2 % of the highest, those with the most seeds count. A chain counts by its last stage. Runs without
   pushes count only if there are no others.
   """
   ours = our_runs(rows, task)
@@ -148,7 +148,7 @@ def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]
   mean = lambda runs: fmean(map(reached_return, runs))
   highest = max(map(mean, groups.values()), default=0.0)
   close = [runs for runs in groups.values() if mean(runs) >= highest - 0.02 * abs(highest)]
-  return max(close, key=lambda runs: (len(runs), mean(runs)), default=[])
+  return max(close, key=lambda runs: (len({row["seed"] for row in runs}), mean(runs)), default=[])
 
 
 def reached_return(row: dict[str, str]) -> float:

@@ -30,10 +30,11 @@ def test_runs_that_differ_in_seed_alone_count_together():
   assert best_runs(rows, "HopperHop") == []
 
 
-def test_of_runs_as_good_the_most_count():
+def test_of_runs_as_good_those_with_the_most_seeds_count():
   rows = [run(900, agent="sac"), run(890), run(885, seed="2"), run(100, final_mode_return="880")]
   assert best_runs(rows, TASK) == rows[1:]
   assert best_runs([*rows, run(500, agent="reppo", final_mode_return="950")], TASK)[0]["agent"] == "reppo"
+  assert best_runs([run(900, agent="sac"), run(890), run(895)], TASK) == [run(900, agent="sac")]
 
 
 def test_a_chain_counts_by_its_last_stage():
