@@ -49,6 +49,24 @@ def unwritable(folder: Path, within: Path | None = None) -> str | None:
   return None
 
 
+def check_links(folder: Path, depth: int = sys.maxsize) -> None:
+  """Raises CheckpointError if a link in a folder, which another user may have made, leads out of it.
+
+  What is written to the folder would be written there.
+
+  Args:
+    folder: the folder; it may be a link itself.
+    depth: levels of folders to look at. Folders `wandb` are left out: W&B links to its own cache, and writes elsewhere.
+  """
+  root = folder.resolve()
+  for path, folders, files in os.walk(root):
+    for entry in (Path(path, name) for name in (*folders, *files)):
+      if entry.is_symlink() and not entry.resolve().is_relative_to(root):
+        raise CheckpointError(f"{entry} is a link that leads out of {folder}: put what it stands for in its place.")
+    deepest = len(Path(path).relative_to(root).parts) + 1 >= depth
+    folders[:] = [name for name in folders if name != "wandb" and not deepest]
+
+
 def need_file(path: Path, suffix: str, option: str) -> None:
   """Raises ConfigError, which names the option that it is of, where no file of that suffix can be; makes no folder."""
   if path.suffix != suffix or path.is_dir():
@@ -122,7 +140,7 @@ def locking(path: Path, patience_s: float = 0.0) -> Iterator[int | None]:
 def is_locked(path: Path) -> bool:
   """Whether a process holds a lock, on this machine or another that shares the file system."""
   try:
-    handle = os.open(path, os.O_RDWR)
+    handle = os.open(path, os.O_RDONLY)  # the folder may be another user's
   except FileNotFoundError:
     return False
   try:

@@ -19,6 +19,7 @@ from playground.errors import ConfigError
 from playground.mdp.managers import CommandManager
 from tests.command import caller
 from tests.deploy.untrained import UntrainedRun
+from tests.runs.helpers import make_run
 
 EVIL = """
 from pathlib import Path
@@ -212,3 +213,11 @@ def test_flags_that_are_allowed(flags: str):
 def test_flags_that_are_refused(flag: str):
   with pytest.raises(ConfigError, match="is refused: they must be switches and numbers"):
     compose(["env=CartpoleBalance", f'hardware.xla_flags="--xla_ok=true {flag}"'])
+
+
+def test_a_saved_chains_stage_is_no_path(tmp_path: Path) -> None:
+  chain = compose(["experiment=hopper_hop_chain"]).resolved
+  stages = {"1": {"num_timesteps": 1, "overrides": []}, "x/../../mine": {"num_timesteps": 1, "overrides": []}}
+  path = make_run(tmp_path / "theirs", {**chain, "curriculum": {**chain["curriculum"], "stages": stages}}).path
+  with pytest.raises(ConfigError, match=r"stages\.x/\.\./\.\./mine: a stage's name is that of a folder"):
+    compose([f"resume={path}"])

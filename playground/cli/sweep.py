@@ -21,7 +21,9 @@ def status(folder: str) -> int:
 
 def collect(folder: str) -> int:
   """Writes sweep.csv, groups.csv, the curves and report.html from the finished jobs."""
-  write_result(SweepDirectory.open(folder))
+  sweep = SweepDirectory.open(folder)
+  sweep.check_links()
+  write_result(sweep)
   return 0
 
 
@@ -42,6 +44,7 @@ def retry(folder: str, *overrides: str, trust: Sequence[str] = ()) -> int:
 def stop(folder: str) -> int:
   """Asks all running jobs to save and exit, on any machine."""
   sweep = SweepDirectory.open(folder)
+  sweep.check_links()
   sweep.stop_file.touch()
   print(f"Jobs of {sweep.path} are asked to stop; `playground sweep retry {sweep.path}` continues them.")
   return 0

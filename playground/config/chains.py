@@ -14,6 +14,7 @@ the command line, which therefore hold for all stages.
 """
 
 import contextlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from playground.text import format_value, wrong_type
 
 _FIELDS = ("num_timesteps", "overrides")
 _SETTABLE = ("env", "robot", "agent", "tuned", "randomization", "seed")  # groups and sections that a stage may set
+_STAGE_NAME = re.compile(r"[\w-]*[^\W_][\w-]*")
 SINGLE_RUN = defaults(CurriculumConfig)  # curriculum=none
 
 
@@ -33,9 +35,13 @@ def stage_folders(curriculum: CurriculumConfig) -> dict[str, str]:
   """Returns the stages that a chain runs, from `start_at` on, with their folders in the chain's.
 
   Raises:
+    ConfigError: a stage's name is no folder's.
     UnknownNameError: `start_at` is no stage.
   """
   names, start_at = list(curriculum.stages), curriculum.start_at
+  for name in names:  # a saved chain may be another user's, whose path would lead out of its folder
+    if not _STAGE_NAME.fullmatch(str(name)):
+      raise ConfigError(f"curriculum.stages.{name}: a stage's name is that of a folder, letters, digits, - and _ only.")
   _need_stage(start_at, names)
   first = 0 if start_at is None else names.index(start_at)
   return {name: f"{number}_{name}" for number, name in enumerate(names[first:], first + 1)}
@@ -67,7 +73,7 @@ def check_chain(resolved: Section, parsed: Sequence[Override], roots: Sequence[P
       raise ConfigError(f"{about[0]} needs a chain: add curriculum=<name>, one of {chains}.")
     return
   for name, stage in stages.items():
-    _check_stage(f"curriculum.stages.{name}", name, stage)
+    _check_stage(f"curriculum.stages.{name}", stage)
   _need_stage(start_at, list(stages))
   if start_at not in (None, next(iter(stages))) and resolved["init_from"] is None:
     what = "is not the first stage, so it needs weights to start from"
@@ -131,9 +137,7 @@ def in_stage(name: str) -> Iterator[None]:
     raise type(error)(f"Stage {name} of the chain: {error}") from error
 
 
-def _check_stage(key: str, name: str, stage: object) -> None:
-  if not str(name).replace("_", "").replace("-", "").isalnum():
-    raise ConfigError(f"{key}: a stage's name is that of a folder, letters, digits, - and _ only.")
+def _check_stage(key: str, stage: object) -> None:
   if not isinstance(stage, Mapping):
     raise wrong_type(key, stage, f"a mapping with the keys {', '.join(_FIELDS)}")
   for field in stage:

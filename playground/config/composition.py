@@ -63,7 +63,7 @@ from playground.config.overrides import (
 )
 from playground.config.run_config import SCALARS, SECTIONS, RunConfig, from_dict, load
 from playground.config.schema import check_key, check_removed, fit, is_term, is_terms, unknown_term
-from playground.config.sweep_options import SweepSettings
+from playground.config.sweep_options import GridConfig, SlurmConfig, SweepSettings
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.hardware.options import HardwareConfig
@@ -129,6 +129,9 @@ def compose_settings(overrides: Sequence[str]) -> SweepSettings:
   check_limits(resolved)
   chosen = {key: resolved[key] for key in _SWEEP_SECTIONS}
   sections = {key: build(defined()[key][section["name"]], section) for key, section in chosen.items()}
+  launcher, search = sections["launcher"], sections["search"]
+  if isinstance(launcher, SlurmConfig) and not launcher.wait and not isinstance(search, GridConfig):
+    raise ConfigError("launcher.wait=false submits all jobs at once, but a search draws them one after another.")
   return SweepSettings(**resolved | sections, resolved=resolved)
 
 

@@ -12,7 +12,16 @@ from typing import Literal, get_args
 import yaml
 
 from playground.errors import CheckpointError, PlaygroundError, nearest
-from playground.files import lock_holder, locking, make_numbered, read_json, read_yaml, write_json, write_text
+from playground.files import (
+  check_links,
+  lock_holder,
+  locking,
+  make_numbered,
+  read_json,
+  read_yaml,
+  write_json,
+  write_text,
+)
 from playground.runs.interrupts import Interrupted
 from playground.runs.provenance import git_state, package_versions
 from playground.settings import Plain, Section, plain
@@ -181,11 +190,12 @@ class RunDirectory:
     """Locks the run: only this process writes it while the block runs.
 
     Raises:
-      CheckpointError: another process writes the run.
+      CheckpointError: another process writes the run, or a link in it leads out of it.
     """
     if self._locked:  # by a block around this one
       yield
       return
+    check_links(self.path)
     file = self.path / "run.lock"
     with contextlib.ExitStack() as stack:
       with _writing(self.path):

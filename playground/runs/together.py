@@ -2,7 +2,7 @@
 
 import contextlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, cast
@@ -38,9 +38,9 @@ Group = tuple[list["RunConfig"], Population | None]  # runs that train together,
 def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explore: Sequence[str] = ()) -> int:
   """Trains runs that have the same program, new or to resume.
 
-  A run that fails (non-finite numbers, a full disk, no intact checkpoint) ends alone. Runs at different steps (an
-  earlier start was interrupted between two runs) are trained one group after another, those of the same step together.
-  A population continues from the newest step that all its runs have.
+  A run that fails (non-finite numbers, a full disk, no intact checkpoint, another process trains it) ends alone. Runs
+  at different steps (an earlier start was interrupted between two runs) are trained one group after another, those of
+  the same step together. A population continues from the newest step that all its runs have.
 
   Args:
     configs: of the runs.
@@ -60,21 +60,37 @@ def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explo
   with Interrupts() as interrupts:
     try:
       hardware = setup(configs[0].hardware)
-      return _train_groups(_groups(configs, population), interrupts, hardware)
+      return _train_runs(configs, population, interrupts, hardware)
     except Interrupted as interrupt:
       print(f"Interrupted by {interrupt}.")
       return exit_code(interrupt.signum)
 
 
-def _train_groups(groups: Sequence[Group], interrupts: Interrupts, hardware: Hardware) -> int:
-  """Trains groups one after another, until a signal; returns the exit code."""
+def _train_runs(
+  configs: Sequence["RunConfig"], population: Population | None, interrupts: Interrupts, hardware: Hardware
+) -> int:
+  """Trains the unfinished runs, one group after another, until a signal; returns the exit code."""
+  able: list[RunConfig] = []
   codes: list[int] = []
-  for group in groups:
-    if interrupts.signum is None:
-      codes.append(_train_group(*group, interrupts, hardware))
-      interrupts.stop_saving()  # the next group compiles first
-  unfinished = any(codes) or len(codes) < len(groups)
-  return exit_code(interrupts.signum) if interrupts.signum is not None and unfinished else max(codes, default=0)
+  for config in configs:
+    try:
+      RestorePlan.find(config)
+      able.append(config)
+    except PlaygroundError as error:
+      codes.append(_say_failed(config, str(error)))
+  left = _groups(able, population)
+  while left and interrupts.signum is None:
+    codes.append(_train_group(*left.pop(0), interrupts, hardware))
+    interrupts.stop_saving()  # the next group compiles first
+  if interrupts.signum is not None and (left or any(codes)):
+    return exit_code(interrupts.signum)
+  return max(codes, default=0)
+
+
+def _say_failed(config: "RunConfig", why: str) -> int:
+  """Prints why a run failed while others go on; returns its exit code."""
+  print(f"{Path(config.resume or str(config.run_dir)).name} failed: {why}", file=sys.stderr)
+  return 2
 
 
 def _groups(configs: Sequence["RunConfig"], population: Population | None) -> list[Group]:
@@ -111,7 +127,10 @@ def _train_group(
 ) -> int:
   """Trains runs at the same step, or a population."""
   with contextlib.ExitStack() as runs:
-    plans = [runs.enter_context(RestorePlan.find(config).locked(config)) for config in configs]
+    plans = [runs.enter_context(_locked(config)) for config in configs]
+    if any(plan.error for plan in plans):
+      runs.close()
+      return _without_failed(configs, plans, population, interrupts, hardware)
     if population:
       steps = _shared_steps(plans)
       for config, plan in zip(configs, plans, strict=True):
@@ -122,17 +141,11 @@ def _train_group(
     training = prepare(configs, plans, hardware, together=True)
     if any(plan.error for plan in plans):
       runs.close()
-      others: list[RunConfig] = []
-      for config, plan in zip(configs, plans, strict=True):
-        if plan.error is None:
-          others.append(config)
-        else:
-          print(f"{Path(config.resume or str(config.run_dir)).name} failed: {plan.error}", file=sys.stderr)
-      return max(2, _train_groups(_groups(others, population), interrupts, hardware))
+      return _without_failed(configs, plans, population, interrupts, hardware)
     if len({plan.update for plan in plans}) > 1:  # a checkpoint is damaged, and its run is behind the others
       _set_damaged_apart(configs, plans)
       runs.close()
-      return _train_groups(_groups(configs, population), interrupts, hardware)
+      return _train_runs(configs, population, interrupts, hardware)
     members = [
       runs.enter_context(Member(open_run(config, plan), interrupts))
       for config, plan in zip(configs, plans, strict=True)
@@ -169,6 +182,29 @@ def _train_group(
   if any(member.error for member in members):
     return 2
   return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+
+
+@contextlib.contextmanager
+def _locked(config: "RunConfig") -> Iterator[RestorePlan]:
+  """Yields the plan of a run, which is locked; one that cannot start has an `error`."""
+  with contextlib.ExitStack() as lock:
+    try:
+      plan = lock.enter_context(RestorePlan.find(config).locked(config))
+    except PlaygroundError as error:
+      plan = RestorePlan(error=str(error))
+    yield plan
+
+
+def _without_failed(
+  configs: Sequence["RunConfig"], plans: Sequence[RestorePlan], population: Population | None, interrupts: Interrupts,
+  hardware: Hardware,
+) -> int:  # fmt: skip
+  """Prints the errors of those plans that have one, and trains the other runs."""
+  for config, plan in zip(configs, plans, strict=True):
+    if plan.error is not None:
+      _say_failed(config, plan.error)
+  others = [config for config, plan in zip(configs, plans, strict=True) if plan.error is None]
+  return max(2, _train_runs(others, population, interrupts, hardware))
 
 
 def _set_damaged_apart(configs: Sequence["RunConfig"], plans: Sequence[RestorePlan]) -> None:

@@ -17,6 +17,7 @@ from playground.config import RunConfig, format_value, is_of_command
 from playground.config.overrides import SHORT_KEYS
 from playground.errors import CheckpointError, ConfigError, nearest
 from playground.files import (
+  check_links,
   is_locked,
   lock_holder,
   locking,
@@ -135,7 +136,7 @@ class JobFolder:
     """The content of job.json; empty without one."""
     optional = (str, NoneType)
     kinds = {"status": str, "reason": str, "attempt": int, "started": optional, "ended": optional, "where": str}
-    return read_json(self.record_path, **kinds)
+    return read_json(self.record_path, job_pid=int, **kinds)
 
   @property
   def run(self) -> RunDirectory:
@@ -277,9 +278,18 @@ class SweepDirectory:
     self.jobs.append(job)
     self.save()
 
+  def check_links(self) -> None:
+    """Raises CheckpointError if a link leads out of the sweep's folder; a run looks at its own links."""
+    check_links(self.path, depth=3)  # <sweep>/jobs/<job>/<file>
+
   @contextlib.contextmanager
   def controlled(self) -> Iterator[None]:
-    """Locks the sweep while the block runs; raises CheckpointError if another process holds the lock."""
+    """Locks the sweep while the block runs.
+
+    Raises:
+      CheckpointError: another process holds the lock, or as `check_links`.
+    """
+    self.check_links()
     with locking(self.path / "sweep.lock") as lock:
       if lock is None:
         raise CheckpointError(

@@ -60,9 +60,11 @@ class TogetherLauncher(LocalLauncher):
         except PlaygroundError:  # the job fails alone, and its log says why
           program = None
         programs.setdefault(program or job.name, []).append(job)
-    share = math.ceil(sum(map(len, programs.values())) / len(self.slots))  # with it no slot stays empty
+    total = sum(map(len, programs.values()))
     for same in programs.values():
-      size = min(self._max_agents, share)
+      needs = 1 if self.slots[0].gpu is None else max(1, same[0].needs or 1)
+      at_once = max(1, len(self.slots) // needs)
+      size = min(self._max_agents, math.ceil(total / at_once))  # so that no slot stays empty
       size = len(same) if self._population else size
       groups = [same[i : i + size] for i in range(0, len(same), size)]
       self._groups |= {job.name: group for group in groups for job in group}

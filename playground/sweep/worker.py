@@ -15,7 +15,8 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from playground.interpreter import PYTHON
+from playground.config import parse_with_hydra
+from playground.interpreter import PYTHON, environment_elsewhere
 from playground.runs.interrupts import on_signals
 from playground.runs.run_dir import now
 from playground.settings import Plain
@@ -28,8 +29,18 @@ _JAX_REMARK = "For simplicity, JAX has removed its internal frames"  # below a t
 
 
 def job_command(trusted: Sequence[str] = (), lines: Sequence[str] = ()) -> tuple[str, ...]:
-  """Returns the command of jobs, with trusted packages and the overrides that sweep.yaml omits (`is_of_command`)."""
-  return (*COMMAND, *([f"trust=[{','.join(trusted)}]"] if trusted else []), *lines)
+  """Returns the command of jobs, with trusted packages and the overrides that sweep.yaml omits (`is_of_command`).
+
+  Jobs start in the folder that sweep.yaml names, so a relative `hardware.cache_dir` becomes absolute here.
+  """
+  return (*COMMAND, *([f"trust=[{','.join(trusted)}]"] if trusted else []), *map(_from_here, lines))
+
+
+def _from_here(line: str) -> str:
+  key, folder = line.partition("=")[0], parse_with_hydra(line).value()
+  if not key.endswith("hardware.cache_dir") or not isinstance(folder, str):
+    return line
+  return f"{key}={quoted(Path(folder).expanduser().absolute())}"
 
 
 class Worker:
@@ -136,7 +147,7 @@ class Worker:
       return subprocess.Popen(
         [*self._command, *args],
         cwd=sweep.cwd if sweep.cwd.is_dir() else None,
-        env={"WANDB_RUN_GROUP": sweep.group} | os.environ | {"PYTHONUNBUFFERED": "1"},
+        env={"WANDB_RUN_GROUP": sweep.group} | environment_elsewhere() | {"PYTHONUNBUFFERED": "1"},
         stdin=subprocess.DEVNULL,
         stdout=log,
         stderr=subprocess.STDOUT,

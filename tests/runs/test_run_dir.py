@@ -222,3 +222,24 @@ def test_git_state_is_of_this_checkout_only(tmp_path: Path):
   (tmp_path / "new.txt").write_text("x")
   state = git_state(tmp_path)
   assert state and state["dirty"] is True
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "metrics.csv", "run.lock", "2_far/videos"])
+def test_a_link_out_of_a_run_is_not_followed(tmp_path: Path, name: str) -> None:
+  run = make_run(tmp_path / "run", CONFIG)
+  (run.path / name).unlink(missing_ok=True)
+  (run.path / name).parent.mkdir(exist_ok=True)
+  (run.path / name).symlink_to(tmp_path / "outside")
+  with pytest.raises(CheckpointError, match=f"{name} is a link that leads out of {run.path}"), run.locked():
+    pass
+  assert not (tmp_path / "outside").exists()
+
+
+def test_links_of_a_user_are_followed(tmp_path: Path) -> None:
+  run = make_run(tmp_path / "run", CONFIG)
+  (run.path / "newest").symlink_to("config.yaml")
+  (run.path / "wandb").mkdir()
+  (run.path / "wandb" / "debug-core.log").symlink_to(tmp_path / "cache")  # as W&B makes them
+  (tmp_path / "link").symlink_to(run.path)
+  with RunDirectory(tmp_path / "link").locked():
+    pass

@@ -7,7 +7,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 
 from playground.config import RunConfig, compose
+from playground.errors import ConfigError
 from playground.learning.checkpoints import find_checkpoints
 from playground.learning.population import Population
 from playground.runs import together
@@ -206,6 +207,25 @@ def test_a_stop_between_two_groups_is_no_success(tmp_path: Path, monkeypatch: py
 
   monkeypatch.setattr(together, "_train_group", end_with_a_signal)
   assert train_together(groups) == 128 + signal.SIGTERM
+
+
+def test_a_run_that_another_process_trains_does_not_stop_the_others(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  configs = [saved(tmp_path / name, [400], "preempted") for name in "abcd"]
+  shutil.rmtree(tmp_path / "d")
+  groups: list[list[str]] = []
+
+  def end(configs: Sequence[RunConfig], *_: Any, **__: Any) -> None:
+    groups.append([Path(str(config.resume)).name for config in configs])
+    raise ConfigError("Enough.")
+
+  monkeypatch.setattr(together, "prepare", end)
+  with RunDirectory(tmp_path / "b").locked(), pytest.raises(ConfigError, match="Enough"):
+    train_together(configs)
+  assert groups == [["a", "c"]]
+  said = capsys.readouterr().err.splitlines()
+  assert said[0].startswith("d failed: No run directory at") and said[1].startswith("b failed: ")
 
 
 def test_a_signal_ends_a_group_that_still_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,12 +7,13 @@ import pytest
 import ray
 import yaml
 
+from playground.cli import sweep as commands
 from playground.config.sweep_options import SlurmConfig, TogetherConfig
 from playground.errors import CheckpointError, ConfigError
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.plan import settings_of
 from playground.sweep.slurm import SlurmLauncher
-from playground.sweep.worker import COMMAND
+from playground.sweep.worker import COMMAND, job_command
 from tests.aliases import LAUGHS
 from tests.sweep.helpers import make_sweep, run, statuses
 
@@ -50,6 +51,35 @@ def test_rays_workers_import_nothing_from_the_current_folder(tmp_path: Path, tra
   sweep = make_sweep(tmp_path / "sweep", 0, needs=0)
   assert run(sweep, "launcher=ray", "launcher.cores_per_job=1") == 0
   assert statuses(sweep) == {0: "finished"} and not trap.exists()
+
+
+@pytest.mark.parametrize("path", ["", ":/nowhere", "."])
+def test_a_job_imports_nothing_from_the_folder_that_a_sweep_names(
+  tmp_path: Path, trap: Path, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+  sweep = change(make_sweep(tmp_path / "sweep", 0), cwd=str(trap.parent))
+  monkeypatch.chdir(tmp_path)
+  monkeypatch.setenv("PYTHONPATH", path)
+  assert run(sweep, command=(*COMMAND, "--cfg", "job")) == 0
+  assert not trap.exists()
+
+
+def test_a_relative_folder_of_compiled_programs_is_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.chdir(tmp_path)
+  own = job_command(lines=["hardware.cache_dir=cache"])
+  assert own == (*COMMAND, f"hardware.cache_dir='{tmp_path / 'cache'}'")
+  assert job_command(lines=["hardware.cache_dir=null"]) == (*COMMAND, "hardware.cache_dir=null")
+
+
+@pytest.mark.parametrize("name", ["sweep.lock", "stop", "plots", "jobs/000_seed=0", "jobs/000_seed=0/job.log"])
+def test_a_link_out_of_a_sweep_is_not_followed(tmp_path: Path, name: str) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  (sweep.path / name).parent.mkdir(parents=True, exist_ok=True)
+  (sweep.path / name).symlink_to(tmp_path / "outside")
+  for command in (run, lambda sweep: commands.collect(str(sweep.path)), lambda sweep: commands.stop(str(sweep.path))):
+    with pytest.raises(CheckpointError, match=f"{name} is a link that leads out of {sweep.path}: put what it stands"):
+      command(sweep)
+  assert not (tmp_path / "outside").exists()
 
 
 def test_slurms_jobs_import_nothing_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

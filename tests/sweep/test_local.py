@@ -1,6 +1,10 @@
 """How a machine is divided into slots, and what jobs get of it."""
 
+import contextlib
 import os
+import signal
+import socket
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -115,3 +119,20 @@ def test_more_gpus_than_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
   assert statuses(sweep) == {0: "queued"}
   with pytest.raises(HardwareError, match=r"launcher\.gpus=2, but this machine has 1\."):
     LocalLauncher(sweep, LocalConfig(gpus=2))
+
+
+def test_only_jobs_of_this_machine_are_killed(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0, 1, 2)
+  launcher = LocalLauncher(sweep, LocalConfig())
+  processes = [subprocess.Popen(["sleep", "60"], start_new_session=True) for _ in range(2)]
+  hosts = ["node07", socket.gethostname()]
+  with contextlib.ExitStack() as locks:
+    for job, process, host in zip(sweep.jobs, processes, hosts, strict=False):
+      locks.enter_context(sweep.folder(job).claim())
+      sweep.folder(job).write(status="running", host=host, job_pid=process.pid)
+    locks.enter_context(sweep.folder(sweep.jobs[2]).claim())
+    sweep.folder(sweep.jobs[2]).write(status="running", host=hosts[1], job_pid=1)
+    launcher.kill()
+  assert processes[1].wait(10) == -signal.SIGKILL
+  assert processes[0].poll() is None
+  processes[0].kill()

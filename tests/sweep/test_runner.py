@@ -101,6 +101,20 @@ def test_an_interrupt_saves_and_starts_nothing_more(tmp_path: Path, signum: int,
   assert set(statuses(sweep).values()) == {"finished"}
 
 
+def test_a_stop_starts_nothing_more(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 13, 13, 0, 1)
+  process = controller(sweep)
+  folders = [sweep.folder(job).path for job in sweep.jobs]
+  slots = min(2, len(os.sched_getaffinity(0)))
+  wait_for(lambda: sum((folder / "starts.jsonl").is_file() for folder in folders) == slots)
+  assert command.stop(str(sweep.path)) == 0
+  assert process.wait(60) == 4, "none has finished"
+  states = sweep.states().values()
+  assert [state.status for state in states] == ["preempted"] * slots + ["queued"] * (4 - slots)
+  assert [state.attempt for state in states] == [1] * slots + [0] * (4 - slots)
+  assert "Stopped by `playground sweep stop`" in output(sweep)
+
+
 def test_a_second_interrupt_kills(tmp_path: Path) -> None:
   sweep = make_sweep(tmp_path / "sweep", 11)
   process = controller(sweep, "launcher.grace=60")

@@ -109,3 +109,8 @@ def test_what_sbatch_refuses_is_one_sentence(tmp_path: Path, monkeypatch: pytest
   with pytest.raises(HardwareError, match=r"sbatch refused job 000_seed=0 \(error: No such partition\)"):
     run(sweep, "launcher=slurm")
   assert statuses(sweep) == {0: "queued"}
+
+
+def test_a_search_waits_for_its_jobs() -> None:
+  with pytest.raises(ConfigError, match=r"launcher\.wait=false submits all jobs at once, but a search draws them one"):
+    compose_settings(["launcher=slurm", "launcher.wait=false", "search=optuna"])

@@ -63,6 +63,18 @@ def test_jobs_of_one_program_stay_together_where_other_jobs_fill_the_slots(
   assert started == [["000", "001"], ["002", "003"]]
 
 
+@pytest.mark.parametrize(("needs", "groups"), [(4, 1), (2, 2), (None, 4)])
+def test_jobs_of_several_gpus_share_processes_that_run_side_by_side(
+  tmp_path: Path, started: list[list[str]], monkeypatch: pytest.MonkeyPatch, needs: int | None, groups: int
+) -> None:
+  monkeypatch.setattr("playground.sweep.local.visible_gpus", lambda: ["0", "1", "2", "3"])
+  jobs = [Job(f"{i:03d}", ["tuned=null", f"seed={i}"], {}, needs) for i in range(8)]
+  sweep = SweepDirectory.create(tmp_path, "test", [], [], [], jobs)
+  launcher = TogetherLauncher(sweep, TogetherConfig())
+  assert all(launcher.start(job) for job in jobs)
+  assert [len(names) for names in started] == [8 // groups] * groups
+
+
 def test_finished_jobs_are_left_out_and_a_search_adds_jobs(tmp_path: Path, started: list[list[str]]) -> None:
   sweep = make(tmp_path, "seed=1", "seed=2", "seed=3")
   sweep.folder(sweep.jobs[0]).write(status="finished")
