@@ -77,7 +77,10 @@ class FastTD3(OffPolicy[FastTD3Config, FastTD3Networks]):
     return jnp.clip(action + levels[:, None] * jax.random.normal(key, action.shape), -1, 1)
 
   def _noise_levels(self, step: jax.Array, count: int) -> jax.Array:
-    """Returns the noise std of this device's environments, [count], which changes after each length of an episode."""
+    """Returns the noise std of this device's environments, [count], which changes after each length of an episode.
+
+    It follows from the step alone, so it is the same with every seed.
+    """
     key = jax.random.fold_in(jax.random.PRNGKey(0), step // self._noise_for)
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
     return jax.random.uniform(key, (count,), minval=self.config.min_noise, maxval=self.config.max_noise)

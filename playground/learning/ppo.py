@@ -133,7 +133,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
       batch = batch.replace(
         mirrored_obs=normalize(mirrored, normalizer), mirrored_action=mirror.action(data.raw_action)
       )
-    if self.bounds_kl:
+    if self.bounds_kl and not config.augment_pixels:  # else of the shifted images
       batch = batch.replace(old_logits=networks.logits(state.params.policy, batch.obs))
     scale, seen = None, state.targets_seen
     if seen is not None:
@@ -152,7 +152,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
         carry: tuple[jax.Array, PyTree, jax.Array], x: tuple[jax.Array, jax.Array]
       ) -> tuple[PyTree, jax.Array]:
         flat, opt_state, stopped = carry
-        minibatch, key = self._minibatch(data, *x)
+        minibatch, key = self._minibatch(data, state.params.policy, *x)
         grads, parts = jax.grad(ppo_loss, has_aux=True)(unravel(flat), minibatch, key, networks, config, scale)
         kl = jax.lax.pmean(parts[KL], AXIS) if self.bounds_kl else jnp.zeros(())
         adapted = opt_state if config.desired_kl is None else self._adapt(opt_state, kl)
@@ -173,7 +173,7 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
 
     *total, steps = jax.lax.pmean(log.sum((0, 1)), AXIS)
     names = (*self.losses, "grad_norm", "nonfinite_updates")
-    metrics: Metrics = {name: value / steps for name, value in zip(names, total, strict=True)}
+    metrics: Metrics = {name: value / jnp.maximum(steps, 1) for name, value in zip(names, total, strict=True)}
     metrics |= {"gradient_steps": steps, "nonfinite_updates": total[-1]}
     if vectors := jax.tree.leaves(networks.vectors(obs)):
       farthest = jnp.stack([jnp.abs(entry).max() for entry in vectors]).max()
@@ -205,8 +205,11 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
     rate = adapted_rate(adam.hyperparams["learning_rate"], kl, self.config)
     return clip, adam._replace(hyperparams=adam.hyperparams | {"learning_rate": rate})
 
-  def _minibatch(self, batch: Batch, columns: jax.Array, key: jax.Array) -> tuple[Batch, jax.Array]:
-    """Returns the trajectories in `columns`, with shifted images if `augment_pixels` is set, and a key for the loss."""
+  def _minibatch(self, batch: Batch, policy: PyTree, columns: jax.Array, key: jax.Array) -> tuple[Batch, jax.Array]:
+    """Returns the trajectories in `columns`, with shifted images if `augment_pixels` is set, and a key for the loss.
+
+    `policy` has the actor's parameters before the update.
+    """
     last_obs = jax.tree.map(lambda x: x[columns], batch.last_obs)
     minibatch = jax.tree.map(lambda x: x[:, columns], batch.replace(last_obs=None)).replace(last_obs=last_obs)
     if pad := self.config.augment_pixels:
@@ -214,6 +217,8 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
       shifts = jax.random.randint(shift_key, (len(columns), 2), 0, 2 * pad + 1)
       shift = lambda obs: random_shift(obs, shifts, pad)
       minibatch = minibatch.replace(obs=shift(minibatch.obs), last_obs=shift(minibatch.last_obs))
+      if self.bounds_kl:
+        minibatch = minibatch.replace(old_logits=self.networks.logits(policy, minibatch.obs))
     return minibatch, key
 
 
@@ -272,6 +277,8 @@ def ppo_loss(
       assert batch.value is not None
       near = batch.value + jnp.clip(values - batch.value, -limit, limit)
       value_error = jnp.maximum(value_error, squared(targets - near))
+    if batch.targets is not None and not config.bootstrap_on_timeout:  # else their error is 0
+      value_error *= 1 - batch.truncation
     return 0.5 * config.vf_loss_coefficient * value_error.mean()
 
   value_loss = critic_loss(values)

@@ -108,8 +108,8 @@ class Trainer:
     self.num_agents = len(agents)
     self.mesh = mesh = for_agents(mesh, len(agents)) if agents else mesh
     self.num_devices = mesh.shape[AXIS]  # of each agent
-    config.check(self.num_devices)
     self.algorithm = build_algorithm(env, config, network_precision)
+    config.check(self.num_devices)
     self.config, self.env = config, wrap_for_training(env)
     own = trainer_settings(config, env.settings_of(env.config)) if not agents else {}
     self.settings: dict[str, PyTree] = self.join([*agents] or [own])

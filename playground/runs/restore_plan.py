@@ -32,7 +32,7 @@ from playground.runs.run_dir import RunDirectory
 from playground.settings import Plain, Section
 from playground.text import format_value
 
-_ONLY_AT_FIRST = ("value_dtype", "policy_output_scale")  # keys of networks that their weights do not depend on
+_ONLY_AT_FIRST = ("value_dtype", "policy_output_scale", "init_std")  # keys of networks that given weights leave open
 _OF_NETWORKS = ("normalize_observations", "min_value", "max_value")  # keys beside those of `network` that they do
 
 

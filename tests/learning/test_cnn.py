@@ -176,6 +176,15 @@ def test_a_training_step_keeps_images_as_bytes_and_shifts_them(monkeypatch: pyte
   assert all((a != b).any() for a, b in zip(before, numbers(state.algorithm.params), strict=True) if a.any())
 
 
+def test_a_shift_of_images_is_no_change_of_the_policy() -> None:
+  """`max_kl` ends an update after the first gradient step that changes the policy, not before it."""
+  network = NetworkConfig((16,), (16,), policy_obs_key="", value_obs_key="", cnn=TINY)
+  config = dataclasses.replace(SMALL_PPO, network=network, augment_pixels=2, max_kl=1e-12)
+  trainer = Trainer(Seen(), config, make_mesh(1))
+  _, metrics = trainer.train(trainer.init(jax.random.PRNGKey(0), {}, None, trainer.settings), {}, jnp.int32(1))
+  assert metrics["gradient_steps"] == 1 and np.isfinite(metrics["total_loss"])
+
+
 def test_only_images_can_be_shifted() -> None:
   with pytest.raises(
     ConfigError, match=r"^agent\.augment_pixels=4 shifts images, and the task has none: set it to 0\.$"

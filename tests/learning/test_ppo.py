@@ -19,7 +19,8 @@ from playground.learning.algorithm import gradient_step
 from playground.learning.networks import NetworkConfig, normalize
 from playground.learning.ppo import Batch, gae, pay_time_outs
 from playground.learning.rollout import Environments, unroll
-from tests.dummy import SMALL_PPO, numbers, point_trainer
+from playground.learning.trainer import Trainer
+from tests.dummy import SMALL_PPO, PointTask, numbers, point_trainer
 
 
 def test_a_bad_gradient_is_left_out() -> None:
@@ -121,3 +122,8 @@ def test_a_run_that_pays_time_outs_stores_no_more_and_learns() -> None:
     learned.append(ravel_pytree(state.algorithm.params)[0])
   assert jax.tree.structure(shapes[0]) == jax.tree.structure(shapes[1])
   assert np.isfinite(learned[1]).all() and (learned[0] != learned[1]).any()
+
+
+def test_values_are_checked_before_sizes() -> None:
+  with pytest.raises(ConfigError, match=r"agent\.num_envs=0 must be a whole number from 1 to "):
+    Trainer(PointTask(), dataclasses.replace(SMALL_PPO, num_envs=0), make_mesh(1))

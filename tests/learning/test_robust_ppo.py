@@ -150,7 +150,8 @@ def test_the_mirror_image_counts_as_much_as_what_was_experienced(networks: Actor
   advantages = jnp.linspace(-3, 3, 24).reshape(6, 4)
   known = {"targets": advantages + 1, "advantages": advantages}
   beside = lambda x, y: jnp.concatenate([x, y], axis=1)
-  twice = {name: beside(value, value) for name, value in (*known.items(), ("log_prob", data.log_prob))}
+  same = {**known, "log_prob": data.log_prob, "truncation": data.truncation}
+  twice = {name: beside(value, value) for name, value in same.items()}
   both = data.replace(obs=jax.tree.map(beside, data.obs, obs), raw_action=beside(data.raw_action, action), **twice)
   parts = lambda batch: ppo_loss(params, batch, jax.random.PRNGKey(1), networks, SMALL_PPO)[1]
   ours, theirs = parts(data.replace(mirrored_obs=obs, mirrored_action=action, **known)), parts(both)
@@ -160,6 +161,16 @@ def test_the_mirror_image_counts_as_much_as_what_was_experienced(networks: Actor
     assert float(ours[name]) != pytest.approx(float(alone[name]), rel=1e-3)
   for name in ("entropy", "approx_kl"):
     assert float(ours[name]) == float(alone[name]), "of what was experienced"
+
+
+def test_the_critic_learns_nothing_where_time_cut_an_episode(networks: ActorCritic) -> None:
+  """Also with targets of an earlier critic, from which it has moved since."""
+  params, data = networks.init(jax.random.PRNGKey(0)), batch(networks)
+  known = {"targets": jnp.ones((6, 4)), "advantages": jnp.ones((6, 4))}
+  loss = lambda cut: ppo_loss(
+    params, data.replace(truncation=jnp.full((6, 4), cut), **known), jax.random.PRNGKey(1), networks, SMALL_PPO
+  )[1]["value_loss"]
+  assert loss(1.0) == 0 < loss(0.0)
 
 
 def test_a_task_without_a_mirror_is_refused() -> None:

@@ -30,7 +30,7 @@ from playground.learning import checkpoints
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
 from playground.learning.loop import Loop, schedule
 from playground.runs import train as train_module
-from playground.runs.restore_plan import RestorePlan
+from playground.runs.restore_plan import RestorePlan, networks_of
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import cut_short, open_run, say_where, train
 from tests.processes import WITHOUT_WARP
@@ -501,6 +501,14 @@ def test_weights_of_another_network_are_refused(
   key, _, here = override.partition("=")
   sentence = refused(*TASK, override, f"init_from={whole}", f"run_dir={tmp_path / 'run'}")
   assert f"was trained with {key}={there}: a run with {key}={here} cannot start from it." in sentence
+
+
+def test_the_noise_of_a_new_policy_is_no_matter_of_weights(whole: Path, tmp_path: Path) -> None:
+  run = ["agent.network.init_std=0.3", f"init_from={whole}", f"run_dir={tmp_path / 'run'}"]
+  config = compose([*TASK, *run])
+  assert RestorePlan.find(config).weights is not None
+  agent = config.resolved["agent"]
+  assert networks_of(agent) == networks_of({**agent, "network": {**agent["network"], "init_std": None}})
 
 
 def test_weights_of_a_critic_of_other_values_are_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
