@@ -179,8 +179,10 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
       after = batch.step(state, action)
       ended = after.done if same_step else state.done
       begun = jax.lax.cond(ended.any(), lambda: where_done(ended, start(key), after), lambda: after)
-      kept = {name: value for name, value in after.info.items() if name == PRESERVE_INFO}
-      begun = begun.replace(info=begun.info | kept)
+      if PRESERVE_INFO in after.info:  # not from a step that the environment ignores
+        kept = after.info[PRESERVE_INFO]
+        kept = kept if same_step else where_done(state.done, state.info[PRESERVE_INFO], kept)
+        begun = begun.replace(info=begun.info | {PRESERVE_INFO: kept})
       return begun, (after if same_step else begun).replace(data=None)
 
     self._start, self._advance, self._where = jax.jit(start), jax.jit(advance), jax.jit(where_done)

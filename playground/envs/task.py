@@ -2,7 +2,7 @@
 
 import abc
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import CodeType, FunctionType
 from typing import Any, ClassVar
 
@@ -18,14 +18,15 @@ from playground.mdp.context import Robot, StepContext
 from playground.mdp.managers import (
   CommandManager,
   EventManager,
-  Info,
   ObservationManager,
   RewardManager,
   TerminationManager,
+  checked,
 )
+from playground.mdp.terms import bind
 from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
 from playground.randomization import Randomizer
-from playground.text import first_line
+from playground.text import first_line, format_value
 
 _LAGS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))  # their `act` follows `ctrl`
 _MODEL_FIELDS = "model_fields"  # entry of `info`: fields of the model that events of mode reset draw
@@ -79,7 +80,8 @@ class Task(Env):
     self.rewards = RewardManager(config.rewards)
     self.terminations = TerminationManager(config.terminations)
     self.observations = ObservationManager(config)
-    if any(not term.func.__module__.startswith("playground.") for term in self.terms()):
+    acting = [*bind("commands", config.get("commands")), *bind("events", config.get("events"))]
+    if any(not term.func.__module__.startswith("playground.") for term in (*self.terms(), *acting)):
       self.derived = DERIVED_FIELDS  # another package's term may read any of them
     else:
       read = set().union(*(_attributes_read(term.func) for term in self.terms()))
@@ -99,6 +101,13 @@ class Task(Env):
   def terms(self) -> list[Any]:
     """All reward, termination and observation terms."""
     return [*self.rewards.terms, *self.terminations.terms, *self.observations.terms]
+
+  def scales(self, scale: float | Sequence[float]) -> np.ndarray:
+    """Returns `action_scale` for each action, or one for all; raises ConfigError for a list of another length."""
+    if np.ndim(scale) and len(np.asarray(scale)) != self.action_size:
+      what = f"has {len(np.asarray(scale))} numbers, and this task {self.action_size} actions"
+      raise ConfigError(f"env.action_scale={format_value(scale)} {what}.")
+    return np.asarray(scale, np.float32)
 
   def prepare_model(self, mj_model: mujoco.MjModel, config: Any) -> None:
     """Changes the compiled model in place before it goes to the device."""
@@ -177,7 +186,8 @@ class Task(Env):
     rewards = self.rewards.compute(c)
     obs, buffers = self.observations.compute(c, obs_key, info.get("observation_buffers"))
     after = {**info, "rng": rng, "last_act": action, "last_last_act": info["last_act"]}
-    after |= self.commands.step(c, command_key) | self._checked(self.next_info(c, own_key), info)
+    own = checked(self.next_info(c, own_key), info, f"{type(self).__name__}.next_info", "first_info")
+    after |= self.commands.step(c, command_key) | own
     after |= {"observation_buffers": buffers} if buffers else {}
     reward = self.clipped(self.total(rewards))
     done, ended = self.terminations.end(c)
@@ -212,17 +222,6 @@ class Task(Env):
         what = f"has shape {list(jnp.shape(value))}, and a metric is one number"
         raise ConfigError(f"{type(self).__name__}.measure: {name!r} {what}: add .sum() or .mean().")
     return metrics | {"fall": jnp.array(failures, jnp.float32).max(initial=0.0)} | measured
-
-  def _checked(self, own: Info, info: Mapping[str, object]) -> Info:
-    """Returns what `next_info` returned; raises ConfigError for entries that `info` lacks or has with another type."""
-    described = lambda entry: jax.tree.map(lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}", entry)
-    for name, entry in own.items():
-      if name not in info:
-        raise ConfigError(f"{type(self).__name__}.next_info returns {name!r}, which first_info lacks: add it there.")
-      if (new := described(entry)) != (old := described(info[name])):
-        what = f"{name!r} as {new}, where an episode starts with {old}"
-        raise ConfigError(f"{type(self).__name__}.next_info returns {what}: make them the same.")
-    return own
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:

@@ -2,7 +2,7 @@
 
 A command is a class whose fields are the term's `params`. `bind(env)` looks names up once; `reset(key)` returns the
 entries of `info` that an episode starts with, `step(c, key)` those for the next step. They outlast an auto-reset: the
-next episode keeps the command and draws a new time for it.
+next episode keeps the command and, unless time cut the episode before it, draws a new time for it.
 """
 
 import dataclasses

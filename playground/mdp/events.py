@@ -4,7 +4,9 @@
 - mode `reset`: a function `(key, env, initial, **params) -> initial` changes the state that an episode starts with.
 - mode `interval`: a class whose fields are the term's `params`. `bind(env)` looks names up once; `reset(key, model)`
   returns the entries of `info` that an episode starts with, `step(data, info)` acts before the physics of a step. Where
-  entries follow from the model, `of_model(model)` returns them again for the model that an auto-reset draws.
+  entries follow from the model, `of_model(model)` returns them again for the model that an auto-reset draws. Other
+  entries outlast an auto-reset. In the step after one, what the physics derives from the state (`sensordata`, `xpos`,
+  ...) is still that of the last episode's end.
 """
 
 import dataclasses
@@ -31,7 +33,11 @@ _MOMENTS = {"normal": ("mean", "std"), "bernoulli": ("mean",)}  # parameters of 
 
 
 def reset_root_xy(key: jax.Array, env: "Task", initial: "InitialState", distance: AtLeast0) -> "InitialState":
-  """Moves the root by U[-distance, distance) along x and y, m."""
+  """Moves the root by U[-distance, distance) along x and y, m.
+
+  The robot starts at the height of the highest ground within 1 m of the origin: on stairs or a slope a larger distance
+  may put it into the ground.
+  """
   need_free_root(env)
   shift = jax.random.uniform(key, (2,), minval=-distance, maxval=distance)
   return initial.replace(qpos=initial.qpos.at[:2].add(shift))
@@ -212,7 +218,7 @@ class ModelField:
 
 @dataclasses.dataclass
 class PushByForce:
-  """Pushes the root body with a force, a half sine in time, at intervals; each episode draws strength and times.
+  """Pushes the root body with a force, a half sine in time, at intervals; a full reset draws strength and times.
 
   Writes `pushing` (whether a push is under way in this step), `push_force` and the counters `push_wait`, `push_time`.
 
@@ -346,7 +352,7 @@ class PushObjectByWrench(PushByForceRegularly):
 
 @dataclasses.dataclass
 class PushBySettingVelocity:
-  """Adds a horizontal velocity in a random direction to the root's, at an interval that each episode draws.
+  """Adds a horizontal velocity in a random direction to the root's, at an interval that a full reset draws.
 
   Writes `push_step`, `push_interval_steps`, `push` (the direction of a push in this step, else 0) and `pushing`.
 

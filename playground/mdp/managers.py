@@ -276,8 +276,9 @@ class CommandManager(_Manager):
     return _union((term, term.run("reset", k)) for term, k in _with_keys(self.terms, key))
 
   def step(self, c: StepContext, key: jax.Array) -> Info:
-    """Returns the entries of `info` for the next step."""
-    return _union((term, term.run("step", c, k)) for term, k in _with_keys(self.terms, key))
+    """Returns the entries of `info` for the next step; raises ConfigError as `checked`."""
+    parts = [(term, term.run("step", c, k)) for term, k in _with_keys(self.terms, key)]
+    return _union((term, checked(part, c.info, f"{term.key}.step", "reset")) for term, part in parts)
 
 
 class EventManager(_Manager):
@@ -325,13 +326,40 @@ class EventManager(_Manager):
     return _union((term, term.run("of_model", model)) for term in terms)
 
   def step(self, data: PhysicsData, info: Mapping[str, Any]) -> tuple[PhysicsData, Info]:
-    """Returns the physics after the interval events, and `info`."""
+    """Returns the physics after the interval events, and `info`.
+
+    Raises:
+      ConfigError: an event returns no such pair, or as `checked`.
+    """
     changed = dict(info)
     for term in self.groups["interval"]:
       if term.options.enabled:
-        data, entries = term.run("step", data, changed)
-        changed |= entries
+        pair = term.run("step", data, changed)
+        if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[1], dict)):
+          raise ConfigError(f"{term.key}.step must return the physics and the entries of info that it changes.")
+        data = pair[0]
+        changed |= checked(pair[1], info, f"{term.key}.step", "reset")
     return data, changed
+
+
+def checked(entries: Info, info: Mapping[str, object], method: str, first: str) -> Info:
+  """Returns entries of `info` for the next step, as they are.
+
+  Args:
+    entries: what `method` returned.
+    info: of this step.
+    method: for messages, as `first`, which returns what an episode starts with.
+
+  Raises:
+    ConfigError: `info` lacks an entry, or has it with another type or shape.
+  """
+  described = lambda entry: jax.tree.map(lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}", entry)
+  for name, entry in entries.items():
+    if name not in info:
+      raise ConfigError(f"{method} returns {name!r}, which {first} lacks: add it there.")
+    if (new := described(entry)) != (old := described(info[name])):
+      raise ConfigError(f"{method} returns {name!r} as {new}, where an episode starts with {old}: make them the same.")
+  return entries
 
 
 def _with_keys(terms: list[Term], key: jax.Array) -> Iterable[tuple[Term, jax.Array]]:

@@ -64,7 +64,8 @@ class ObservationOptions(NamedTuple):
     clip: [low, high].
     scale: a factor, or one for each element (a shorter list repeats).
     delay: [low, high]: the value is that of so many steps ago, drawn in every step, both ends included.
-    history: the newest value and those before it, newest first; 0 before the episode began.
+    history: the newest value and those before it, newest first; 0 before the episode began, with a `delay` its
+      first value.
   """
 
   noise: Mapping[str, Any] | None = None

@@ -238,7 +238,8 @@ def check_params(func: Callable[..., Any], given: Any, key: str, skip: int = 1) 
     raise ConfigError(f"{key}={given!r} is no mapping of parameters.")
   params = {name: plain(value) for name, value in given.items() if value is not None}
   arguments = dict(list(inspect.signature(func).parameters.items())[skip if not isinstance(func, type) else 0 :])
-  arguments = {name: argument for name, argument in arguments.items() if not name.startswith("_")}
+  many = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)  # *args and **kwargs name no parameters
+  arguments = {name: a for name, a in arguments.items() if not name.startswith("_") and a.kind not in many}
   for name, value in params.items():
     if name not in arguments:
       has = f"takes {', '.join(arguments)}" if arguments else "takes no parameters"

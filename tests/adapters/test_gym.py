@@ -152,6 +152,22 @@ def test_the_level_of_a_curriculum_outlasts_an_episode(mode: AutoresetMode) -> N
   assert envs._state.info[PRESERVE_INFO]["curriculum_id"].tolist() == [0, 0]
 
 
+@pytest.mark.parametrize(("mode", "level"), [(AutoresetMode.NEXT_STEP, 2), (AutoresetMode.SAME_STEP, 4)])
+def test_a_step_that_is_ignored_raises_no_level(mode: AutoresetMode, level: int) -> None:
+  always = {
+    "success_distance": 100.0,
+    "success_angle": None,
+    "success_steps": 0,
+    "episode_length": 1,
+    "action_repeat": 1,
+  }
+  envs: Any = GymVectorEnv(2, "PandaRobotiqPushCube", always, "c", autoreset_mode=mode)
+  envs.reset(seed=0)
+  for _ in range(4):
+    envs.step(np.zeros((2, 7), np.float32))
+  assert envs._state.info[PRESERVE_INFO]["curriculum_id"].tolist() == [level, level]
+
+
 def test_only_who_ended_has_a_last_observation() -> None:
   envs: Any = GymVectorEnv(3, "CartpoleBalance", SHORT, "c", autoreset_mode=AutoresetMode.SAME_STEP)
   envs.reset(seed=0)

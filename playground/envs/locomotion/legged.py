@@ -45,7 +45,7 @@ class LeggedTask(Task):
     """Builds the scene and binds the terms; `config` is that of `configs/env/joystick.yaml`, `getup.yaml`, ..."""
     super().__init__(config, self.scene(config))
     self._action_base = lookup(_ACTION_BASES, config.action_base, "env.action_base")
-    self._action_scale: float = config.action_scale
+    self._action_scale = self.scales(config.action_scale)
     self._target_range = self.robot.target_range if config.clip_targets else None
     self._settle_steps = round(config.settle_s / self.sim_dt)
 

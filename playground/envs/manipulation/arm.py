@@ -40,7 +40,7 @@ class TabletopTask(Task):
     """Builds the scene and binds the terms; `config` is that of `configs/env/_panda.yaml` or `_aloha.yaml`."""
     self.object, self.gripper = config.get("object"), config.get("gripper")
     super().__init__(config, build_tabletop(config.scene))
-    self._action_scale: float = config.action_scale
+    self._action_scale = self.scales(config.action_scale)
 
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> ArmRobot:
     return ArmRobot(mj_model, config.keyframe, self.arm_joints)
@@ -135,9 +135,12 @@ class ProgressTask(TabletopTask):
     """Returns the reward besides the gain, from the terms' total."""
     return jnp.zeros(())
 
+  def clipped(self, reward: jax.Array) -> jax.Array:
+    return reward  # of the potential: `post_step` clips the gain
+
   def post_step(self, data: PhysicsData, info: Mapping[str, Any], action: jax.Array) -> State:
     state = super().post_step(data, info, action)
     potential, best = state.reward, info["best_potential"]
     reward = jnp.maximum(potential - best, 0.0) + self.bonus(ArmContext(self, data, info, action), potential)
     best = {"best_potential": jnp.maximum(potential, best)}
-    return state.replace(reward=self.clipped(jnp.where(info["first_step"], 0.0, reward)), info=state.info | best)
+    return state.replace(reward=super().clipped(jnp.where(info["first_step"], 0.0, reward)), info=state.info | best)

@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from playground.envs.base import State
 from playground.envs.task import InitialState, Task
@@ -39,7 +38,7 @@ class HandTask(Task):
     """Builds the scene and binds the terms; `config` is that of `configs/env/_in_hand.yaml`."""
     super().__init__(config, self.scene(config))
     self._action_base = lookup(_ACTION_BASES, config.action_base, "env.action_base")
-    self._action_scale = np.asarray(config.action_scale)
+    self._action_scale = self.scales(config.action_scale)
     self.pose_noise = config.pose_noise if config.noise_level else None
 
   def scene(self, config: Any) -> mujoco.MjSpec:

@@ -55,6 +55,10 @@ class PushCube(ArmTask):
     """Builds the scene. `config`: see `configs/env/PandaRobotiqPushCube.yaml`."""
     if len(config.curriculum.distance) != len(config.curriculum.angle):
       raise ConfigError("env.curriculum.distance and env.curriculum.angle must have an entry for each level.")
+    if config.reward_total != "sum":
+      raise ConfigError(
+        f"env.reward_total={config.reward_total}: this task's reward is a mean of terms: leave it at sum."
+      )
     super().__init__(config)
     need_weights([term for term in self.rewards.terms if term.name not in _BONUSES])
     self._action_delay = tuple(config.action_delay)

@@ -97,6 +97,15 @@ def test_only_progress_pays(task: Any, state: State) -> None:
   assert step(task, calm.replace(info=up.info), still, box=(0.63, 0, 0.03)).reward == 0
 
 
+def test_a_clip_holds_for_the_progress_of_a_step(state: State) -> None:
+  still, task = (0, 0, 1), prepared(reward_clip=[0.0, 0.2])
+  calm = state.replace(info=state.info | {"best_potential": jnp.zeros(()), "last_act": jnp.array([0.0, 0, 1])})
+  first = step(task, calm, still, box=(0.63, 0, 0.03))
+  assert first.reward == pytest.approx(0.2) and first.info["best_potential"] > 0.3
+  up = step(task, calm.replace(info=first.info), still, box=(0.63, 0, 0.04))
+  assert 0 < up.reward < 0.2
+
+
 def test_the_first_step_pays_nothing(task: Any, state: State) -> None:
   new = state.replace(info=state.info | {"first_step": jnp.array(True), "best_potential": jnp.zeros(())})
   after = step(task, new, (0, 0, 1))

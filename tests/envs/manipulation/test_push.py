@@ -273,6 +273,7 @@ def test_the_level_outlasts_episodes_and_all_else_begins_anew(push: Any) -> None
     ({"action_delay": [4, 3]}, r"env\.action_delay=\[4, 3\] must be"),
     ({"observation_delay": [-1, 3]}, r"env\.observation_delay=\[-1, 3\] must be"),
     ({"curriculum.angle": [0.5]}, "an entry for each level"),
+    ({"reward_total": "product"}, r"env\.reward_total=product: this task's reward is a mean of terms: leave it at sum"),
   ],
 )
 def test_refuses(overrides: dict[str, Any], message: str) -> None:
