@@ -17,6 +17,7 @@ import sys
 import tarfile
 from pathlib import Path
 
+_OVERHEAD = 5 * 512  # bytes of a file in an archive, at most: header, a long name's header and blocks, padding
 FILES = ("config.yaml", "overrides.yaml", "manifest.json", "metrics.csv", "status.json", "summary.json", "job.log")
 
 
@@ -45,14 +46,14 @@ def pack(folder: Path, out: Path, part: int, parts: int) -> list[str]:
   record = folder / "packed.json"
   packed: dict[str, str] = json.loads(record.read_text()) if record.is_file() else {}
   names, size, archive = [], 0, io.BytesIO()
-  with tarfile.open(fileobj=archive, mode="w") as tar:
+  with tarfile.open(fileobj=archive, mode="w", format=tarfile.GNU_FORMAT) as tar:
     for job in sorted((folder / "jobs").iterdir()):
       path = job / "status.json"
       status = json.loads(path.read_text()) if path.is_file() else {"status": "running"}
       if status["status"] == "running" or packed.get(job.name) == status["updated"]:
         continue
       members = _members(job)
-      needed = sum(path.lstat().st_size + 1024 for path in members)  # 1024: header and padding
+      needed = sum(path.lstat().st_size + _OVERHEAD for path in members)
       if size + needed > part * parts - 10240:  # the archive's end
         print(f"{job.name} has {needed / 2**20:.1f} MiB and does not fit: next time, or with more MIB or PARTS")
         continue

@@ -7,7 +7,7 @@ reference runs in results/reference/. A task of another package is not in it.
 import dataclasses
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from statistics import fmean
@@ -91,7 +91,7 @@ def measure(task: str) -> Entry:
     budget=int(config.agent.num_timesteps),
     experiment=experiment_name(task),
     status=STATUSES[min(reached, default=-1)],
-    best_return=round(fmean(map(reached_return, best)), 3) if best else None,
+    best_return=round(fmean(by_seed(best, reached_return)), 3) if best else None,
     best_steps=int(best[0]["steps"]) if best else None,
     best_run=run_name(best[0]) if best else "",
   )
@@ -145,7 +145,7 @@ def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]
   groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
   for row in [row for row in ours if not _NO_PUSHES.search(row["setting"])] or ours:
     groups.setdefault((row["agent"], row["setting"], row["backend"], row["steps"]), []).append(row)
-  mean = lambda runs: fmean(map(reached_return, runs))
+  mean = lambda runs: fmean(by_seed(runs, reached_return))
   highest = max(map(mean, groups.values()), default=0.0)
   close = [runs for runs in groups.values() if mean(runs) >= highest - 0.02 * abs(highest)]
   return max(close, key=lambda runs: (len({row["seed"] for row in runs}), mean(runs)), default=[])
@@ -154,6 +154,14 @@ def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]
 def reached_return(row: dict[str, str]) -> float:
   """Returns the mean return of a run's last evaluation: of the policy's mode, else of sampled actions."""
   return float(row.get("final_mode_return") or row["final_return"])
+
+
+def by_seed(runs: Sequence[dict[str, str]], value: Callable[[dict[str, str]], float]) -> list[float]:
+  """Returns the mean value of each seed's runs: a seed that is trained again is no other sample."""
+  seeds: dict[str, list[float]] = {}
+  for run in runs:
+    seeds.setdefault(run["seed"], []).append(value(run))
+  return [fmean(values) for values in seeds.values()]
 
 
 def run_name(row: dict[str, str]) -> str:

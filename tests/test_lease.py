@@ -74,6 +74,13 @@ def test_no_part_is_larger_than_allowed(tmp_path: Path, capsys: pytest.CaptureFi
   assert lease.pack(tmp_path, tmp_path / "out", 50_000, 4) == ["1_b"]
 
 
+def test_small_files_with_long_names_fit_too(tmp_path: Path) -> None:
+  for i in range(5):
+    make_job(tmp_path, f"{i}_{'long' * 30}", size=10)
+  while lease.pack(tmp_path, tmp_path / "out", 50_000, 1):
+    assert [path.stat().st_size <= 50_000 for path in (tmp_path / "out").iterdir()] == [True]
+
+
 def test_the_queue_is_stopped_after_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   calls = []
   real = subprocess.Popen

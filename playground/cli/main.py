@@ -34,7 +34,7 @@ _PROGRAMS = {
   "bench": ("playground.cli.bench", "Measure speed and memory; the same as playground-bench."),
 }
 _RUN = "run directory, checkpoint, a task for its pretrained policy, or wandb:<entity>/<project>/<run>"
-_CAMERA = "camera of --video (default: video.camera of the run, else one that shows the whole scene)"
+_CAMERA = "camera of --video (default: video.camera of a run, else one that shows the whole scene)"
 _TASK_VALUES = "other values of the task, such as terrain=stairs or env.episode_length=500"
 Command = Callable[[argparse.Namespace], int]  # returns the exit code
 
@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
   show.add_argument("task", help="a task, or randomization=<name> for its events")
   show.add_argument("overrides", nargs="*", help="as for playground-run, such as robot=go1 or env.impl=jax")
   show.add_argument("--views", metavar="FILE", help="write images of its camera on randomised models instead")
-  show.add_argument("--num-views", type=int, default=16, help="randomised models of --views (default: %(default)s)")
+  show.add_argument("--num-views", type=int, help="randomised models of --views (default: 16)")
   keys = add("keys", "cli.keys:show_keys", "Explain a section's or group's keys: value, allowed values and meaning.")
   keys.add_argument("prefix", help="such as agent, env.rewards, hardware.platform or tracking")
   keys.add_argument("overrides", nargs="*", help="as for playground-run, such as env=Go1Getup or agent=sac")
@@ -132,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
   play.add_argument(
     "--agent", choices=("zero", "random"), help="zero or random actions on a task, in place of a policy"
   )
-  play.add_argument("--episodes", type=int, default=10, help="episodes to measure (default: %(default)s)")
+  play.add_argument("--episodes", type=int, help="episodes to measure (default: 10)")
   play.add_argument("--seed", type=int, default=0, help="seed of the episodes (default: %(default)s)")
   shown = _add_places(play, "also render an episode to this .mp4")
   shown.add_argument("--web", action="store_true", help="show it in the browser instead")
@@ -188,8 +188,8 @@ def _add_places(parser: argparse.ArgumentParser, video: str) -> argparse._Mutual
   parser.add_argument(
     "--randomize", action="store_true", help="draw the model by the task's startup events, one for each episode"
   )
-  parser.add_argument("--host", default="127.0.0.1", help="address that the page listens on (default: %(default)s)")
-  parser.add_argument("--port", type=int, default=8080, help="port of the page (default: %(default)s)")
+  parser.add_argument("--host", help="address that the page listens on (default: 127.0.0.1)")
+  parser.add_argument("--port", type=int, help="port of the page (default: 8080)")
   return shown
 
 
@@ -235,14 +235,32 @@ def _play(args: argparse.Namespace) -> int:
   if args.agent and args.policy not in registry.names():
     near = nearest(args.policy, registry.names())
     raise UnknownNameError(f"--agent={args.agent} acts on a task, and {args.policy} is none.{near}")
-  return play(args.policy if args.agent else _run_path(args.policy), **_named(args, "policy"))
+  if args.episodes is not None and (args.web or args.viewer):
+    raise ConfigError(
+      f"--episodes={args.episodes} are measured, and --{'web' if args.web else 'viewer'} measures none."
+    )
+  _need_page(args, args.web)
+  return play(args.policy if args.agent else _run_path(args.policy), **_given(args, "policy"))
 
 
 def _view(args: argparse.Namespace) -> int:
   from playground.cli.play import play
 
-  own = {"episodes": 1, "web": not (args.video or args.viewer)}
-  return play(args.task, **own, **_named(args, "task"))
+  web = not (args.video or args.viewer)
+  _need_page(args, web)
+  return play(args.task, episodes=1, web=web, **_given(args, "task"))
+
+
+def _need_page(args: argparse.Namespace, web: bool) -> None:
+  """Raises ConfigError for options of the page in the browser where there is none."""
+  for name in ("host", "port"):
+    if (value := getattr(args, name)) is not None and not web:
+      raise ConfigError(f"--{name}={value} is of the page in the browser, which this command does not show.")
+
+
+def _given(args: argparse.Namespace, *others: str) -> dict[str, Any]:
+  """Returns the arguments as `_named`, without those that were not given."""
+  return {name: value for name, value in _named(args, *others).items() if value is not None}
 
 
 def _pretrained(args: argparse.Namespace) -> int:

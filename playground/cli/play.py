@@ -66,7 +66,7 @@ def play(
     episodes: number of episodes to measure.
     seed: of the episodes.
     video: the .mp4 to render the first episode to.
-    camera: of the video, see `render_video`.
+    camera: of the video, see `render_video`; None is the `video.camera` of a run.
     viewer: whether to show the policy in MuJoCo's viewer instead of measuring it.
     web: whether to show it in the browser instead.
     host: address that the page in the browser is served at.
@@ -107,6 +107,7 @@ def play(
   unlike = [f"{sentence} --randomize plays on models like those of training." for sentence in unlike]
   for sentence in (*better, *of_events_that_are_off(env.config, overrides), *unlike):
     console.print(sentence, soft_wrap=True, markup=False, highlight=False)
+  camera = camera or (opened.trained.config.video.camera if opened.trained else None)
   need_camera(env.mj_model, camera, "--camera")
   if viewer:
     from playground.deploy.viewer import view
@@ -123,7 +124,7 @@ def play(
     return 0
   models = draw_models(env, exported.contract["task"], episodes, seed) if randomize else {}
   scores, recording = measure(exported, env, episodes, seed, 1 if film else 0, models)
-  console.print(_table(exported.contract, episodes, scores, overrides, randomize))
+  console.print(_table(exported.contract, agent, episodes, scores, overrides, randomize))
   if opened.folder is not None:
     steps = exported.contract["origin"]["steps"]
     out = opened.folder / result_name(steps, seed, episodes, interval_events, overrides, randomize)
@@ -226,8 +227,9 @@ def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
 
 
 def _table(
-  contract: Contract, episodes: int, scores: Mapping[str, float], overrides: Sequence[str], randomized: bool
-) -> Table:
+  contract: Contract, agent: str | None, episodes: int, scores: Mapping[str, float], overrides: Sequence[str],
+  randomized: bool,
+) -> Table:  # fmt: skip
   """Builds a table of scores, beside those of the last evaluation in training, the mode's first."""
   origin = contract["origin"]
   trained = origin["evaluation"]
@@ -235,7 +237,8 @@ def _table(
   table = Table("per episode", title=title)
   table.add_column("C MuJoCo", justify="right")
   model = "randomised models" if randomized else "nominal model"
-  table.caption = f"C MuJoCo: mean of {episodes} episode{'s' * (episodes != 1)}, {model}, mode of the policy."
+  acts = f"{agent} actions" if agent else "mode of the policy"
+  table.caption = f"C MuJoCo: mean of {episodes} episode{'s' * (episodes != 1)}, {model}, {acts}."
   kinds = {}  # of actions in training: what their scores' names begin with
   if trained:
     other = {name.partition("/")[0] for name in trained} & {*OTHER_RETURNS}

@@ -61,6 +61,8 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
   chain = RunDirectory(run.path.parent)
   started = chain if run.path in find_stages(chain.path) else run  # by the command of the card
   path = str(run.path)
+  if newest != (last := find_checkpoints(run.path)[0]):
+    raise ConfigError(f"{newest} is not the run's newest policy, which alone can be added: {last}.")
   for name in ("overrides.yaml", "manifest.json", "metrics.csv"):
     if not (run.path / name).is_file():
       raise ConfigError(f"{run.path / name} is missing: only a whole run can be added.")
@@ -120,6 +122,7 @@ def add_policy(path: str, note: str = "", replace: bool = False) -> int:
 
 def _status(scores: dict[str, float], note: str) -> catalog.Status:
   """Returns the catalogue's status for a policy's scores in C MuJoCo, and the note of its card."""
-  measured = {"falls_per_episode": "episode_fall", "success": "episode_success"}
+  measured = {"falls_per_episode": "episode_fall", "success": "episode_success", "turns": "episode_turns"}
+  measured["c_mujoco_falls_per_episode"] = measured["falls_per_episode"]
   row = {column: str(scores[name]) for column, name in measured.items() if name in scores}
   return catalog.status({"note": note, "final_return": str(scores["episode_reward"]), **row})

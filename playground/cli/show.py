@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 Row = Section
 
 
-def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_views: int = 16) -> int:
+def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_views: int | None = None) -> int:
   """Prints tables about a task, or writes images of its camera.
 
   Args:
     task: a task, or `randomization=<name>` alone for its events.
     overrides: as for playground-run.
     views: image file to write instead of the tables: the camera's view on randomised models.
-    num_views: models in the image.
+    num_views: models in the image; None is 16.
 
   Returns:
     The exit code, 0.
@@ -41,6 +41,8 @@ def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_v
     PlaygroundError: no such task, or an invalid one.
   """
   console = wide_console(180)
+  if num_views is not None and not views:
+    raise ConfigError(f"--num-views={num_views} needs --views=<file>.")
   if task.startswith("randomization=") and not overrides:
     if views:
       raise ConfigError("--views shows a task: playground show <task> randomization=<name> --views <file>.")
@@ -52,7 +54,7 @@ def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_v
   if views:
     from playground.rendering.views import save_views
 
-    console.print(f"wrote {save_views(env, config.env.events, views, num_views, config.seed)}")
+    console.print(f"wrote {save_views(env, config.env.events, views, num_views or 16, config.seed)}")
     return 0
   for part in describe(config, env):
     console.print(part)

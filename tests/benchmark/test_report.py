@@ -361,3 +361,11 @@ def test_a_folder_that_cannot_be_is_said_before_the_page_is_made(tmp_path: Path,
   (tmp_path / "file").touch()
   with pytest.raises(ConfigError, match=r"^out=.*/file/page cannot be written: .*/file is not a folder that you may"):
     run(Options(out=str(tmp_path / "file" / "page"), rows=(str(REFERENCE),)))
+
+
+def test_runs_of_other_lengths_and_experiments_are_others(tmp_path: Path) -> None:
+  header = "task,agent,who,experiment,setting,seed,backend,steps,final_return,devices,device,conditions\n"
+  of = lambda experiment, steps, value: f"Go1Getup,ppo,ours,{experiment},,1,jax,{steps},{value},1,NVIDIA H200,\n"
+  lines = [of("", 100, 1.5), of("", 200, 2.5), of("chain", 200, 3.5), of("chain", 200, 4.5)]
+  (tmp_path / "runs.csv").write_text(header + "".join(lines))
+  assert sorted(figure.mean for figure in Evidence([tmp_path]).find(quantity="final_return")) == [1.5, 2.5, 4.5]

@@ -73,7 +73,7 @@ def test_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch):
   runs = [run(100, final_mode_return="110", **in_c("90", "0.25")), run(300, seed="2", **in_c("92", "0.5"))]
   (row,) = table([entry], runs).rows
   assert row == [
-    *(TASK, entry.status, "ppo", "60", f"{entry.budget / 1e6:.3g}", "2 (2)", "200 ± 1271", "110", "91, 0.38 falls"),
+    *(TASK, entry.status, "ppo", "60", f"{entry.budget / 1e6:.3g}", "2 (2)", "200 ± 1271", "110 (1)", "91, 0.38 falls"),
     *("3.5 (PPO, mode)", "4 (REPPO, sampled)"),
   ]
   (row,) = table([entry], [run(50, agent="reppo", steps="5000000")]).rows
@@ -82,6 +82,13 @@ def test_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch):
   assert row[8] == "6, success 1.00 (7)"
   (row,) = table([entry], []).rows
   assert row[2] == "not measured"
+
+
+def test_a_seed_that_is_trained_again_is_no_other_sample() -> None:
+  runs = [run(100), run(300, seed="2"), run(200), run(300, seed="2")]
+  (row,) = table([entries()[TASK]], runs).rows
+  assert row[5:7] == ["4 (2)", "225 ± 953"]  # of 150 and 300
+  assert best_runs([run(220, agent="sac"), *runs], TASK) == runs
 
 
 def test_a_row_for_each_agent_of_a_task_that_several_trained():

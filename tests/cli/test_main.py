@@ -109,7 +109,7 @@ def test_list_needs_no_jax():
       ["PandaPickCubeCartesian"],
       ["gripper_pos 3 site gripper Position of a site", "site_pos playground/mdp/manipulators.py:"],
     ),
-    (["CartpoleBalance", "--num-views", "2", "env.impl=jax"], ["backend jax"]),
+    (["CartpoleBalance", "env.impl=jax"], ["backend jax"]),
     (
       ["randomization=go1"],
       ["randomization: go1", "body_mass trunk: add uniform(-1, 1)", "geom_friction[:, 0] floor: set"],
@@ -131,6 +131,23 @@ def test_show_names_the_line_of_a_term_that_a_helper_makes(command: Command, cap
   for name in ("gyro", "actuator_force", "last_contact"):
     (line,) = (i for i, text in enumerate(lines, 1) if text.startswith(f"{name} ="))
     assert re.search(rf"^ +{name} .* playground/mdp/observations\.py:{line} *$", out, re.M), name
+
+
+@pytest.mark.parametrize(
+  ("line", "message"),
+  [
+    ("show CartpoleBalance --num-views 2", "--num-views=2 needs --views=<file>."),
+    ("play CartpoleBalance --port 9", "--port=9 is of the page in the browser, which this command does not show."),
+    ("play CartpoleBalance --viewer --host ::", "--host=:: is of the page in the browser, which this command does not"),
+    ("view CartpoleBalance --video a.mp4 --port 9", "--port=9 is of the page in the browser, which this command does"),
+    ("play CartpoleBalance --web --episodes 3", "--episodes=3 are measured, and --web measures none."),
+  ],
+)
+def test_options_that_do_nothing_are_refused(
+  command: Command, capsys: pytest.CaptureFixture[str], line: str, message: str
+) -> None:
+  assert command(*line.split()) == 2
+  assert capsys.readouterr().err.startswith(f"error: {message}")
 
 
 def test_show_refuses(command: Command, capsys: pytest.CaptureFixture[str]):

@@ -9,7 +9,7 @@ import yaml
 from rich.console import Console
 
 from playground import pretrained
-from playground.cli.pretrained import add_policy, show_policies
+from playground.cli.pretrained import _status, add_policy, show_policies  # pyright: ignore[reportPrivateUsage]
 from playground.config import compose
 from playground.errors import ConfigError
 from playground.learning.checkpoints import Checkpoint
@@ -82,6 +82,22 @@ def test_a_run_of_a_task_that_is_not_listed_is_refused(untrained: Callable[..., 
   run, task = untrained(*overrides), overrides[0]
   with pytest.raises(ConfigError, match=rf"run trained env={task}: only policies of tasks that `playground list`"):
     add_policy(str(run))
+
+
+def test_only_the_newest_policy_is_added(untrained: Callable[..., Path]) -> None:
+  run = untrained("CartpoleBalance")
+  (run / "checkpoints" / f"{50:012d}").mkdir()
+  (run / "checkpoints" / "best").symlink_to(f"{50:012d}")
+  for name in ("best", f"{50:012d}"):
+    with pytest.raises(ConfigError, match=rf"{50:012d} is not the run's newest policy, .*: .*/{100:012d}\."):
+      add_policy(str(run / "checkpoints" / name))
+
+
+@pytest.mark.parametrize(
+  ("turns", "drops", "status"), [(3.1, 0.0, "solved"), (3.1, 0.3, "learning"), (0.0, 0.0, "learning")]
+)
+def test_a_rotation_counts_by_turns(turns: float, drops: float, status: str) -> None:
+  assert _status({"episode_reward": 1.0, "episode_fall": drops, "episode_turns": turns}, "") == status
 
 
 def test_folders_that_cannot_be_written_are_said_first(untrained: Callable[..., Path], tmp_path: Path) -> None:

@@ -80,9 +80,10 @@ class Evidence:
     return next(iter(self.find(**wanted)), None)
 
 
+_OF_RUNS = ("experiment", "steps")  # columns of tables of whole runs, which tell runs apart
 SAME = (
   *("benchmark", "task", "agent", "who", "setting", "quantity", "backend", "devices", "device"),
-  *("precision", "versions", "commit", "note"),
+  *("precision", "versions", "commit", "note", *_OF_RUNS),
 )
 
 
@@ -124,8 +125,10 @@ def _rows(lines: Mapping[str, dict[str, str]], path: Path) -> Iterable[Row]:
       return
     if None in line:
       raise ConfigError(f"{where} has too many columns: mend or remove it.")
+    one = {"quantity", "value"} <= set(line)
     known = {name: line.get(name, "") for name in (*COLUMNS, "note")}
-    values = {line["quantity"]: line["value"]} if {"quantity", "value"} <= set(line) else line
+    known |= {name: "" if one else line.get(name, "") for name in _OF_RUNS}
+    values = {line["quantity"]: line["value"]} if one else line
     for quantity in QUANTITIES:
       if value := values.get(quantity):
         measured = number(where, quantity, value, quantity in _POSITIVE)

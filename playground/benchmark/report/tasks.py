@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from statistics import fmean
 
 from playground.benchmark.report.public import agent_of, at, is_ppo, public_curves
-from playground.catalog import Entry, best_runs, reached_return, run_name
+from playground.catalog import Entry, best_runs, by_seed, reached_return, run_name
 from playground.reporting.page import NOT_MEASURED, Table, mean_and_ci95, short
 from playground.text import millions
 
@@ -56,7 +56,7 @@ def agents_table(entries: Sequence[Entry], rows: Sequence[Row]) -> Table:
     for row in rows:
       by_agent.setdefault(agent_of(row["agent"]), []).append(row)
     found = [runs for of_agent in by_agent.values() if (runs := best_runs(of_agent, entry.task))]
-    for runs in sorted(found, key=lambda runs: -fmean(map(reached_return, runs))) if len(found) > 1 else []:
+    for runs in sorted(found, key=lambda runs: -fmean(by_seed(runs, reached_return))) if len(found) > 1 else []:
       on = "CPU" if runs[0].get("device") == "CPU" else "GPU"
       default = "yes" if agent_of(runs[0]["agent"]) == entry.agent else ""
       cells.append([entry.task, *_cells(runs), ended(runs), on, default])
@@ -89,16 +89,21 @@ def _in_c_mujoco(runs: Sequence[Row]) -> str:
 
 
 def _returns(runs: Sequence[Row], column: str) -> list[float]:
-  return [float(row[column]) for row in runs if row.get(column)]
+  """Returns a column's mean for each seed that has it."""
+  return by_seed([row for row in runs if row.get(column)], lambda row: float(row[column]))
 
 
 def _with_ci(runs: Sequence[Row], column: str) -> str:
-  """Formats the mean over runs, for several with half its 95 % confidence interval; "" if it was not measured."""
+  """Formats the mean over seeds, for several with half its 95 % confidence interval; "" if it was not measured.
+
+  In brackets stands how many seeds were measured, where that is not all.
+  """
   values = _returns(runs, column)
   if not values:
     return ""
   mean, ci95 = mean_and_ci95(values)
-  return short(mean) + ("" if ci95 is None else f" ± {ci95:.0f}" if ci95 >= 10 else f" ± {ci95:.2g}")
+  some = f" ({len(values)})" if len(values) < len({row["seed"] for row in runs}) else ""
+  return short(mean) + ("" if ci95 is None else f" ± {ci95:.0f}" if ci95 >= 10 else f" ± {ci95:.2g}") + some
 
 
 def _public(task: str, steps: float, ppo_only: bool) -> str:
