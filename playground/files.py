@@ -49,7 +49,7 @@ def unwritable(folder: Path, within: Path | None = None) -> str | None:
   return None
 
 
-def check_links(folder: Path, depth: int = sys.maxsize) -> None:
+def check_links(folder: Path, depth: int) -> None:
   """Raises CheckpointError if a link in a folder, which another user may have made, leads out of it.
 
   What is written to the folder would be written there.

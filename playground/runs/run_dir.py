@@ -195,7 +195,7 @@ class RunDirectory:
     if self._locked:  # by a block around this one
       yield
       return
-    check_links(self.path)
+    check_links(self.path, depth=2)  # as deep as a run writes: below are checkpoints, or stages, which are runs
     file = self.path / "run.lock"
     with contextlib.ExitStack() as stack:
       with _writing(self.path):
