@@ -61,7 +61,7 @@ def check_links(folder: Path, depth: int) -> None:
   root = folder.resolve()
   for path, folders, files in os.walk(root):
     for entry in (Path(path, name) for name in (*folders, *files)):
-      if entry.is_symlink() and not entry.resolve().is_relative_to(root):
+      if os.path.islink(entry) and not Path(os.path.realpath(entry)).is_relative_to(root):
         raise CheckpointError(f"{entry} is a link that leads out of {folder}: put what it stands for in its place.")
     deepest = len(Path(path).relative_to(root).parts) + 1 >= depth
     folders[:] = [name for name in folders if name != "wandb" and not deepest]

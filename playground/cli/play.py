@@ -107,8 +107,10 @@ def play(
   unlike = [f"{sentence} --randomize plays on models like those of training." for sentence in unlike]
   for sentence in (*better, *of_events_that_are_off(env.config, overrides), *unlike):
     console.print(sentence, soft_wrap=True, markup=False, highlight=False)
-  camera = camera or (opened.trained.config.video.camera if opened.trained else None)
   need_camera(env.mj_model, camera, "--camera")
+  if film and camera is None and opened.trained:
+    camera = opened.trained.config.video.camera
+    need_camera(env.mj_model, camera, "video.camera")
   if viewer:
     from playground.deploy.viewer import view
 

@@ -80,7 +80,8 @@ class Task(Env):
     self.rewards = RewardManager(config.rewards)
     self.terminations = TerminationManager(config.terminations)
     self.observations = ObservationManager(config)
-    acting = [*bind("commands", config.get("commands")), *bind("events", config.get("events"))]
+    events = [term for term in bind("events", config.get("events")) if isinstance(term.func, type)]  # of intervals
+    acting = [*bind("commands", config.get("commands")), *events]
     if any(not term.func.__module__.startswith("playground.") for term in (*self.terms(), *acting)):
       self.derived = DERIVED_FIELDS  # another package's term may read any of them
     else:

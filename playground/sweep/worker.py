@@ -38,7 +38,7 @@ def job_command(trusted: Sequence[str] = (), lines: Sequence[str] = ()) -> tuple
 
 def _from_here(line: str) -> str:
   key, folder = line.partition("=")[0], parse_with_hydra(line).value()
-  if not key.endswith("hardware.cache_dir") or not isinstance(folder, str):
+  if not key.endswith("hardware.cache_dir") or not isinstance(folder, str) or not folder or "${" in folder:
     return line
   return f"{key}={quoted(Path(folder).expanduser().absolute())}"
 

@@ -271,7 +271,10 @@ def test_a_video_by_the_camera_that_is_named(
   video = ["--episodes", "1", "--video=~/new/a.mp4"]
   assert command("play", str(run), *video, "--camera", "lookatcart") == 0
   assert command("play", str(run), *video) == 0
-  assert filmed == [(tmp_path / "new" / "a.mp4", camera) for camera in ("lookatcart", None)]
+  config = shutil.copytree(run, tmp_path / "run") / "config.yaml"
+  config.write_text(re.sub(r"^  camera: null$", "  camera: fixed", config.read_text(), flags=re.MULTILINE))
+  assert command("play", str(config.parent), *video) == 0
+  assert filmed == [(tmp_path / "new" / "a.mp4", camera) for camera in ("lookatcart", None, "fixed")]
   monkeypatch.setattr(play, "make_evaluator", pytest.fail)
   capsys.readouterr()
   assert command("play", str(run), *video, "--camera", "lookat_cart") == 2

@@ -243,3 +243,10 @@ def test_links_of_a_user_are_followed(tmp_path: Path) -> None:
   (tmp_path / "link").symlink_to(run.path)
   with RunDirectory(tmp_path / "link").locked():
     pass
+
+
+def test_a_link_to_itself_leads_nowhere(tmp_path: Path) -> None:
+  run = make_run(tmp_path / "run", CONFIG)
+  (run.path / "loop").symlink_to("loop")
+  with run.locked():
+    pass

@@ -68,7 +68,8 @@ def test_a_relative_folder_of_compiled_programs_is_the_users(tmp_path: Path, mon
   monkeypatch.chdir(tmp_path)
   own = job_command(lines=["hardware.cache_dir=cache"])
   assert own == (*COMMAND, f"hardware.cache_dir='{tmp_path / 'cache'}'")
-  assert job_command(lines=["hardware.cache_dir=null"]) == (*COMMAND, "hardware.cache_dir=null")
+  for line in ("hardware.cache_dir=null", "hardware.cache_dir=", "hardware.cache_dir=${oc.env:HOME}/x"):
+    assert job_command(lines=[line]) == (*COMMAND, line)
 
 
 @pytest.mark.parametrize("name", ["sweep.lock", "stop", "plots", "jobs/000_seed=0", "jobs/000_seed=0/job.log"])

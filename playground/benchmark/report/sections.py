@@ -9,6 +9,7 @@ from playground.config import compose, options, task_names
 from playground.paper import SUITES, paper_table
 from playground.reporting import figures
 from playground.reporting.page import NOT_MEASURED, Block, Heading, Image, Table, Text, short
+from playground.text import millions
 
 TITLES = {"dm_control": "DM Control Suite", "locomotion": "Locomotion", "manipulation": "Manipulation"}
 SPEED = "training_steps_per_s"
@@ -304,12 +305,14 @@ def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
   rows = []
   for figure in evidence.find(quantity="final_return"):
     if figure["benchmark"] != "chain":
-      who = [figure["task"], figure["agent"], figure["who"], figure["setting"]]
+      setting = " ".join(filter(None, (figure["experiment"], figure["setting"])))
+      who = [figure["task"], figure["agent"], figure["who"], setting]
       each = ", ".join(f"{row['value']:,.1f}" for row in figure.rows)
-      result = [each, figure["backend"], figure["device"]]
+      result = [each, millions(float(figure["steps"])) if figure["steps"] else "", figure["backend"], figure["device"]]
       rows.append([*who, *result, notes.number(figure)])
   if rows:
-    yield Table(["task", "agent", "who", "setting", "return of each run", "backend", "device", "note"], sorted(rows))
+    header = ["task", "agent", "who", "setting", "return of each run", "M steps", "backend", "device", "note"]
+    yield Table(header, sorted(rows))
 
 
 def runs_by_step(
