@@ -145,9 +145,10 @@ def below(key: str, values: Mapping[str, T]) -> dict[str, T]:
 def select(values: Plain, key: str) -> Plain:
   """Returns the value at a dotted key of nested mappings and lists, None if there is none."""
   for part in key.split("."):
-    values = (
-      values[int(part)] if isinstance(values, list) else values.get(part) if isinstance(values, Mapping) else None
-    )
+    if isinstance(values, list):
+      values = values[int(part)] if part.isdecimal() and int(part) < len(values) else None
+    else:
+      values = values.get(part) if isinstance(values, Mapping) else None
   return values
 
 

@@ -753,3 +753,14 @@ def test_a_saved_run_whose_task_is_gone_keeps_what_it_has() -> None:
   del saved["hardware"]["distributed"]
   again = from_saved(saved)
   assert again.choices["env"] == "NoLongerThere" and again.hardware.distributed == DistributedConfig()
+
+
+def test_an_entry_of_a_list_has_a_number() -> None:
+  with pytest.raises(
+    ConfigError, match=r"^env\.[a-z.]*max\.x=2: env\.commands\.velocity\.params\.max is a list, whose ent"
+  ):
+    compose(["env=Go1JoystickFlatTerrain", "env.commands.velocity.params.max.x=2"])
+
+
+def test_a_short_key_may_have_a_plus() -> None:
+  assert compose(["env=Go1JoystickFlatTerrain", "+terrain=stairs"]).env.scene.terrain == "stairs"

@@ -193,6 +193,23 @@ def test_listed_jobs_are_combined_with_what_all_have(folder: Path):
   assert with_listed(["seed=1"], []) == [["seed=1"]] and listed_jobs(["seed=1"]) == []
 
 
+@pytest.mark.parametrize("key", ["terrain", "env.scene.terrain"])
+def test_a_short_key_is_the_key_that_it_stands_for(folder: Path, key: str) -> None:
+  text = (
+    "params: {env: Go1JoystickFlatTerrain, terrain: slope}\njobs: [terrain=rough, env.scene.terrain=slope, seed=2]\n"
+  )
+  (folder / "terrains.yaml").write_text(text)
+  given = ["sweep=terrains", f"{key}=stairs"]
+  jobs = with_listed(expand(given), listed_jobs(given))
+  assert jobs == [["env=Go1JoystickFlatTerrain", f"{key}=stairs"]] * 2 + [
+    ["env=Go1JoystickFlatTerrain", f"{key}=stairs", "seed=2"]
+  ]
+  with pytest.raises(
+    ConfigError, match=r"terrain=rough,slope .*terrain=stairs: give all values of .*terrain in one list"
+  ):
+    expand(["env=Go1JoystickFlatTerrain", "terrain=rough,slope", "env.scene.terrain=stairs"])
+
+
 def test_every_job_is_checked_and_named(folder: Path):
   (folder / "typo.yaml").write_text("params: {env: CartpoleBalance, agent.learning_rat: [1, 2]}\n")
   with pytest.raises(UnknownNameError, match=r"Did you mean 'agent\.learning_rate'\?"):

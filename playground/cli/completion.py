@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from playground.config import compose, config_roots, task_names
+from playground.config.composition import CHOSEN_BY_GROUP
 from playground.config.definitions import chosen_names, definition
 from playground.config.files import groups, listed_options
 from playground.config.run_config import SCALARS, SECTIONS
@@ -107,7 +108,9 @@ def _of_command(parser: argparse.ArgumentParser, current: str, words: Sequence[s
   elif action.dest == "prefix":
     yield from (word.rstrip("=") for word in _of_run(current, []))
   elif action.dest == "overrides":
-    yield from _of_run(current, [word for word in words if "=" in word])
+    first = next((word for word in words if not word.startswith("-")), "")
+    task = [f"env={first}"] if first in task_names() else []
+    yield from _of_run(current, [*task, *(word for word in words if "=" in word)])
 
 
 def _of_run(current: str, overrides: Sequence[str]) -> Iterator[str]:
@@ -128,7 +131,8 @@ def _of_run(current: str, overrides: Sequence[str]) -> Iterator[str]:
     parent = key.rpartition(".")[0]
     node = select(_resolved(overrides), parent)
     for name, inner in node.items() if isinstance(node, Mapping) else ():
-      yield f"{parent}.{name}" + ("." if isinstance(inner, Mapping) and inner else "=")
+      if f"{parent}.{name}" not in CHOSEN_BY_GROUP:
+        yield f"{parent}.{name}" + ("." if isinstance(inner, Mapping) and inner else "=")
 
 
 def _choices(key: str, overrides: Sequence[str]) -> Iterator[str]:

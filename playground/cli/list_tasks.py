@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from rich.table import Table
 from rich.text import Text
 
-from playground.catalog import entries
+from playground.catalog import STATUSES, entries
 from playground.config import compose
 from playground.console import wide_console
 from playground.errors import UnknownNameError, nearest
@@ -34,7 +34,7 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   known = entries()
   wanted = {name: value for name, value in filters.items() if value is not None}
   for name, value in wanted.items():
-    values = sorted({getattr(entry, name) for entry in known.values()} - {""})
+    values = sorted(STATUSES if name == "status" else {getattr(entry, name) for entry in known.values()} - {""})
     if value not in values:
       raise UnknownNameError(f"--{name}={value}: choose from {', '.join(values)}.{nearest(value, values)}")
   rows: list[Section] = [dataclasses.asdict(known[name]) if name in known else _composed(name) for name in names]

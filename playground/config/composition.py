@@ -79,7 +79,7 @@ _BUDGET = "agent.num_timesteps"  # may be larger in one
 _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that define the keys, in this order
 _SWEEP_SECTIONS = ("launcher", "search")
 _HARDWARE = defaults(HardwareConfig)
-_CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
+CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
 
@@ -408,13 +408,16 @@ def _apply(config: DictConfig, overrides: Iterable[Override], schema: Section) -
       check_key(override.key, schema)
       if override.value is None:
         check_removed(override.key, config)
-      if override.key in _CHOSEN_BY_GROUP:
+      if override.key in CHOSEN_BY_GROUP:
         group = override.key.partition(".")[0]
         raise ConfigError(f"{override.text} cannot be set: {group}=<name> chooses it, with the keys that it has.")
       try:
         OmegaConf.update(config, override.key, override.value, merge=isinstance(override.value, Mapping))
       except OmegaConfBaseException as error:
         raise ConfigError(f"{override.text}: {first_line(error)}.") from None
+      except ValueError:  # of OmegaConf, for a name below a list
+        where = f"{override.text}: {override.key.rpartition('.')[0]}"
+        raise ConfigError(f"{where} is a list, whose entries have numbers as keys.") from None
     if missing := OmegaConf.missing_keys(config):
       raise ConfigError(f"{min(missing)} has no value: set {min(missing)}=<value>.")
     return fit(OmegaConf.to_container(config, resolve=True), schema, chosen_names(schema))

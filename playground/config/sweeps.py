@@ -33,7 +33,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from playground.config.files import config_roots, groups, listed_options, shipped
-from playground.config.overrides import is_hydras, is_of_command, is_of_sweep, parse, parse_with_hydra
+from playground.config.overrides import SHORT_KEYS, is_hydras, is_of_command, is_of_sweep, parse, parse_with_hydra
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.files import check_aliases
 from playground.text import first_line, format_value
@@ -56,11 +56,11 @@ def expand(overrides: Sequence[str]) -> list[str]:
   named = [override for override in given if override.key_or_group == "sweep"]
   if len(named) > 1 or any(override.is_sweep_override() for override in named):
     raise ConfigError(f"{' '.join(str(o.input_line) for o in named)}: one sweep at a time.")
-  keys = {override.key_or_group for override in given}
+  keys = set(map(_key, given))
   listed = [parse_with_hydra(text) for override in named for text in _read(str(override.value()))[0]]
-  chosen = [*(o for o in listed if o.key_or_group not in keys), *(o for o in given if o not in named)]
+  chosen = [*(o for o in listed if _key(o) not in keys), *(o for o in given if o not in named)]
   for override in chosen:
-    twice = [str(o.input_line) for o in chosen if o.key_or_group == override.key_or_group]
+    twice = [str(o.input_line) for o in chosen if _key(o) == _key(override)]
     if override.is_sweep_override() and len(twice) > 1:
       raise ConfigError(f"{' '.join(twice)}: give all values of {override.key_or_group} in one list.")
   return [*_checked(chosen, roots), *filter(is_hydras, overrides)]
@@ -74,7 +74,7 @@ def listed_jobs(overrides: Sequence[str]) -> list[list[str]]:
     UnknownNameError: as `expand`.
   """
   given = [parse_with_hydra(text) for text in overrides if not is_hydras(text)]
-  keys = {override.key_or_group for override in given}
+  keys = set(map(_key, given))
   found = []
   for override in (override for override in given if override.key_or_group == "sweep"):
     for text in _read(str(override.value()))[1]:
@@ -83,16 +83,21 @@ def listed_jobs(overrides: Sequence[str]) -> list[list[str]]:
       except ValueError as error:
         raise ConfigError(f"{override.input_line}: its job {text!r} cannot be read: {error}.") from None
       parsed = [parse_with_hydra(part) for part in parts]
-      lines = _checked([o for o in parsed if o.key_or_group not in keys], config_roots())
+      lines = _checked([o for o in parsed if _key(o) not in keys], config_roots())
       if whole := [*split(lines)[0], *filter(is_of_command, lines)]:
         raise ConfigError(f"{override.input_line}: {whole[0]} in its job {text!r} is of the whole sweep.")
       found.append(lines)
   return found
 
 
+def _key(override: HydraOverride) -> str:
+  """Returns the key that an override sets, whichever form of it the line has."""
+  return SHORT_KEYS.get(override.key_or_group, override.key_or_group)
+
+
 def with_listed(lines: Sequence[str], jobs: Sequence[Sequence[str]]) -> list[list[str]]:
   """Returns the overrides of each listed job, which win over `lines`; without jobs, `lines` alone."""
-  key = lambda line: parse_with_hydra(line).key_or_group
+  key = lambda line: _key(parse_with_hydra(line))
   together = []
   for job in jobs or [[]]:
     own = set(map(key, job))

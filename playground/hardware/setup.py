@@ -94,7 +94,8 @@ def _environment(config: HardwareConfig) -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", str(config.memory_fraction))
   known = lambda flag: jax.__version_info__ < _REMOVED_FLAGS.get(flag.partition("=")[0], (math.inf,))
   exported = os.environ.get("XLA_FLAGS", "").split()
-  added = [flag for flag in config.xla_flags.split() if known(flag) and flag not in exported]
+  names = {flag.partition("=")[0] for flag in exported}
+  added = [flag for flag in config.xla_flags.split() if known(flag) and flag.partition("=")[0] not in names]
   if added:  # a chain calls this often
     from jax._src.xla_bridge import backends_are_initialized  # JAX has no public name for it
 

@@ -251,7 +251,10 @@ class RunCallbacks:
       self._dumped = True
       dump = write_dump(self._run_dir.nan_dump, step, captured, self._config.resolved)
       where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
-      self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or too large.{where}")
+      count = bad * self._env.action_repeat
+      self._progress.print(
+        f"{count:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or too large.{where}"
+      )
     check_fraction(bad * self._env.action_repeat / max(taken, 1), self._config.on_nonfinite.max_fraction, step, where)
 
 

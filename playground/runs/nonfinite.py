@@ -73,8 +73,13 @@ class Dump:
     return jax.tree.unflatten(jax.tree.structure(template), [self._state[name] for name, _ in _named(template)])
 
   def replay(self, env: Env) -> State:
-    """Repeats the step on this machine's backend."""
-    return env.jitted[1](self.state(env), self.action, self.model, {})
+    """Repeats the step on this machine's backend, up to the first repeat of the action that is not finite."""
+    state = self.state(env)
+    for _ in range(env.action_repeat):
+      state = env.jitted[1](state, self.action, self.model, {})
+      if nonfinite_fields({"data": state.data, "obs": state.obs, "reward": state.reward}):
+        break
+    return state
 
 
 def nonfinite_fields(tree: PyTree) -> list[str]:

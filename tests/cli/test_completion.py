@@ -26,6 +26,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     ("playground sweep ", ["collect", "retry", "status", "stop"]),
     ("playground keys agent.net", ["agent.network."]),
     ("playground view Go1Getup robot=g", ["robot=g1", "robot=go1"]),
+    ("playground show Go1Getup env.rewards.upr", ["env.rewards.upright_exp."]),
     ("playground train env=Cartpole", ["env=CartpoleBalance", "env=CartpoleSwingup"]),
     ("/usr/bin/playground-run experiment=go1_j", ["experiment=go1_joystick", "experiment=go1_joystick_chain"]),
     ("playground-run --ver", ["--verbose", "--version"]),
@@ -45,7 +46,12 @@ def test_candidates(command: Command, capsys: pytest.CaptureFixture[str], line: 
 
 
 @pytest.mark.parametrize(
-  "line", ["", "playground", "'\"", "playground-bench ", "playground-run 'env=", "playground nothing ", "ls "]
+  "line",
+  [
+    *("", "playground", "'\"", "playground-bench ", "playground-run 'env=", "playground nothing ", "ls "),
+    *("playground show Go1Getup env.swing", "playground-run agent.na", "playground-run agent.num_envs.x.y"),
+    "playground-run agent.network.policy_hidden_layer_sizes.x.y",
+  ],
 )
 def test_nothing_to_complete(command: Command, capsys: pytest.CaptureFixture[str], line: str):
   assert command("completion", "query", line) == 0

@@ -53,6 +53,9 @@ def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
   assert all(row["robot"] == "go1" for row in rows)
   assert command("list", "--suite", "locomotoin") == 2
   assert "--suite=locomotoin: choose from" in capsys.readouterr().err
+  assert command("list", "--status", "open") == 0, "a status, whether a task has it or not"
+  assert command("list", "--status", "opened") == 2
+  assert "--status=opened: choose from learning, not measured, open, solved." in capsys.readouterr().err
   assert command("list", "cartpool") == 2
   assert "error: No task's name contains 'cartpool'" in capsys.readouterr().err
 

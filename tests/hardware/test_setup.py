@@ -111,7 +111,8 @@ def test_platforms_that_jax_has_not_are_one_sentence(
 
 def test_flags_that_this_jax_has_no_more_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setenv("XLA_FLAGS", "--xla_exported=1")
-  config = hardware(xla_flags="--xla_cpu_use_fusion_emitters=false --xla_given=2", devices=99)
+  own = "--xla_cpu_use_fusion_emitters=false --xla_given=2 --xla_exported=2"  # an exported one wins
+  config = hardware(xla_flags=own, devices=99)
   jax.local_devices()
   with pytest.raises(HardwareError), pytest.warns(UserWarning, match="xla_flags=.* does not act: JAX has started"):
     setup(config)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,20 @@ def test_nan_is_counted_dumped_and_kept_out(
   RunDirectory(run).set_status("running")
   assert resume(run) == 0
   assert list((run / "nan_dump").iterdir()) == [dump], "one dump a run, however often it is resumed"
+
+
+@pytest.mark.parametrize(("repeats", "steps"), [(1, 1), (4, 3)])
+def test_all_repeats_of_an_action_are_replayed(repeats: int, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+  """Up to the first that is not finite."""
+  state = lambda number: types.SimpleNamespace(
+    data=np.array([0.0, 0.0, 0.0, np.nan, 0.0])[number], obs=0.0, reward=number
+  )
+  step = lambda before, *_: state(before.reward + 1)
+  dump = object.__new__(Dump)
+  dump.action, dump.model = np.zeros(1), {}
+  monkeypatch.setattr(Dump, "state", lambda self, env: state(0))
+  env: Any = types.SimpleNamespace(action_repeat=repeats, jitted=(None, step))
+  assert dump.replay(env).reward == steps
 
 
 def test_no_dump_at_all_is_one_sentence() -> None:
