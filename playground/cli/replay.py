@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-import jax
 from rich.console import Console
 
 from playground import config as configs
 from playground import registry
 from playground.hardware.setup import setup, this_machine
-from playground.runs.nonfinite import Dump, nonfinite_fields
+from playground.runs.nonfinite import Dump, nonfinite_fields, nonfinite_results
 
 
 def replay(file: str) -> int:
@@ -28,8 +27,7 @@ def replay(file: str) -> int:
   before = dump.state(env)
   console.print(f"{run.choices['env']} at physics time {float(before.data.time):.3f} s, action {dump.action.tolist()}")
   console.print(f"recorded: {_listed(nonfinite_fields(dump.after))}")
-  again = jax.device_get(dump.replay(env))
-  bad = nonfinite_fields({"data": again.data, "obs": again.obs, "reward": again.reward})
+  bad = nonfinite_results(dump.replay(env))
   console.print(f"replayed on {hardware.machine['device']} with impl={env.impl}: {_listed(bad)}")
   return 0 if bad else 1
 

@@ -105,8 +105,8 @@ def parse(text: str, roots: Sequence[Path]) -> Override:
     UnknownNameError: no such option.
   """
   name, equals, value = text.partition("=")
-  plus = "+" * (len(name) - len(name.lstrip("+")))
-  text = plus + SHORT_KEYS.get(name.lstrip("+"), name.lstrip("+")) + equals + value
+  bare = name.lstrip("+")
+  text = name.removesuffix(bare) + SHORT_KEYS.get(bare, bare) + equals + value
   parsed = parse_with_hydra(text)
   text, key = parsed.input_line or text, parsed.key_or_group
   if parsed.is_sweep_override():

@@ -105,8 +105,8 @@ class Task(Env):
 
   def scales(self, scale: float | Sequence[float]) -> np.ndarray:
     """Returns `action_scale` for each action, or one for all; raises ConfigError for a list of another length."""
-    if np.ndim(scale) and len(np.asarray(scale)) != self.action_size:
-      what = f"has {len(np.asarray(scale))} numbers, and this task {self.action_size} actions"
+    if np.ndim(scale) and np.size(scale) != self.action_size:
+      what = f"has {np.size(scale)} numbers, and this task {self.action_size} actions"
       raise ConfigError(f"env.action_scale={format_value(scale)} {what}.")
     return np.asarray(scale, np.float32)
 

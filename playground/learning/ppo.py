@@ -173,7 +173,8 @@ class PPO(Algorithm[PPOConfig, ActorCritic, PPOState]):
 
     *total, steps = jax.lax.pmean(log.sum((0, 1)), AXIS)
     names = (*self.losses, "grad_norm", "nonfinite_updates")
-    metrics: Metrics = {name: value / jnp.maximum(steps, 1) for name, value in zip(names, total, strict=True)}
+    made = jnp.maximum(steps, 1)
+    metrics: Metrics = {name: value / made for name, value in zip(names, total, strict=True)}
     metrics |= {"gradient_steps": steps, "nonfinite_updates": total[-1]}
     if vectors := jax.tree.leaves(networks.vectors(obs)):
       farthest = jnp.stack([jnp.abs(entry).max() for entry in vectors]).max()

@@ -243,7 +243,7 @@ class RunCallbacks:
 
   def _check_numbers(self, step: int, taken: int, metrics: Metrics, captured: Step | None) -> None:
     """Dumps the first non-finite step, and stops the run if too many steps are non-finite."""
-    bad = metrics.get("training/nonfinite", 0.0)
+    bad = metrics.get("training/nonfinite", 0.0) * self._env.action_repeat
     if not bad:
       return
     where = ""
@@ -251,11 +251,8 @@ class RunCallbacks:
       self._dumped = True
       dump = write_dump(self._run_dir.nan_dump, step, captured, self._config.resolved)
       where = f" The first is in {dump}: replay it with `playground replay {dump}`." if dump else ""
-      count = bad * self._env.action_repeat
-      self._progress.print(
-        f"{count:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or too large.{where}"
-      )
-    check_fraction(bad * self._env.action_repeat / max(taken, 1), self._config.on_nonfinite.max_fraction, step, where)
+      self._progress.print(f"{bad:.0f} of {taken:,} steps before step {step:,} went NaN, infinite or too large.{where}")
+    check_fraction(bad / max(taken, 1), self._config.on_nonfinite.max_fraction, step, where)
 
 
 class NonMainCallbacks:

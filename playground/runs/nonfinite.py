@@ -77,9 +77,14 @@ class Dump:
     state = self.state(env)
     for _ in range(env.action_repeat):
       state = env.jitted[1](state, self.action, self.model, {})
-      if nonfinite_fields({"data": state.data, "obs": state.obs, "reward": state.reward}):
+      if nonfinite_results(state):
         break
     return state
+
+
+def nonfinite_results(state: State) -> list[str]:
+  """Counts as `nonfinite_fields`, in what a step computes."""
+  return nonfinite_fields({"data": state.data, "obs": state.obs, "reward": state.reward})
 
 
 def nonfinite_fields(tree: PyTree) -> list[str]:

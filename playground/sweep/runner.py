@@ -185,13 +185,15 @@ class Runner:
 
   def _react(self) -> None:
     """Stops jobs after a failure, a signal, `playground sweep stop`, or when the time is up."""
-    if self._stop_on_error and not self._stopping and any(s.status in FAILED for s in self._ended_now()):
+    if self._stopping:
+      pass
+    elif self._stop_on_error and any(s.status in FAILED for s in self._ended_now()):
       self._stop("on_error=stop: a job failed, the others are asked to stop.")
-    if self._signum is not None and not self._stopping:
+    elif self._signum is not None:
       self._stop("Interrupted: jobs are asked to stop, which saves them (once more kills them).")
-    if not self._stopping and self._sweep.stop_file.exists():
+    elif self._sweep.stop_file.exists():
       self._stop("Stopped by `playground sweep stop`: jobs are asked to save and end.")
-    if self._deadline is not None and not self._stopping and time.monotonic() >= self._deadline:
+    elif self._deadline is not None and time.monotonic() >= self._deadline:
       self._stop()
     if self._kill:
       self._launcher.kill()
