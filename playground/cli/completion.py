@@ -1,6 +1,7 @@
 """`playground completion bash|zsh|fish`: completion scripts for shells, and the candidates that they ask for."""
 
 import argparse
+import contextlib
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -144,7 +145,7 @@ def _choices(key: str, overrides: Sequence[str]) -> Iterator[str]:
 
 def _resolved(overrides: Sequence[str]) -> Section:
   """Returns the configuration of the words typed so far, or the default one if they do not compose yet."""
-  try:
-    return compose(overrides).resolved
-  except PlaygroundError:
-    return compose().resolved
+  for words in (overrides, [word.partition(",")[0] for word in overrides]):  # a sweep's: the first of several values
+    with contextlib.suppress(PlaygroundError):
+      return compose(words).resolved
+  return compose().resolved

@@ -68,7 +68,8 @@ class RunCallbacks:
     self._began = time.perf_counter()
     self._trained_s = 0.0  # the run's time when training ended
     self._process_began_s = plan.began_s
-    self._evaluations = 0
+    # Over all starts of the run.
+    self._evaluations = int(read_metrics(run_dir.metrics_csv).filter([RETURN]).count().sum()) if plan.step else 0
     self._step = plan.step or 0
     self._return: float | None = None  # of the newest row
     self._copied = False  # whether another agent's policy has replaced this one since that row
@@ -88,7 +89,9 @@ class RunCallbacks:
 
   def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Recording | None) -> None:
     score = metrics.get(RETURN)
-    self._trackers.log(step, metrics | {"time/wall_clock_s": self.wall_clock_s})
+    # The policy before training is evaluated after the first training steps: without them its row has that time alone.
+    seconds = self.wall_clock_s if step else metrics["time/eval_s"]
+    self._trackers.log(step, metrics | {"time/wall_clock_s": seconds})
     self._progress.update(step, metrics.get("time/steps_per_second"), score)
     taken = step - self._step
     if (rate := metrics.get("time/steps_per_second")) is not None:

@@ -34,6 +34,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     ("playground-run -m agent=ppo,s", ["agent=ppo,sac"]),
     ("playground-run agent=sac agent.num_e", ["agent.num_envs=", "agent.num_eval_envs="]),
     ("playground-run env=Go1Getup env.rewards.upr", ["env.rewards.upright_exp."]),
+    ("playground-run -m env=Go1Getup,CartpoleBalance seed=1,2 env.rewards.upr", ["env.rewards.upright_exp."]),
     ("playground-run env.impl=", ["env.impl=auto", "env.impl=jax", "env.impl=warp"]),
     ("playground-run video.enable=", ["video.enable=false", "video.enable=true"]),
   ],

@@ -125,7 +125,8 @@ def test_a_run_leaves_everything_behind(whole: Path) -> None:
   assert timings["trace_s"] + timings["compile_s"] < timings["start_to_compiled_s"] < timings["start_to_first_update_s"]
 
   table = pd.read_csv(run.metrics_csv)
-  assert table["step"].is_monotonic_increasing
+  assert table["step"].is_monotonic_increasing and table["time/wall_clock_s"].is_monotonic_increasing
+  assert table["time/wall_clock_s"].to_numpy()[0] == table["time/eval_s"].to_numpy()[0], "no training before step 0"
   assert np.isfinite(table["eval/episode_reward"].to_numpy()).sum() == 5
   rates = table["time/steps_per_second"].dropna()
   assert timings["steady_steps_per_second"] == pytest.approx(rates.median())
@@ -424,10 +425,13 @@ def test_a_finished_run_is_not_resumed(whole: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_run_that_trains_longer_ends_as_one_of_that_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  filmed: list[Path] = []
+  monkeypatch.setattr("playground.runs.callbacks.render_video", lambda *_, out_path, **__: filmed.append(out_path))
+  video = ["video.enable=true", "video.at_end=false", "video.every_evals=3"]
   short, long = (tmp_path / name for name in ("short", "long"))
   for run, steps, evals in ((short, 800, 2), (long, 1600, 3)):
     budget = [f"agent.num_timesteps={steps}", f"agent.num_evals={evals}", "agent.num_resets_per_eval=0"]
-    assert train(compose([*TASK, *budget, f"run_dir={run}"])) == 0
+    assert train(compose([*TASK, *budget, *video, f"run_dir={run}"])) == 0
   with monkeypatch.context() as patch:
     patch.setattr(train_module.Training, "compile", lambda *_: sys.exit(3))
     with pytest.raises(SystemExit):
@@ -440,6 +444,7 @@ def test_a_run_that_trains_longer_ends_as_one_of_that_budget(tmp_path: Path, mon
   assert one.summary["params_sha256"] == other.summary["params_sha256"]
   steps = [pd.read_csv(run.metrics_csv)["step"].to_numpy()[-1] for run in (one, other)]
   assert steps == [1600, 1600] and one.status["status"] == one.summary["status"] == "finished"
+  assert filmed == [run.videos / "step_000000001600.mp4" for run in (other, one)], "the third evaluation"
 
 
 def test_of_two_starts_in_one_folder_the_second_changes_nothing(tmp_path: Path) -> None:
