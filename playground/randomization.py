@@ -134,10 +134,6 @@ class Randomizer:
     """Draws N environments' fields from keys [N]: each field gets a leading axis N."""
     return jax.vmap(self.sample)(keys)
 
-  def describe(self) -> list[dict[str, str]]:
-    """Returns one row per term for people: `ModelField.describe`, and the number of values drawn."""
-    return [draw.term.describe() | {"values": str(draw.count)} for draw in self._draws.values()]
-
   def without_nominal(self) -> list[str]:
     """Returns a sentence for each term that sets values in a range in which the nominal ones are not."""
     found = []

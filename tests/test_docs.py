@@ -301,7 +301,7 @@ def test_the_controller_of_the_page_on_deployment_walks(tmp_path: Path):
 def test_the_page_on_randomisation_writes_events_that_fit_and_code_that_runs():
   (text,) = files("randomization.md").values()
   model, events = build_scene("go1").compile(), yaml.safe_load(text)
-  assert [len(Randomizer(model, events, mode).describe()) for mode in ("startup", "reset")] == [3, 1]
+  assert [len(Randomizer(model, events, mode)._draws) for mode in ("startup", "reset")] == [3, 1]
   (code,) = blocks("randomization.md", "python")
   scope: dict[str, Any] = {}
   exec(code, scope)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from playground import __version__
 from playground.benchmark.arguments import help_of, parse
+from playground.benchmark.commands import COMMANDS, run
 from playground.console import lasting_stdout
 from playground.errors import PlaygroundError, UnknownNameError, nearest, one_sentence
 
@@ -29,8 +30,6 @@ def main() -> None:
 
 
 def _main(argv: Sequence[str]) -> int:
-  from playground.benchmark.commands import COMMANDS, run
-
   name = argv[0] if argv else "--help"
   known = [*COMMANDS, *OTHERS]
   if name in ("-h", "--help", "help"):
@@ -52,8 +51,6 @@ def _main(argv: Sequence[str]) -> int:
 
 
 def _print_help() -> None:
-  from playground.benchmark.commands import COMMANDS
-
   print("playground-bench <command> [key=value ...]; `playground-bench <command> --help` shows a command's keys.\n")
   docs = {name: command.__doc__ for name, command in COMMANDS.items()}
   docs |= {name: importlib.import_module(module).Options.__doc__ for name, module in OTHERS.items()}

@@ -13,7 +13,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NoReturn
 
 import hydra
@@ -41,7 +41,7 @@ from playground.errors import ConfigError, PlaygroundError, UnknownNameError, on
 from playground.gc_pause import gc_paused
 from playground.rendering.gl import withhold_gl
 from playground.runs.wandb_artifacts import local_path
-from playground.settings import Plain
+from playground.settings import nodes
 from playground.trust import trust
 
 _COMPLETION = re.compile("(install|uninstall|query)=(bash|fish|zsh)")
@@ -173,12 +173,10 @@ def _shown(config: RunConfig, package: str | None) -> str:
   """Returns the configuration, or its section at a dotted key, as YAML."""
   if package is None:
     return to_yaml(config)
-  section: Plain = config.resolved
-  for part in package.split("."):
-    if not isinstance(section, Mapping) or part not in section:
-      raise UnknownNameError(f"--package {package}: the configuration has no such key.")
-    section = section[part]
-  return values_to_yaml(section)
+  known = dict(nodes(config.resolved))
+  if package not in known:
+    raise UnknownNameError(f"--package {package}: the configuration has no such key.")
+  return values_to_yaml(known[package])
 
 
 def _refuse(message: str) -> NoReturn:

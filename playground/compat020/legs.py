@@ -12,10 +12,10 @@ from playground.envs.locomotion.joystick import Joystick
 from playground.envs.locomotion.stand import Stand
 from playground.envs.task import InitialState
 from playground.mdp import rewards
-from playground.mdp.commands import Gait, is_still
+from playground.mdp.commands import Gait
 from playground.mdp.context import StepContext
 from playground.mdp.events import Info, PushByForce, PushByForceRegularly
-from playground.mdp.legged import LeggedContext
+from playground.mdp.legged import LeggedContext, is_still
 from playground.physics.backend import mjx
 
 _SIDEWAYS = 0.1  # m/s

@@ -116,9 +116,9 @@ class FastSAC(OffPolicy[FastSACConfig, FastSACNetworks]):
       next_key, actor_key = jax.random.split(key)
 
       next_action, next_log_prob = networks.sample(networks.logits(unravel_actor(actor), batch.next_obs), next_key)
-      grads, (loss, mean, edge) = jax.grad(critic_loss, has_aux=True)(
-        *(unravel_critic(critic), unravel_critic(target)),
-        *(batch, next_action, next_log_prob, jnp.exp(log_alpha[0]), networks, config),
+      bonus = -jnp.exp(log_alpha[0]) * next_log_prob
+      grads, (loss, mean, edge) = jax.grad(c51_loss, has_aux=True)(  # each critic from its own target, no minimum
+        *(unravel_critic(critic), unravel_critic(target), batch, next_action, bonus, False, networks, config),
       )
       critic, critic_opt, critic_norm, good = gradient_step(optimizer, grads, critic, critic_opt)
 
@@ -148,34 +148,6 @@ class FastSAC(OffPolicy[FastSACConfig, FastSACNetworks]):
     actor, critic, log_alpha, target, opt_state = carry
     learned = FastSACParams(unravel_actor(actor), unravel_critic(critic), log_alpha[0])
     return (learned, unravel_critic(target), opt_state), log.mean(axis=0)
-
-
-def critic_loss(
-  params: PyTree,
-  target_params: PyTree,
-  batch: Transition,
-  next_action: jax.Array,
-  next_log_prob: jax.Array,
-  alpha: jax.Array,
-  networks: FastSACNetworks,
-  config: FastSACConfig,
-) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
-  """`c51_loss` of soft values: each critic learns from its own target critic, and there is no minimum.
-
-  Args:
-    params: the critics'.
-    target_params: the target critics'.
-    batch: B normalised transitions.
-    next_action: samples on `next_obs`, [B, action_size].
-    next_log_prob: of these, [B].
-    alpha: temperature, [].
-    networks: the networks the parameters belong to.
-    config: `discounting`, `reward_scaling`.
-
-  Returns:
-    See `c51_loss`.
-  """
-  return c51_loss(params, target_params, batch, next_action, -alpha * next_log_prob, False, networks, config)
 
 
 def alpha_loss(log_alpha: jax.Array, log_prob: jax.Array, target_entropy: jax.Array | float) -> jax.Array:

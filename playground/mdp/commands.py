@@ -16,6 +16,7 @@ import numpy as np
 from playground.errors import ConfigError
 from playground.limits import AtLeast0, Limit, Positive, Share, Span, Vector
 from playground.mdp.context import StepContext
+from playground.mdp.legged import is_still
 
 Info = dict[str, Any]
 _AT_REST = np.pi  # the phase of a foot that stays on the floor
@@ -159,19 +160,3 @@ class Gait:
     if self.rest_when_still:
       phase = jnp.where(is_still(c.command), _AT_REST, phase)
     return {"phase": phase}
-
-
-def is_still(command: jax.Array) -> jax.Array:
-  """Returns whether a velocity command asks to stand still, bool: its norm is at most 0.01."""
-  return jnp.linalg.norm(command) <= 0.01
-
-
-def swing_height(phase: jax.Array, peak: jax.Array | float) -> jax.Array:
-  """Returns how high a foot should be at its phase: `peak` times 3u² - 2u³, u rising to 1 at phase 0 and falling back.
-
-  (Paper, appendix "Locomotion", feet phase. The polynomial goes on beyond +- pi.)
-  """
-  place = (phase + jnp.pi) / (2 * jnp.pi)
-  rise, fall = 2 * place, 2 * place - 1
-  smooth = lambda u: 3 * u**2 - 2 * u**3
-  return peak * jnp.where(place <= 0.5, smooth(rise), 1 - smooth(fall))

@@ -20,7 +20,7 @@ from mujoco.mjx._src.math import axis_angle_to_quat, normalize, quat_mul
 from playground.errors import ConfigError
 from playground.limits import MOST, AtLeast0, Limit, Share, Span, Vector, count, span
 from playground.mdp.context import need_free_root
-from playground.mdp.poses import uniform_quat
+from playground.mdp.poses import horizontal, uniform_quat
 from playground.physics.backend import PhysicsData, mjx
 from playground.text import format_value
 
@@ -275,7 +275,7 @@ class PushByForce:
 
   def step(self, data: PhysicsData, info: Info) -> tuple[PhysicsData, Info]:
     pushing, dt = info["push_wait"] >= info["push_interval"], self.env.dt
-    force = push_force(info["push_time"] * dt, info["push_mass"], info["push_velocity"], info["push_duration"])
+    force = self.force(info["push_time"] * dt, info["push_mass"], info["push_velocity"], info["push_duration"])
     force = jnp.where(pushing, force * info["push_direction"], 0.0)
     over = pushing & (info["push_time"] >= jnp.round(info["push_duration"] / dt))
     rng, key = jax.random.split(info["rng"])
@@ -288,6 +288,11 @@ class PushByForce:
       "push_time": jnp.where(starting, 0, info["push_time"] + pushing),
       "pushing": pushing,
     }
+
+  @staticmethod
+  def force(time: jax.Array, mass: jax.Array, velocity: jax.Array, duration: jax.Array) -> jax.Array:
+    """Returns a push's force at `time` s after it began, N."""
+    return 0.5 * jnp.sin(jnp.pi * time / duration) * mass * velocity / duration
 
   def apply(self, data: PhysicsData, force: jax.Array) -> PhysicsData:
     """Returns the physics with a further force [3], or force and torque [6], on the body."""
@@ -314,7 +319,7 @@ class PushByForceRegularly(PushByForce):
     rng, key = jax.random.split(info["rng"])
     direction = jnp.where(starting, self.direction(key), info["push_direction"])
     pushing = since < info["push_duration"]
-    force = push_force(since * dt, info["push_mass"], info["push_velocity"], info["push_duration"] * dt)
+    force = self.force(since * dt, info["push_mass"], info["push_velocity"], info["push_duration"] * dt)
     return self.apply(data, jnp.where(pushing, force, 0.0) * direction), {
       "rng": jnp.where(starting, rng, info["rng"]),
       "push_step": info["push_step"] + 1,
@@ -386,20 +391,9 @@ class PushBySettingVelocity:
     return data, {"rng": rng, "push": push, "push_step": step, "pushing": due}
 
 
-def push_force(time: jax.Array, mass: jax.Array, velocity: jax.Array, duration: jax.Array) -> jax.Array:
-  """Returns a push's force at `time` s after it began, N: a half sine, see `PushByForce`."""
-  return 0.5 * jnp.sin(jnp.pi * time / duration) * mass * velocity / duration
-
-
 def _steps(seconds: jax.Array, dt: float) -> jax.Array:
   """Returns the nearest number of control steps, 1 at least, int32."""
   return jnp.maximum(jnp.round(seconds / dt), 1).astype(jnp.int32)
-
-
-def horizontal(key: jax.Array) -> jax.Array:
-  """Draws a horizontal unit vector, shape [3]."""
-  angle = jax.random.uniform(key, maxval=2 * jnp.pi)
-  return jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
 
 
 def _uniform(key: jax.Array, reach: Span, shape: tuple[int, ...] = ()) -> jax.Array:

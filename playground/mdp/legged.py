@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 from playground.errors import ConfigError, lookup
-from playground.mdp.commands import is_still
 from playground.mdp.context import Robot, StepContext
 from playground.mdp.options import mirrors_as
 from playground.physics.backend import PhysicsData, mjx
@@ -239,3 +238,19 @@ class LeggedContext(StepContext):
   def feet_velocity(self) -> jax.Array:
     """World velocities of the feet, m/s [feet, 3]."""
     return self.robot.foot_sensors(self.data, "foot_linvel")
+
+
+def is_still(command: jax.Array) -> jax.Array:
+  """Returns whether a velocity command asks to stand still, bool: its norm is at most 0.01."""
+  return jnp.linalg.norm(command) <= 0.01
+
+
+def swing_height(phase: jax.Array, peak: jax.Array | float) -> jax.Array:
+  """Returns how high a foot should be at its phase: `peak` times 3u² - 2u³, u rising to 1 at phase 0 and falling back.
+
+  (Paper, appendix "Locomotion", feet phase. The polynomial goes on beyond +- pi.)
+  """
+  place = (phase + jnp.pi) / (2 * jnp.pi)
+  rise, fall = 2 * place, 2 * place - 1
+  smooth = lambda u: 3 * u**2 - 2 * u**3
+  return peak * jnp.where(place <= 0.5, smooth(rise), 1 - smooth(fall))

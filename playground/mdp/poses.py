@@ -1,4 +1,4 @@
-"""Orientations as unit quaternions (w, x, y, z), and the noise on the pose of an object that a camera tracks."""
+"""Directions, orientations as unit quaternions (w, x, y, z), and noise on the pose that a camera gives of an object."""
 
 from typing import Any
 
@@ -9,6 +9,12 @@ from mujoco.mjx._src.math import axis_angle_to_quat, norm, normalize, quat_inv, 
 Pose = tuple[jax.Array, jax.Array]  # position m [3], orientation [4]
 
 _INJECTED_REACH = 0.5  # m
+
+
+def horizontal(key: jax.Array) -> jax.Array:
+  """Draws a horizontal unit vector, shape [3]."""
+  angle = jax.random.uniform(key, maxval=2 * jnp.pi)
+  return jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
 
 
 def uniform_quat(key: jax.Array) -> jax.Array:

@@ -17,9 +17,8 @@ from mujoco.mjx._src.math import normalize
 
 from playground.errors import ConfigError
 from playground.limits import AtLeast0, Positive, Share, Vector, positive
-from playground.mdp.commands import swing_height
 from playground.mdp.context import StepContext, root_qpos
-from playground.mdp.legged import LeggedContext
+from playground.mdp.legged import LeggedContext, swing_height
 from playground.mdp.manipulators import ArmContext, HandContext
 from playground.mdp.tolerance import tolerance
 

@@ -1,24 +1,28 @@
-"""Identifies runs with the same compiled program: they can train together, and a later start loads it."""
+"""Identifies runs with the same compiled program: they can train together, as a population, too, or load it later."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from playground import fingerprint
-from playground.errors import ConfigError
+from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.hardware.distributed import is_multiprocess
 from playground.hardware.setup import Hardware
+from playground.learning.population import Population
 from playground.learning.stored_program import StoredProgram
 from playground.learning.trainer import Trainer
+from playground.limits import Limit
 from playground.mdp.options import is_model_field
 from playground.registry import task_class
-from playground.settings import Plain, below
+from playground.settings import Plain, below, settings
 
 if TYPE_CHECKING:
   from playground.config import RunConfig
+
+KEEP = 3  # a run may have saved a step while another still writes the one before, so that its newest is older still
 
 
 def program_of(config: "RunConfig") -> str | None:
@@ -37,6 +41,58 @@ def program_of(config: "RunConfig") -> str | None:
     return _structure(config, names, config.init_from is not None)
   except ConfigError:  # the run reports its invalid term when it starts
     return None
+
+
+def share_program(configs: Sequence["RunConfig"]) -> bool:
+  """Returns whether runs can train together."""
+  first, *others = {program_of(config) for config in configs}
+  return first is not None and not others
+
+
+def population_of(configs: Sequence["RunConfig"], exploit_every: int, explore: Sequence[str]) -> Population | None:
+  """Returns the population of the runs, None where `exploit_every` is 0.
+
+  Raises:
+    ConfigError: there is only one run, the runs differ in program or task, so that returns are not comparable, they
+      keep fewer than `KEEP` checkpoints, have too few evaluations for an exchange, or PPO adapts the learning rate that
+      the population would set.
+    UnknownNameError: a key of `explore` is not one of the agent's numbers that are arguments of the program.
+  """
+  if not exploit_every:
+    return None
+  if len(configs) < 2 or not share_program(configs):
+    raise ConfigError(
+      f"launcher.exploit_every={exploit_every} needs two or more jobs that train in one program: these are "
+      f"{len(configs)} that differ in more than seeds and numbers (docs/sweeps.md)."
+      if len(configs) > 1
+      else f"launcher.exploit_every={exploit_every} needs two or more jobs, such as 'seed=range(8)'."
+    )
+  if any(config.resolved["env"] != configs[0].resolved["env"] for config in configs):
+    raise ConfigError(
+      f"launcher.exploit_every={exploit_every} compares returns, so all jobs need the same env: vary seed and agent."
+    )
+  if (keep := min(config.checkpoint.keep for config in configs)) < KEEP:
+    raise ConfigError(
+      f"checkpoint.keep={keep} must be {KEEP} or more with launcher.exploit_every: after a kill the jobs go on from a "
+      "step that all have, and their newest checkpoints may be two apart."
+    )
+  if (evals := min(config.agent.num_evals for config in configs)) < exploit_every + 2:
+    raise ConfigError(
+      f"agent.num_evals={evals} must be {exploit_every + 2} or more with launcher.exploit_every={exploit_every}: the "
+      "evaluations before and after training change nothing."
+    )
+  agent, known = configs[0].agent, [f"agent.{name}" for name in configs[0].agent.traced]
+  for key in explore:
+    if key not in known:
+      raise UnknownNameError(f"launcher.explore={key} must be one of {', '.join(known)}.{nearest(key, known)}")
+  rate = "agent.learning_rate"
+  if rate in explore and getattr(agent, "desired_kl", None) is not None:
+    raise ConfigError(
+      f"launcher.explore={rate} has no effect with agent.desired_kl, which adapts the rate: name other keys, or set "
+      "agent.desired_kl=null."
+    )
+  limits = {key: settings(type(agent))[key.removeprefix("agent.")].limit or Limit() for key in explore}
+  return Population(exploit_every, limits, configs[0].seed)
 
 
 def stored_program(

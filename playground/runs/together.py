@@ -22,8 +22,7 @@ from playground.learning.rollout import Step
 from playground.learning.trainer import TrainState
 from playground.runs.callbacks import RunCallbacks
 from playground.runs.interrupts import Interrupted, Interrupts, exit_code
-from playground.runs.population import population_of
-from playground.runs.programs import program_of
+from playground.runs.programs import population_of, share_program
 from playground.runs.progress import Progress
 from playground.runs.restore_plan import RestorePlan
 from playground.runs.run_dir import RunDirectory
@@ -54,7 +53,7 @@ def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explo
   Raises:
     PlaygroundError: an error that concerns all runs.
   """
-  if len({program_of(config) for config in configs}) > 1 or program_of(configs[0]) is None:
+  if not share_program(configs):
     raise ConfigError("These runs cannot train together: they differ in more than seeds and numbers of agent and task.")
   population = population_of(configs, exploit_every, explore)
   with Interrupts() as interrupts:

@@ -15,15 +15,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 from rich.console import Console
 
 from playground.config import check_saved_job
-from playground.config.sweep_options import (
-  LauncherConfig,
-  LocalConfig,
-  OptunaConfig,
-  RayConfig,
-  SlurmConfig,
-  SweepSettings,
-  TogetherConfig,
-)
+from playground.config.sweep_options import LAUNCHERS, LauncherConfig, OptunaConfig, SlurmConfig, SweepSettings
 from playground.runs.interrupts import on_signals
 from playground.sweep.folder import ENDED, FAILED, Job, JobState, SweepDirectory
 from playground.sweep.report import write_result
@@ -37,12 +29,6 @@ ConfigT = TypeVar("ConfigT", bound=LauncherConfig, contravariant=True)
 
 POLL_S = 0.3
 MAX_CODE = 100  # exit codes above are signals'
-_CLASSES = {
-  LocalConfig: "local:LocalLauncher",
-  RayConfig: "ray:RayLauncher",
-  SlurmConfig: "slurm:SlurmLauncher",
-  TogetherConfig: "together:TogetherLauncher",
-}
 
 
 class Launcher(Protocol):
@@ -82,8 +68,8 @@ class LauncherClass(Protocol[ConfigT]):
 
 def launcher_class(config: ConfigT) -> LauncherClass[ConfigT]:
   """Returns the launcher class of the settings; raises ConfigError if its package is not installed."""
-  module, _, name = _CLASSES[type(config)].partition(":")
-  return getattr(importlib.import_module(f"playground.sweep.{module}"), name)
+  name = next(name for name, settings in LAUNCHERS.items() if settings is type(config))
+  return getattr(importlib.import_module(f"playground.sweep.{name}"), f"{name.title()}Launcher")
 
 
 def run_sweep(

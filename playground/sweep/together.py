@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from playground.config import compose
 from playground.config.sweep_options import LocalConfig, TogetherConfig
 from playground.errors import ConfigError, PlaygroundError
-from playground.runs.population import population_of
-from playground.runs.programs import program_of
+from playground.runs.programs import population_of, program_of
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import LocalLauncher, Slot
 from playground.sweep.worker import COMMAND

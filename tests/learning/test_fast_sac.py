@@ -13,13 +13,12 @@ from jax.sharding import PartitionSpec as P
 
 from playground.errors import ConfigError
 from playground.hardware.mesh import jit_on_mesh, make_mesh
-from playground.learning.c51 import updates_actor
+from playground.learning.c51 import c51_loss, updates_actor
 from playground.learning.fast_sac import (
   BoundedNormalTanh,
   FastSAC,
   FastSACNetworks,
   alpha_loss,
-  critic_loss,
   policy_loss,
 )
 from playground.learning.hyperparameters import FastSACConfig, FastSACNetworkConfig
@@ -81,7 +80,8 @@ def test_each_critic_learns_soft_values_from_its_own_target(networks: FastSACNet
     reward = float(data.reward[i]) - discount * alpha * float(log_prob[i])
     for k in (0, 1):
       expected -= (projected(following[k, i], reward, discount, -3, 3) * log[k, i]).sum() / 16
-  loss = jax.jit(lambda data, alpha: critic_loss(params.q, target.q, data, action, log_prob, alpha, networks, SMALL)[0])
+  rest = False, networks, SMALL
+  loss = jax.jit(lambda data, alpha: c51_loss(params.q, target.q, data, action, -alpha * log_prob, *rest)[0])
   assert float(loss(data, alpha)) == pytest.approx(expected, rel=1e-4)
   over = data.replace(discount=jnp.zeros(16))
   assert loss(over, alpha) == loss(over, 9.0), "no entropy bonus after the end"

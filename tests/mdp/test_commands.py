@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from playground.errors import ConfigError, UnknownNameError
-from playground.mdp.commands import Gait, UniformVelocity, VelocityWalk, swing_height
-from playground.mdp.legged import LeggedRobot
+from playground.mdp.commands import Gait, UniformVelocity, VelocityWalk
+from playground.mdp.legged import LeggedRobot, swing_height
 from playground.mdp.terms import bind
 from tests.mdp.context import context
 

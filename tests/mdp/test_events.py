@@ -176,7 +176,7 @@ def test_strengths_and_times_of_pushes_lie_in_their_ranges() -> None:
 
 def test_a_force_integrates_to_mass_times_velocity_over_pi() -> None:
   time = jnp.linspace(0, 0.15, 1001)
-  impulse = events.push_force(time, jnp.array(MASS), jnp.array(2.0), jnp.array(0.15)).mean() * 0.15
+  impulse = PushByForce.force(time, jnp.array(MASS), jnp.array(2.0), jnp.array(0.15)).mean() * 0.15
   np.testing.assert_allclose(impulse, MASS * 2.0 / np.pi, rtol=1e-2)
 
 
@@ -190,7 +190,7 @@ def test_pushes_by_force_in_time(dt: float) -> None:
   assert not body.xfrc_applied[:, 0].any() and not body.xfrc_applied[:, 1, 2:].any() and not body.qvel.any()
   push = forces[wait : wait + duration + 1]
   time = jnp.arange(duration + 1) * dt
-  expected = events.push_force(time, jnp.array(MASS), info["push_velocity"], info["push_duration"])
+  expected = PushByForce.force(time, jnp.array(MASS), info["push_velocity"], info["push_duration"])
   np.testing.assert_allclose(np.linalg.norm(push, axis=1), np.abs(expected), rtol=1e-3, atol=1e-3)
   assert infos["pushing"][: wait + duration + 2].tolist() == [False] * wait + [True] * (duration + 1) + [False]
   if dt < 0.01:  # a coarse step samples a short half sine coarsely

@@ -307,3 +307,12 @@ def test_terms_that_an_arm_has_not(kind: str, entry: Any, message: str, arm: Arm
 def test_functions_have_the_names_under_which_they_are_registered() -> None:
   for kind in ("rewards", "observations", "terminations"):
     assert {func.__name__ for func in registered(kind).values()} == set(registered(kind))
+
+
+def test_nothing_is_registered_that_cannot_be_a_term_of_its_kind() -> None:
+  methods = {"bind", "reset", "step"}
+  for name, command in registered("commands").items():
+    assert methods <= set(dir(command)), name
+  for name, event in registered("events").items():
+    leading = [*inspect.signature(event).parameters][:3]
+    assert leading == ["key", "env", "initial"] or methods <= set(dir(event)) or name == "model_field", name

@@ -8,11 +8,10 @@ from functools import cache
 from itertools import groupby, pairwise
 
 from playground.benchmark.report.evidence import Evidence
-from playground.benchmark.report.sections import Notes, runs_by_step
+from playground.benchmark.report.sections import Notes, curves_of, runs_by_step
 from playground.catalog import entries
 from playground.config.files import shipped, task_names
 from playground.files import read_csv
-from playground.reporting import figures
 from playground.reporting.page import Block, Heading, Image, Table, Text
 
 Points = list[tuple[float, float]]  # (environment steps, return), steps ascending
@@ -54,8 +53,7 @@ def beside_public(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     "`our actions` and the public names say (as set: as the run's agent.deterministic_eval says, sampled by default). "
     "Public settings stand below the table, ours are in the run's name."
   )
-  panels = {task: _panel(ours[task], theirs[task]) for task in shared}
-  drawn = figures.curves(panels, "million control steps", "return").decode()
+  drawn = curves_of({task: _panel(ours[task], theirs[task]) for task in shared})
   yield Image("public", drawn, "Our curves over public ones, of each public algorithm the one that ends highest.")
   compared = [_compared(task, curve, theirs[task]) for task in shared for curve in ours[task]]
   rows = [row.cells() for row in sorted(compared, key=lambda row: (-row.below, row.ratio))]
@@ -170,15 +168,12 @@ def _task_of(name: str) -> str | None:
   return max((task for task in task_names() if name == task or name.startswith(f"{task}_")), key=len, default=None)
 
 
-def _panel(ours: Sequence[Curve], theirs: Sequence[Curve]) -> dict[str, figures.Curve]:
+def _panel(ours: Sequence[Curve], theirs: Sequence[Curve]) -> dict[str, Points]:
   """Returns a task's curves by short names, ours first."""
   named = {f"our {agent_of(curve.label)}{', mode' * (curve.actions == 'mode')}": curve.points for curve in ours}
   for curve in sorted(theirs, key=lambda curve: curve.points[-1][1]):
     named[re.split(r"[ ,(]", curve.label)[0]] = curve.points  # the highest is the last
-  return {
-    name: figures.Curve([step / 1e6 for step, _ in points], [value for _, value in points])
-    for name, points in named.items()
-  }
+  return named
 
 
 @cache

@@ -299,9 +299,9 @@ def returns(evidence: Evidence, notes: Notes) -> Iterable[Block]:
     task, run = parts.groups() if parts else (name, name)
     groups.setdefault(task, {})[run] = points
   if groups:
-    yield Image("curves", _curves(groups), "Return of evaluations over control steps.")
+    yield Image("curves", curves_of(groups), "Return of evaluations over control steps.")
   if runs := runs_by_step(evidence):
-    yield Image("runs", _curves(runs), "Return of runs that were measured whole, means over seeds.")
+    yield Image("runs", curves_of(runs), "Return of runs that were measured whole, means over seeds.")
   rows = []
   for figure in evidence.find(quantity="final_return"):
     if figure["benchmark"] != "chain":
@@ -339,7 +339,8 @@ def runs_by_step(
   return dict(sorted(curves.items()))
 
 
-def _curves(groups: Mapping[str, Mapping[str, figures.Points]]) -> str:
+def curves_of(groups: Mapping[str, Mapping[str, figures.Points]]) -> str:
+  """Draws curves (environment steps, return), by title of the panel and name."""
   in_millions = lambda points: figures.Curve([step / 1e6 for step, _ in points], [value for _, value in points])
   panels = {title: {name: in_millions(points) for name, points in group.items()} for title, group in groups.items()}
   return figures.curves(dict(sorted(panels.items())), "million control steps", "return").decode()

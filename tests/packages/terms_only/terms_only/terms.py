@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from playground.limits import Positive, Span
-from playground.mdp.events import horizontal
 from playground.mdp.legged import LeggedContext
+from playground.mdp.poses import horizontal
 from playground.physics.backend import PhysicsData, mjx
 
 
