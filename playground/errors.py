@@ -32,7 +32,7 @@ class HardwareError(PlaygroundError):
 
 # Errors of the operating system about a path, a disk or a limit of the machine, never caused by a bug of ours.
 _OF_THE_MACHINE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP}
-_OF_THE_MACHINE |= {errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ESTALE}
+_OF_THE_MACHINE |= {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ESTALE}
 
 
 def one_sentence(error: Exception) -> str:

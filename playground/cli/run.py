@@ -226,19 +226,22 @@ def _trusted(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _sweep(overrides: Sequence[str], show: str | None, package: str | None, trusted: Sequence[str]) -> int:
-  from playground.sweep.plan import compose_jobs, plan
-
   if show is not None:
+    from playground.sweep.plan import compose_jobs
+
     if show != "job":
       raise ConfigError(f"--cfg {show} shows one run: leave -m out; --cfg job shows all jobs of a sweep.")
     print(
       "---\n".join(f"# {' '.join(config.overrides)}\n{_shown(config, package)}" for config in compose_jobs(overrides))
     )
     return 0
-  from playground.sweep.runner import run_sweep
-  from playground.sweep.worker import job_command
+  with gc_paused():  # JAX's callback of the collector would swallow a Ctrl+C
+    from playground.sweep.plan import plan
+    from playground.sweep.runner import run_sweep
+    from playground.sweep.worker import job_command
 
-  return run_sweep(*plan(overrides), job_command(trusted, command_lines(overrides)))
+    planned = plan(overrides)
+  return run_sweep(*planned, job_command(trusted, command_lines(overrides)))
 
 
 def _report(error: Exception) -> int:

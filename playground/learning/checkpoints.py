@@ -354,7 +354,7 @@ class Checkpoint:
     # As Orbax writes it; read without Orbax, whose errors do not tell the cause.
     file = self.path / "meta" / "metadata"
     if not file.exists() and not any((self.path / item).is_dir() for item in ("meta", "policy", "state")):
-      raise CheckpointError(f"{self.path} is not a checkpoint of playground-run.")
+      raise DamagedCheckpointError(f"{self.path} is not a checkpoint of playground-run.")  # or half deleted
     meta = self._read("meta", lambda: json.loads(file.read_bytes()))
     written_as = meta.get("format") if isinstance(meta, dict) else None
     if _version(written_as) > _version(FORMAT):

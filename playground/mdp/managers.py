@@ -119,9 +119,14 @@ class ObservationManager(_Manager):
   The group `state` is the first of `groups`; an empty group is left out.
   """
 
-  def __init__(self, config: Any):
-    """Binds `observations` of a task's config, with the settings of `TermsConfig`; raises as `terms.bind`."""
+  def __init__(self, config: Any, delay: tuple[int, int] | None = None):
+    """Binds `observations` of a task's config, with the settings of `TermsConfig`; raises as `terms.bind`.
+
+    With `delay`, the group `state` as a whole is that of so many steps ago (drawn in each step, from and up to), at
+    first that of the episode's start.
+    """
     section, order = config.observations, config.observation_order or {}
+    self._delay = delay
     self._level: float = config.noise_level
     self._frames: int = config.observation_frames
     self.groups = {}
@@ -147,6 +152,9 @@ class ObservationManager(_Manager):
     """
     past: Info = {}
     obs: dict[str, jax.Array] = {}
+    whole_key = key
+    if self._delay:
+      key, whole_key = jax.random.split(key)
     for group, terms in self.groups.items():
       drawn: dict[str, jax.Array] = {}
       parts = []
@@ -167,6 +175,10 @@ class ObservationManager(_Manager):
         empty = jnp.zeros((self._frames, obs[group].size))
         past[group] = delays.push(empty if buffers is None else buffers[group], obs[group])
         obs[group] = past[group].ravel()
+      if group == ACTOR and self._delay:
+        now, depth = obs[group], self._delay[1] + 1
+        past["delayed"] = delays.start(now, depth) if buffers is None else delays.push(buffers["delayed"], now)
+        obs[group] = delays.delayed(past["delayed"], delays.draw_delay(whole_key, self._delay))
     return obs if len(obs) > 1 else obs[ACTOR], past
 
   def _read(self, term: Term, c: StepContext, key: jax.Array, drawn: dict[str, jax.Array]) -> jax.Array:

@@ -130,8 +130,13 @@ class RunCallbacks:
     self._store.close()
     self._trained_s = self.wall_clock_s
     wanted = self._config.video.enable and self._config.video.at_end and not self.should_stop()
-    if wanted and self._recording is not None and self._filmed != self._step:
+    if not wanted or self._filmed == self._step:
+      return
+    if self._recording is not None:
       self._start_video(self._step, self._recording)
+    elif not self._video_at(self._step).exists():  # killed after the last evaluation, resumed without one
+      command = f"`playground play {self._run_dir.path} --video <file>.mp4`"
+      self._progress.print(f"No video of the last evaluation: {command} films an episode.")
 
   def finish(self, loop: Loop, policy: Policy, completed: bool) -> None:
     """Waits for the video, and writes the run's result with the last policy; call `end_training` first."""
@@ -206,6 +211,9 @@ class RunCallbacks:
     """Returns the seconds from the start of the process or stage to a time of `time.perf_counter`."""
     return None if at is None else process_age_s() - self._process_began_s - (time.perf_counter() - at)
 
+  def _video_at(self, step: int) -> Path:
+    return self._run_dir.videos / f"step_{step:012d}.mp4"
+
   def _start_video(self, step: int, recording: Recording) -> None:
     """Renders the first recorded episodes in a child process while training continues."""
     view = self._config.video
@@ -213,7 +221,7 @@ class RunCallbacks:
     self._video = self._videos.submit(
       render_video,
       self._drawn,
-      out_path=self._run_dir.videos / f"step_{step:012d}.mp4",
+      out_path=self._video_at(step),
       dt=self._env.dt * self._env.action_repeat,
       camera=view.camera,
       width=view.width,

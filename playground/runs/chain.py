@@ -59,7 +59,8 @@ def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) 
   else:
     chain = RunDirectory.open(config.resume)
     # Else a stage was trained longer by itself, or is to be: it was interrupted in that.
-    if chain.status.get("status") == "finished" and chain.summary.get("stages") == _stages(chain, folders):
+    stages = _stages(chain, folders)  # raises for a damaged summary before a stage trains
+    if chain.status.get("status") == "finished" and chain.summary.get("stages") == stages:
       print(f"{chain.path} is finished: nothing to resume (init_from={chain.path} trains on from its weights).")
       return 0
     opened = contextlib.nullcontext((chain, list(config.stages)))

@@ -145,10 +145,10 @@ def _structure(config: "RunConfig", sections: list[str], from_policy: bool, left
   Raises:
     ConfigError: a term's number is invalid.
   """
-  traced = [*left_out, *(f"agent.{name}" for name in config.agent.traced)]
-  traced += [f"env.{name}" for name in task_class(config.resolved["env"]["task"]).settings_of(config.env)]
+  numbers = task_class(config.resolved["env"]["task"]).settings_of(config.env)
+  traced = [*left_out, *(f"agent.{name}" for name in config.agent.traced), *(f"env.{name}" for name in numbers)]
   resolved = without({name: config.resolved[name] for name in sections}, [*traced, *_startup_ranges(config)])
-  resolved["init_from"] = from_policy
+  resolved |= {"init_from": from_policy, "shapes": {name: np.shape(value) for name, value in numbers.items()}}
   return json.dumps(resolved, sort_keys=True, default=str)
 
 

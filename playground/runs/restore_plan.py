@@ -209,7 +209,7 @@ class RestorePlan:
         self.state, notice = trainer.restore(checkpoint, template)
       except DamagedCheckpointError as error:
         if path == self.checkpoints[-1]:
-          if not (path / "state").is_dir():
+          if (path / "policy").is_dir() and not (path / "state").is_dir():
             raise CheckpointError(f"{path} holds a policy alone: init_from={path} starts a new run from it.") from None
           raise
         self.notices.append(

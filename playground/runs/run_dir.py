@@ -149,7 +149,7 @@ class RunDirectory:
   @property
   def status(self) -> dict[str, Plain]:
     """The content of status.json, see `set_status`; empty without one."""
-    return read_json(self.path / "status.json", status=str, reason=str, started=str)
+    return read_json(self.path / "status.json", status=str, reason=str, started=str, updated=str)
 
   @property
   def summary(self) -> dict[str, Plain]:

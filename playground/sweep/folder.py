@@ -159,8 +159,9 @@ class JobFolder:
     state = JobState(**fields)
     if state.status != "running" or self.locked():
       return state
-    if self.run.status.get("status") == "finished":  # the run outlived its worker
-      return dataclasses.replace(state, status="finished")
+    run = self.run.status
+    if run.get("status") in ENDED and run.get("updated", "") >= (record.get("started") or ""):  # it outlived its worker
+      return dataclasses.replace(state, status=run["status"], reason=run["reason"])
     return dataclasses.replace(state, status="killed", reason="its process is gone without a word")
 
   @contextlib.contextmanager

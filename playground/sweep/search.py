@@ -4,6 +4,7 @@ The study is a file in the sweep's folder (`study.log`), a trial is one of the s
 """
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSweep
 from hydra.core.override_parser.types import Override as HydraOverride
@@ -34,6 +35,13 @@ _SAMPLERS = {
 _GOLDEN = 1.618  # divides an interval between whole numbers where no whole number is
 
 
+def _drop_torn_line(log: Path) -> None:
+  """Drops the last line if a kill or a full disk has cut it: Optuna would append to it."""
+  if log.is_file():
+    with log.open("rb+") as file:
+      file.truncate(file.read().rfind(b"\n") + 1)
+
+
 class Search:
   """Gets jobs from Optuna and reports their results."""
 
@@ -49,6 +57,7 @@ class Search:
       str(o.get_key_element()): distribution(o) for o in parsed if o.is_sweep_override()
     }
     log = sweep.path / "study.log"
+    _drop_torn_line(log)
     try:
       self._study = optuna.create_study(
         storage=JournalStorage(JournalFileBackend(str(log))),

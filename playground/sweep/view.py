@@ -123,5 +123,5 @@ def _most_telling(jobs: Sequence[Job], states: Mapping[str, JobState], rows: int
 def _clock(seconds: float | None) -> str:
   if seconds is None:
     return ""
-  hours, rest = divmod(round(seconds), 3600)
+  hours, rest = divmod(max(0, round(seconds)), 3600)
   return f"{hours}:{rest // 60:02}:{rest % 60:02}" if hours else f"{rest // 60}:{rest % 60:02}"

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from playground.config import parse_with_hydra
+from playground.errors import CheckpointError
 from playground.interpreter import PYTHON, environment_elsewhere
 from playground.runs.interrupts import on_signals
 from playground.runs.run_dir import now
@@ -90,12 +91,17 @@ class Worker:
           continue
         started = {"attempt": folder.record.get("attempt", 0) + 1, "host": socket.gethostname(), "started": now()}
         self._records[folder] = {**started, "where": where, "pid": os.getpid(), **fields}
-        if folder.run.status.get("status") == "finished":  # another worker had the lock while this one started
+        try:
+          self._before[folder] = folder.run.status
+        except CheckpointError as error:  # status.json is damaged
+          self._write(folder, "failed", str(error))
+          del self._records[folder]
+          continue
+        if self._before[folder].get("status") == "finished":  # another worker had the lock while this one started
           self._write(folder, "finished")
           del self._records[folder]
         else:
           locks.append(lock)
-          self._before[folder] = folder.run.status
       if not self._records:
         return 0
       if sweep.stop_file.exists():

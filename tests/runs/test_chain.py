@@ -269,6 +269,18 @@ def test_a_finished_chain_is_not_resumed(whole: Path, capsys: pytest.CaptureFixt
   assert (whole / "status.json").read_bytes() == before
 
 
+def test_a_damaged_result_of_a_stage_is_found_before_the_next_trains(
+  whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  path = shutil.copytree(whole, tmp_path / "chain", symlinks=True)
+  RunDirectory(path / STAGES[1]).set_status("preempted")
+  RunDirectory(path).set_status("preempted")
+  (path / STAGES[0] / "summary.json").write_text("")
+  monkeypatch.setattr(train_module, "compile_program", lambda *_: pytest.fail("a stage trains"))
+  with pytest.raises(CheckpointError, match=r"summary\.json is damaged"):
+    resume(path)
+
+
 def test_a_finished_chain_takes_in_that_its_last_stage_trains_longer(whole: Path, tmp_path: Path) -> None:
   path = shutil.copytree(whole, tmp_path / "longer", symlinks=True)
   chain, far = RunDirectory(path), RunDirectory(path / "2_far")

@@ -320,6 +320,7 @@ def test_what_a_program_depends_on(override: str, same: bool) -> None:
     ("env.events.floor_friction.params.range=[0.5,0.6]", True),  # drawn outside the program
     ("env.observations.state.gyro.noise.uniform=0.1", True),
     ("env.observations.state.gyro.noise.uniform=0", False),
+    ("env.observations.state.gyro.noise.uniform=[0.1,0.2,0.3]", False),  # another shape
     ("env.events.push.enabled=true", False),
     ("env.rewards.feet_air_time.params.threshold=0.2", False),
     ("env.noise_level=0.5", False),

@@ -231,12 +231,19 @@ def test_a_second_start_traces_nothing_and_ends_the_same(whole: Path, cache: Pat
   assert removed.is_file() and RunDirectory(again).manifest["timings"]["trace_s"] == 0, "stored again"
 
 
-def test_a_damaged_checkpoint_is_passed_over(whole: Path, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("what", ["damaged", slow("not a checkpoint")])
+def test_a_damaged_checkpoint_is_passed_over(
+  what: str, whole: Path, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
   newest, before, *_ = find_checkpoints(copy)
-  truncate(newest)
+  if what == "damaged":
+    truncate(newest)
+  else:  # a kill while it was deleted, or half a copy
+    shutil.rmtree(newest)
+    newest.mkdir()
   assert resume(copy) == 0
   said = capsys.readouterr().out
-  assert f"{newest} is damaged" in said
+  assert f"{newest} is {what}" in said
   assert "Falling back to the checkpoint before it." in said
   assert f"training state of {before}" in said
   assert newest.with_name(f"damaged_{newest.name}").is_dir()

@@ -5,6 +5,7 @@ when it is resumed; 14 crashes at its first start only; 15 takes its time;
 16 saves at its first start, and at its second ends before it has a status.
 """
 
+import datetime
 import json
 import os
 import signal
@@ -23,7 +24,8 @@ facts |= {name: os.environ.get(name) for name in PLACE}
 
 
 def status(word: str, reason: str = "") -> None:
-  (run / "status.json").write_text(json.dumps({"status": word, "reason": reason}))
+  now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+  (run / "status.json").write_text(json.dumps({"status": word, "reason": reason, "updated": now}))
 
 
 def save(*_: object) -> None:

@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -13,6 +14,7 @@ from playground.cli import sweep as command
 from playground.config import compose_settings
 from playground.console import lasting_stdout
 from playground.errors import CheckpointError, ConfigError
+from playground.runs.run_dir import now
 from playground.sweep.folder import SweepDirectory
 from playground.sweep.runner import run_sweep
 from playground.sweep.worker import Worker
@@ -155,6 +157,28 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
   assert folder.locked() and folder.state().status == "running", "the job itself is still at work"
   assert process.wait(60) == 0
   assert folder.state().status == "finished"
+
+
+@pytest.mark.parametrize("status", ["finished", "preempted", "failed"])
+def test_of_a_run_that_outlived_its_worker_its_own_status_counts(status: Any, tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  folder = sweep.folder(sweep.jobs[0])
+  folder.write(status="running", started=now())
+  folder.run.set_status(status, "its reason")
+  state = folder.state()
+  assert (state.status, state.reason) == (status, "its reason")
+  folder.write(status="running", started="9999")
+  assert folder.state().status == "killed", "that was an earlier start"
+
+
+def test_a_job_whose_status_is_damaged_says_so(tmp_path: Path) -> None:
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  folder = sweep.folder(sweep.jobs[0])
+  folder.path.mkdir(parents=True)
+  (folder.path / "status.json").write_text('{"status": ')
+  assert run(sweep) == 1
+  state = folder.state()
+  assert state.status == "failed" and "status.json is damaged" in state.reason
 
 
 def test_a_sweep_goes_on_where_nobody_reads_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

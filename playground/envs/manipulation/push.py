@@ -13,7 +13,7 @@ from playground.envs.task import InitialState
 from playground.envs.wrappers import PRESERVE_INFO
 from playground.errors import ConfigError
 from playground.mdp import delays
-from playground.mdp.managers import ACTOR, ObservationManager
+from playground.mdp.managers import ObservationManager
 from playground.mdp.manipulators import ArmContext
 from playground.physics.backend import PhysicsData, mjx
 
@@ -62,7 +62,7 @@ class PushCube(ArmTask):
     super().__init__(config)
     need_weights([term for term in self.rewards.terms if term.name not in _BONUSES])
     self._action_delay = tuple(config.action_delay)
-    self.observations = _DelayedObservations(config, tuple(config.observation_delay))
+    self.observations = ObservationManager(config, tuple(config.observation_delay))
     self._max_ctrl = jnp.array(config.max_torque / self.mj_model.actuator_gear[_ARM, 0])
     self._distances, self.angles = jnp.array(config.curriculum.distance), jnp.array(config.curriculum.angle)
     half = (self.robot.joint_range[1] - self.robot.joint_range[0]) / 2
@@ -153,23 +153,6 @@ class PushCube(ArmTask):
     reach = _SPREAD[0] * distance + _SPREAD[1]
     home = self.robot.init_qpos[_BOX]
     return jnp.clip(jax.random.uniform(key, (3,), minval=home - reach, maxval=home + reach), *_PLACES)
-
-
-class _DelayedObservations(ObservationManager):
-  """Observations whose group `state` is delayed as a whole; at the start of an episode it is that of the start."""
-
-  def __init__(self, config: Any, bounds: tuple[int, int]):
-    super().__init__(config)
-    self._bounds = bounds
-
-  def compute(self, c: ArmContext, key: jax.Array, buffers: Any = None) -> tuple[Any, dict[str, Any]]:
-    key, delay_key = jax.random.split(key)
-    obs, past = super().compute(c, key, buffers)
-    now = obs[ACTOR] if isinstance(obs, dict) else obs
-    depth = self._bounds[1] + 1
-    past["delayed"] = delays.start(now, depth) if buffers is None else delays.push(buffers["delayed"], now)
-    late = delays.delayed(past["delayed"], delays.draw_delay(delay_key, self._bounds))
-    return (obs | {ACTOR: late} if isinstance(obs, dict) else late), past
 
 
 def draw_yaw(key: jax.Array, max_angle: jax.Array | float) -> jax.Array:

@@ -49,6 +49,11 @@ def past(state: State) -> jax.Array:
   return state.info["observation_buffers"]["delayed"]
 
 
+def marked() -> dict[str, jax.Array]:
+  """Buffers that tell how late an observation is."""
+  return {"delayed": jnp.arange(13.0)[:, None] * jnp.ones(48)}
+
+
 def moved(state: State, env: Any, box: Any) -> Any:
   return state.data.replace(xpos=state.data.xpos.at[env.mj_model.body("box").id].set(jnp.asarray(box)))
 
@@ -83,10 +88,18 @@ def test_torques_come_late_and_are_bounded(push: Any, state: State, delay: int) 
 
 def test_delays_reach_both_ends(push: Any, state: State) -> None:
   keys = jax.random.split(jax.random.PRNGKey(0), 200)
-  marked = {"delayed": jnp.arange(13.0)[:, None] * jnp.ones(48)}
-  after: Any = jax.vmap(lambda key: step(push, state, observation_buffers=marked, rng=key))(keys)
+  after: Any = jax.vmap(lambda key: step(push, state, observation_buffers=marked(), rng=key))(keys)
   assert set(after.info["action_delay"].tolist()) == {1, 2, 3}
   assert set(after.obs[:, 0].tolist()) == set(range(5, 12))  # one step later: 6 to 12 steps ago
+
+
+def test_a_critic_reads_what_the_policy_reads(state: State) -> None:
+  """`state: {}` of another group, which replay buffers rely on (`off_policy.groups_inside`)."""
+  env = without_physics(TASK, **{"observations.privileged_state": {"state": {}, "object_to_goal": {}}})
+  obs = jax.jit(jax.vmap(lambda key: step(env, state, observation_buffers=marked(), rng=key).obs))
+  late = obs(jax.random.split(jax.random.PRNGKey(0), 8))
+  assert len(set(late["state"][:, 0].tolist())) > 1
+  np.testing.assert_array_equal(late["privileged_state"][:, :48], late["state"])
 
 
 def test_the_newest_observation_is_of_now(push: Any, state: State) -> None:
