@@ -47,6 +47,8 @@ _LINKED: dict[str, tuple[tuple[str, int | None, float], ...]] = {
   "body_density": (("body_mass", None, 1.0), *(("body_inertia", axis, 1.0) for axis in range(3))),
 }
 _SCALED_ONLY = ("body_density",)
+_NOT_NEGATIVE = ("body_mass", "body_inertia", "geom_friction", "pair_friction", "dof_damping", "dof_armature")
+_NOT_NEGATIVE += ("dof_frictionloss",)
 _TURNS = ("quat", "_axis", "_dir", "_pos")  # ends of the names of fields of directions, quaternions and places
 
 _OPERATIONS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
@@ -114,6 +116,11 @@ class Randomizer:
     slots = (slot for draw in self._draws.values() for slot in draw.slots)
     self.fields: tuple[str, ...] = tuple(dict.fromkeys(slot.field for slot in slots))
     self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
+    changed: set[str] = set()  # by the events before
+    for name, draw in self._draws.items():
+      if draw.term.operation != "add" or draw.term.field not in changed:
+        self._check_sign(f"env.events.{name}.params", draw)
+      changed.add(draw.term.field)
 
   def sample(self, key: jax.Array, model: mjx.Model | None = None) -> dict[str, jax.Array]:
     """Draws one environment's fields, each whole and in its model shape. Pure: jit and vmap freely.
@@ -133,6 +140,16 @@ class Randomizer:
   def sample_batch(self, keys: jax.Array) -> dict[str, jax.Array]:
     """Draws N environments' fields from keys [N]: each field gets a leading axis N."""
     return jax.vmap(self.sample)(keys)
+
+  def _check_sign(self, key: str, draw: _Draw) -> None:
+    """Raises ConfigError where a range takes nominal values of a quantity like a mass below 0."""
+    term, change = draw.term, _OPERATIONS[draw.term.operation]
+    for slot in (slot for slot in draw.slots if slot.field in _NOT_NEGATIVE):
+      nominal = jnp.asarray(self._nominal[slot.field][slot.index])
+      lowest = min((float(change(nominal, jnp.asarray(end)).min()) for end in term.range or ()), default=0.0)
+      if lowest < 0:
+        shown = f"{key}.range={format_value(term.range)}"
+        raise ConfigError(f"{shown}: {term.operation} gives {term.field} {lowest:g}, but it is never negative.")
 
   def without_nominal(self) -> list[str]:
     """Returns a sentence for each term that sets values in a range in which the nominal ones are not."""

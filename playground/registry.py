@@ -15,7 +15,6 @@ Classes of any other package are refused unless the user trusts it (`playground.
 
 import dataclasses
 import functools
-import inspect
 import typing
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol, cast
@@ -101,7 +100,12 @@ def build(env_config: TaskConfig) -> "Env":
   Raises:
     ConfigError: as `check`, and what only the task's model shows, such as the name of a joint that it lacks.
   """
-  env = cast("Callable[[ConfigDict], Env]", check(env_config))(env_config)
+  try:
+    env = cast("Callable[[ConfigDict], Env]", check(env_config))(env_config)
+  except ValueError as error:  # MuJoCo's, for a file of the task's own
+    if not str(error).startswith(("XML Error", "ParseXML")):
+      raise
+    raise ConfigError(f"env.task={env_config.task}: {' '.join(str(error).split())}.") from error
   if not uses_vision(env_config):
     return env
   from playground.rendering.vision import Vision
@@ -143,8 +147,10 @@ def task_class(task: str) -> "type[Env]":
   found = trusted_object("env.task", task)
   from playground.envs.base import Env
 
-  if not (isinstance(found, type) and issubclass(found, Env)) or inspect.isabstract(found):
+  if not (isinstance(found, type) and issubclass(found, Env)):
     raise ConfigError(f"env.task={task} is no task: it must be a class that completes playground.envs.base:Env.")
+  if missing := sorted(found.__abstractmethods__):
+    raise ConfigError(f"env.task={task} is incomplete: the class lacks {', '.join(missing)}.")
   return found
 
 

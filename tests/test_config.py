@@ -541,6 +541,39 @@ def test_a_robots_file_must_be_a_mapping_in_its_package(configs: Path):
       compose(["env=joystick", "robot=mine"], configs)
 
 
+@pytest.mark.parametrize(
+  ("file", "content", "chosen", "message"),
+  [
+    ("randomization/mine", "a: {mode: startup}", "randomization=mine", "randomization=mine: the first line of each"),
+    ("tuned/ppo/Mine", "agent: {num_evals: 3}", "tuned=ppo/Mine", "tuned=ppo/Mine: the first line of each"),
+    ("debug/mine", "agent: {num_evals: 3}", "debug=mine", "debug=mine: the first line of each of its files must be"),
+    ("experiment/mine", "seed: 3", "experiment=mine", "experiment=mine: the first line of each of its files must be"),
+    (
+      *("experiment/mine", "defaults: [override /env: WalkerRun]", "experiment=mine"),
+      "the first line of experiment/mine.yaml must be `# @package _global_`.",
+    ),
+    (
+      *("env/Mine", "defaults: [joystick, override /robot: go1, _self_]", "env=Mine"),
+      "in env/Mine.yaml write `override /robot@_global_.robot: <name>`.",
+    ),
+    (
+      *("curriculum/mine", "# @package curriculum\ndefaults: [none, _self_]\nstages: [a, b]", "curriculum=mine"),
+      "In 'curriculum/mine': Cannot merge DictConfig with ListConfig.",
+    ),
+  ],
+)
+def test_files_in_the_wrong_place_say_what_they_lack(file: str, content: str, chosen: str, message: str, configs: Path):
+  (configs / f"{file}.yaml").write_text(f"{content}\n")
+  with pytest.raises(ConfigError, match=re.escape(message)):
+    compose([chosen], configs)
+
+
+def test_an_agent_without_sizes_for_debug_says_which_file_it_lacks(configs: Path):
+  (configs / "debug/sizes/_sac.yaml").unlink()
+  with pytest.raises(ConfigError, match=r"debug=fast needs configs/debug/sizes/_sac\.yaml in the package of agent=sac"):
+    compose(["agent=sac", "debug=fast"], configs)
+
+
 MOVED = {
   "env.reward.scales.feet_slip=-1": "env.rewards.feet_slip_l2.weight",
   "env.reward.scales.alive=1": "env.rewards.constant.weight",

@@ -1,5 +1,6 @@
 """Domain randomisation terms: what they draw, where it goes, and what they refuse."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +192,22 @@ def test_terms_apply_in_order(small: mujoco.MjModel) -> None:
   assert Randomizer(small, events(*set_then_scale[::-1])).sample(key)["body_mass"][hand] == pytest.approx(2)
 
 
+@pytest.mark.parametrize(
+  ("change", "message"),
+  [
+    ({"operation": "set", "range": [-2, 1]}, "range=[-2.0, 1.0]: set gives body_mass -2, but it is never negative."),
+    ({"operation": "scale", "range": [-1, 1]}, "scale gives body_mass -"),
+    ({"operation": "add", "range": [-99, 1]}, "add gives body_mass -"),
+  ],
+)
+def test_a_mass_is_never_negative(change: dict[str, Any], message: str, small: mujoco.MjModel) -> None:
+  term = {"field": "body_mass", "target": "hand"}
+  with pytest.raises(ConfigError, match=re.escape(message)):
+    Randomizer(small, events(term | change))
+  heavy = term | {"operation": "set", "range": [100, 100]}
+  Randomizer(small, events(heavy, term | {"operation": "add", "range": [-99, 1]}))
+
+
 def test_nothing_to_randomise(small: mujoco.MjModel) -> None:
   randomizer = Randomizer(small, shipped("none") | events(GOOD, mode="reset") | {"gone": None})
   assert randomizer.fields == () and randomizer.sample_batch(keys(3)) == {} and values_drawn(randomizer) == []
@@ -292,17 +309,18 @@ def test_distributions(small: mujoco.MjModel) -> None:
 )  # fmt: skip
 def test_ranges_hold(low: float, width: float, operation: str, target: str, seed: int) -> None:
   model = mujoco.MjModel.from_xml_string(SMALL)
-  term = {"field": "body_mass", "target": target, "operation": operation, "range": [low, low + width]}
-  sample = np.asarray(Randomizer(model, events(term)).sample(jax.random.PRNGKey(seed))["body_mass"])
+  model.body_gravcomp[:] = model.body_mass  # a field that may be negative
+  term = {"field": "body_gravcomp", "target": target, "operation": operation, "range": [low, low + width]}
+  sample = np.asarray(Randomizer(model, events(term)).sample(jax.random.PRNGKey(seed))["body_gravcomp"])
   rows = slice(None) if target == "all" else [model.body(target).id]
   ends = [np.full(4, low), np.full(4, low + width)]
   if operation != "set":
-    ends = [model.body_mass * e if operation == "scale" else model.body_mass + e for e in ends]
+    ends = [model.body_gravcomp * e if operation == "scale" else model.body_gravcomp + e for e in ends]
   ends = np.sort(ends, axis=0)[:, rows]
   assert (sample[rows] >= ends[0] - 1e-3).all() and (sample[rows] <= ends[1] + 1e-3).all()
   untouched = np.ones(4, bool)
   untouched[rows] = False
-  np.testing.assert_allclose(sample[untouched], model.body_mass[untouched], rtol=1e-6)
+  np.testing.assert_allclose(sample[untouched], model.body_gravcomp[untouched], rtol=1e-6)
 
 
 def test_old_randomizer_drives_a_vmapped_model(small: mujoco.MjModel) -> None:

@@ -146,7 +146,7 @@ def test_load_refuses(name: str, overrides: dict[str, Any], message: str):
     ("playground.envs.gone:Task", r"there is no module playground\.envs\.gone \(installed, or on PYTHONPATH\)"),
     ("gone.deep:Task", "may only name code of playground, which gone is not"),
     (":Task", "not of the form module:name"),
-    ("playground.envs.base:Env", "is no task"),  # which lacks most of one
+    ("playground.envs.base:Env", "is incomplete: the class lacks action_to_ctrl, post_step, reset."),
     ("playground.envs.base:State", "is no task"),
     ("playground.envs.wrappers:where_done", "is no task"),
   ],

@@ -20,6 +20,7 @@ from playground.robots.panda.kinematics import JOINT_RANGE, inverse_kinematics
 class NoForward(Task):
   """Resets compute no kinematics, so poses and sensors are 0 at first; an auto-reset keeps all of `info`."""
 
+  adds = False
   episode_info = ()
 
   def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:

@@ -80,6 +80,12 @@ _DEFAULTING = ("robot", "agent", "hardware", "tracking", "env")  # groups that d
 _SWEEP_SECTIONS = ("launcher", "search")
 _HARDWARE = defaults(HardwareConfig)
 CHOSEN_BY_GROUP = ("agent.name", "launcher.name", "search.name", "env.robot.name")
+_PACKAGES = {"randomization": "env.events", "tuned": "_global_", "debug": "_global_", "experiment": "_global_"}
+_REMEDIES = {  # of mistakes in files, by what Hydra says of them
+  r"In '([^']+)': Could not override '\w+@(?!env\.)": r"the first line of \1.yaml must be `# @package _global_`",
+  r"In '([^']+)': Could not override 'robot@env\.": r"in \1.yaml write `override /robot@_global_.robot: <name>`",
+  r"Could not find 'debug/sizes/_([^']+)'": r"debug=fast needs configs/debug/sizes/_\1.yaml in the package of agent=\1",
+}
 _NO_DELTAS = [f"~{group}" for group in DELTAS]
 
 
@@ -267,6 +273,10 @@ def _compose_files(roots: Sequence[Path], *groups: str) -> _Files:
   if not named and choices["tuned"] is None and (there := [name for name in sets if name in options("tuned", roots)]):
     added = (parse(f"tuned={there[0]}", roots),)  # ppo_v020 without a set of its own takes ppo_paper's, then ppo's
     config, choices = _hydra([*groups, *group_overrides(added)], roots)
+  for group, package in _PACKAGES.items():
+    if group in config:  # where Hydra puts a file that does not say otherwise
+      chosen = choices.get(group) or "<name>"
+      raise ConfigError(f"{group}={chosen}: the first line of each of its files must be `# @package {package}`.")
   changes = _changes(groups, choices, roots)
   if "robot" in changes.groups or not changes.is_known or any(text.startswith("robot=") for text in groups):
     _check_robot(choices, roots)
@@ -387,7 +397,7 @@ def _hydra(
       chosen = dict(config.hydra.runtime.choices)
   except (HydraException, YAMLError, OmegaConfBaseException, ValueError, OSError, RecursionError) as error:
     files = " ".join(o for o in overrides if not o.startswith("~"))
-    raise ConfigError(f"The files of {files or f'{name}.yaml'} do not compose: {first_line(error)}.") from None
+    raise ConfigError(f"The files of {files or f'{name}.yaml'} do not compose: {_why(error)}.") from None
   OmegaConf.set_struct(config, False)
   del config["hydra"]
   for section in (key for key in (*SECTIONS, *_SWEEP_SECTIONS) if key in config):
@@ -399,6 +409,16 @@ def _hydra(
   if choices.get("tuned") not in options("tuned", roots):  # optional, and this pair has none
     choices["tuned"] = None
   return config, choices
+
+
+def _why(error: Exception) -> str:
+  """Returns why files do not compose: the remedy of a common mistake, else Hydra's reason."""
+  text = first_line(error)
+  for pattern, remedy in _REMEDIES.items():
+    if found := re.search(pattern, text):
+      return found.expand(remedy)
+  head, _, reason = str(error).partition("composing config:\n")  # Hydra's text, and OmegaConf's
+  return f"{' '.join(head.split()[:2])} {reason.splitlines()[0]}" if reason else text
 
 
 def _apply(config: DictConfig, overrides: Iterable[Override], schema: Section) -> dict[str, Plain]:

@@ -68,6 +68,8 @@ class Env(abc.ABC):
   # Entries of `info` that belong to an episode: `AutoReset` sets them back to their values after reset. The others
   # (random key, command, gait, times of pushes) outlast an auto-reset.
   episode_info: ClassVar[tuple[str, ...]] = ()
+  # Whether a class adds its `summaries` and `episode_info` to those of its base classes; else it replaces them.
+  adds: ClassVar[bool] = True
   # Names of the managers, which are those of their sections: numbers there may be arguments of compiled programs.
   managers: ClassVar[tuple[str, ...]] = ()
   # A class that annotates keys of the config with their limits (`reach: Positive`), which `registry.build` checks.
@@ -76,6 +78,15 @@ class Env(abc.ABC):
   redraws: bool = False
   # Whether the config describes all of the task; if not, the task cannot be pickled.
   as_configured: bool = True
+
+  def __init_subclass__(cls, **kwargs: Any):
+    super().__init_subclass__(**kwargs)
+    if cls.adds:
+      above = [base for base in cls.__bases__ if issubclass(base, Env)]
+      own = vars(cls)
+      cls.summaries = {k: v for base in above[::-1] for k, v in base.summaries.items()} | own.get("summaries", {})
+      info = [name for base in above for name in base.episode_info]
+      cls.episode_info = tuple(dict.fromkeys((*info, *own.get("episode_info", ()))))
 
   def __init__(self, config: Any, mj_model: mujoco.MjModel):
     """Sets the time step and puts the model on the device.

@@ -168,6 +168,7 @@ class Episode(Wrapper):
 
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
     state = self.env.reset(rng, model)
+    _lookup_own("summaries", self.env.unwrapped, state.metrics)
     zero = jnp.zeros_like(state.reward)
     sums = {"sum_reward": zero, "length": zero} | {name: zero for name in state.metrics}
     info = {"steps": zero, "truncation": zero, "episode_done": zero, "episode_metrics": sums}
@@ -237,6 +238,7 @@ class AutoReset(Wrapper):
   def reset(self, rng: jax.Array, model: ModelFields | None = None) -> State:
     keys = jax.vmap(jax.random.split)(rng)
     state = self.env.reset(keys[:, 0], model)
+    _lookup_own("episode_info", self.env.unwrapped, state.info)
     own: Info = {PREFIX + "rng": keys[:, 1], PREFIX + "done_count": jnp.zeros(state.done.shape, jnp.int32)}
     if not self.full_reset:
       own[PREFIX + "first_data"] = start_of(state)
@@ -277,6 +279,17 @@ class AutoReset(Wrapper):
     kept = {k: after.info[k] for k in (*EPISODE_KEYS, "nonfinite", "nonfinite_state", PRESERVE_INFO) if k in after.info}
     data, obs, info = where_done(after.done, (fresh.data, fresh.obs, fresh.info), (after.data, after.obs, after.info))
     return after.replace(data=data, obs=obs, info=info | kept)
+
+
+def _lookup_own(attribute: str, env: Env, known: Mapping[str, Any]) -> None:
+  """Raises UnknownNameError for a name that the task's own class adds and that does not exist.
+
+  A base class, or a class of this package, may name what only some configurations have.
+  """
+  cls = type(env)
+  for name in getattr(cls, attribute) if not cls.__module__.startswith("playground.") else ():
+    if not any(name in getattr(base, attribute, ()) for base in cls.__bases__):
+      lookup(known, name, f"{cls.__name__}.{attribute}")
 
 
 def start_of(state: State) -> dict[str, jax.Array]:

@@ -15,6 +15,7 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from playground.envs.base import Env, Observation
+from playground.errors import lookup
 from playground.hardware.mesh import AXIS
 from playground.learning.hyperparameters import AgentConfig
 from playground.learning.networks import Actor, Normalizer
@@ -125,7 +126,8 @@ def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None
   """
   check(config, "agent")
   module, _, name = config.algorithm.partition(":")
-  make: Callable[..., AnyAlgorithm] = getattr(importlib.import_module(module), name)
+  found = vars(importlib.import_module(module))
+  make: Callable[..., AnyAlgorithm] = lookup(found, name, f"{type(config).__name__}.algorithm={config.algorithm}")
   # A number that the constructor reads would be a constant, the same for all agents of the program.
   unknown = dict.fromkeys(config.traced, TracedSetting())
   algorithm = make(env, dataclasses.replace(config, **unknown), network_precision)

@@ -308,6 +308,8 @@ class Trainer:
     algorithm, envs, metrics = with_settings(self.algorithm, below("agent", state.settings)).train_step(
       state.algorithm.replace(replay=state.replay), envs, jax.random.fold_in(shared, jax.lax.axis_index(AXIS))
     )
+    if wrong := {name: jnp.shape(value) for name, value in metrics.items() if jnp.ndim(value)}:
+      raise ConfigError(f"{type(self.algorithm).__name__}.train_step: a metric is one number, not of shape {wrong}.")
     metrics = {"learned": jnp.ones(())} | metrics | jax.lax.psum(envs.sums, AXIS)
     return _train_state(algorithm, key, envs.state, envs.capture, state.settings, state.sums), metrics
 

@@ -321,9 +321,11 @@ class EventManager(_Manager):
       if not isinstance(changed, type(initial)):
         what = f"and returns {type(changed).__name__}: return initial.replace(...)"
         raise ConfigError(f"{term.key} must return the state that an episode starts with, {what}.")
+      model = env.mj_model
+      shapes = {"ctrl": (model.nu,), "mocap_pos": (model.nmocap, 3), "mocap_quat": (model.nmocap, 4)}
       for name, value in vars(initial).items():
-        old, new = jnp.shape(value), jnp.shape(vars(changed)[name])
-        if value is not None and new != old:
+        old, new = shapes.get(name, jnp.shape(value)), jnp.shape(vars(changed)[name])
+        if new != old and (value is not None or vars(changed)[name] is not None):
           raise ConfigError(f"{term.key} returns {name} of shape {list(new)}, and this task's is {list(old)}.")
       initial = changed
     return initial

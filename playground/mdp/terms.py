@@ -45,6 +45,7 @@ CONTEXTS = {
 }
 # Number of leading arguments that are not parameters: the context; key, task and initial state of reset events.
 _LEADING = {"rewards": 1, "observations": 1, "terminations": 1, "commands": 0, "events": 3}
+_ARGUMENTS = {1: "the step `c`", 3: "(key, env, initial)"}
 _METHODS = ("bind", "reset", "step")  # of the classes of commands and interval events
 
 
@@ -101,6 +102,8 @@ class Term(NamedTuple):
     except (TypeError, ValueError) as error:
       # The innermost term: `is_terminated` reads the terminations, of which another package's keeps its traceback.
       inner = vars(error).setdefault("term", self)
+      if isinstance(error, jax.errors.JAXTypeError):  # Python's `if`, float() or NumPy on values of the step
+        error.add_note(f"in {inner.key}: write jnp.where in place of `if`, and jnp in place of np and float().")
       if type(error) not in (TypeError, ValueError) or not inner.func.__module__.startswith("playground.mdp."):
         raise
       raise ConfigError(f"{self.key} does not fit this task: {first_line(error)}.") from error
@@ -225,6 +228,13 @@ def find(kind: str, name: str, key: str, others: Iterable[str] = ()) -> Callable
   builds = kind == "commands" or (kind == "events" and isinstance(found, type))
   if builds and not (isinstance(found, type) and all(hasattr(found, method) for method in _METHODS)):
     raise ConfigError(f"{key}.func={name} must be a class with the methods {', '.join(_METHODS)}.")
+  if isinstance(found, type) and not builds:
+    raise ConfigError(f"{key}.func={name} is a class: a term of env.{kind} is a function.")
+  leading = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+  taken = [argument.kind for argument in inspect.signature(found).parameters.values()]
+  many = inspect.Parameter.VAR_POSITIONAL in taken
+  if not builds and not many and sum(kind in leading for kind in taken) < _LEADING[kind]:
+    raise ConfigError(f"{key}.func={name} must take {_ARGUMENTS[_LEADING[kind]]} before its parameters.")
   return found
 
 

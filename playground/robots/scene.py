@@ -124,7 +124,8 @@ def build_scene(
     raise ConfigError(f"env.robot.mjcf={mjcf} has a geom named floor: remove it, the scene adds the ground.")
   if collision != "feet" and not _full_geoms(spec):
     feet_only = f"{Path(mjcf).stem} has collision geoms for the feet only"
-    raise ConfigError(f"env.scene.collision={collision}: {feet_only}, choose env.scene.collision=feet.")
+    remedy = "choose env.scene.collision=feet, or give more geoms the class full"
+    raise ConfigError(f"env.scene.collision={collision}: {feet_only}, {remedy}.")
   activate(spec)
   with added_to(mjcf):
     add_studio(spec)

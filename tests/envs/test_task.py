@@ -44,6 +44,7 @@ def test_wrong_results_of_its_methods(
   [
     (lambda key, env, initial: 3, r"must return the state that an episode starts with, and returns int: return"),
     (lambda key, env, initial: initial.replace(qpos=jnp.zeros(2)), r"returns qpos of shape \[2\], and this task's is"),
+    (lambda key, env, initial: initial.replace(mocap_pos=jnp.zeros(3)), r"returns mocap_pos of shape \[3\], and this"),
     (lambda key, env, initial: None, r"returns nothing: <lambda> lacks a `return`"),
   ],
 )

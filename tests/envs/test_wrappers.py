@@ -182,6 +182,42 @@ def test_a_summary_is_of_the_steps_taken_where_an_episode_begins_at_a_random_age
     np.testing.assert_allclose(state.info["episode_metrics"]["constant"], expected)
 
 
+def test_a_class_adds_to_what_its_base_classes_name() -> None:
+  class Above(Counting):
+    summaries: ClassVar[Mapping[str, str]] = {"a": "last", "b": "last"}
+    episode_info = ("a",)
+
+  class Beside(Counting):
+    episode_info = ("c",)
+
+  class Below(Above, Beside):
+    summaries: ClassVar[Mapping[str, str]] = {"b": "max"}
+    episode_info = ("b", "a")
+
+  class Apart(Below):
+    adds = False
+    episode_info = ()
+
+  assert (Below.summaries, Below.episode_info) == ({"a": "last", "b": "max"}, ("a", "c", "b"))
+  assert (Apart.summaries, Apart.episode_info) == (Below.summaries, ())
+
+
+def test_a_name_that_a_task_adds_must_exist() -> None:
+  class Summary(Counting):
+    summaries: ClassVar[Mapping[str, str]] = {"distanse": "last"}
+
+    def reset(self, rng: jax.Array, model: Any = None) -> State:
+      return super().reset(rng, model).replace(metrics={"distance": jnp.zeros(())})
+
+  class Entry(Counting):
+    episode_info = ("agee",)
+
+  for cls, message in ((Summary, "Summary.summaries: 'distanse'"), (Entry, "Entry.episode_info: 'agee'")):
+    with pytest.raises(ConfigError, match=rf"^{message} is unknown.*Did you mean"):
+      wrapped = wrappers.wrap_for_training(cls(episode_length=LENGTH))
+      jax.eval_shape(wrapped.reset, jax.random.split(jax.random.PRNGKey(0), N))
+
+
 def test_an_unknown_summary_is_one_sentence() -> None:
   class Wrong(Counting):
     summaries: ClassVar[Mapping[str, str]] = {"constant": "avg"}

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import pytest
 import yaml
@@ -307,6 +308,48 @@ def test_terms_that_an_arm_has_not(kind: str, entry: Any, message: str, arm: Arm
 def test_functions_have_the_names_under_which_they_are_registered() -> None:
   for kind in ("rewards", "observations", "terminations"):
     assert {func.__name__ for func in registered(kind).values()} == set(registered(kind))
+
+
+class Reward:
+  """A class-based term, as elsewhere."""
+
+  def __call__(self, c: Any) -> Any:
+    return c
+
+
+def no_step() -> None:
+  """Takes nothing."""
+
+
+def two_arguments(key: Any, initial: Any) -> Any:
+  """Lacks the task."""
+  return initial
+
+
+@pytest.mark.parametrize(
+  ("kind", "entry", "message"),
+  [
+    ("rewards", {"func": "Reward", "weight": 1.0}, "is a class: a term of env.rewards is a function."),
+    ("rewards", {"func": "no_step", "weight": 1.0}, "must take the step `c` before its parameters."),
+    ("events", {"func": "two_arguments", "mode": "reset"}, r"must take \(key, env, initial\) before its parameters."),
+  ],
+)
+def test_functions_of_the_wrong_form(kind: str, entry: dict[str, Any], message: str) -> None:
+  trust("tests")
+  with pytest.raises(ConfigError, match=rf"env\.{kind}\.mine\.func=tests\.mdp\.test_terms:{entry['func']} {message}"):
+    bind(kind, {"mine": entry | {"func": f"{__name__}:{entry['func']}"}})
+
+
+def test_pythons_if_on_a_value_of_the_step_names_the_term(arm: ArmContext) -> None:
+  def jumps(c: Any) -> Any:
+    return 1.0 if c.data.qpos[0] > 0 else 0.0
+
+  term = bind("rewards", {"action_rate_l2": {"weight": 1.0}})[0]._replace(func=jumps)
+  at = lambda qpos: term(ArmContext(arm.env, arm.data.replace(qpos=qpos), {}, arm.action))
+  with pytest.raises(jax.errors.TracerBoolConversionError) as error:
+    jax.eval_shape(at, arm.data.qpos)
+  note = "in env.rewards.action_rate_l2: write jnp.where in place of `if`, and jnp in place of np and float()."
+  assert error.value.__notes__[0] == note
 
 
 def test_nothing_is_registered_that_cannot_be_a_term_of_its_kind() -> None:

@@ -18,7 +18,7 @@ class Joystick(LeggedTask):
   `last_contact` in `info`. What differs from Playground 0.2.0 is in docs/differences.md.
   """
 
-  episode_info = (*LeggedTask.episode_info, "feet_air_time", "swing_peak", "last_contact")
+  episode_info = ("feet_air_time", "swing_peak", "last_contact")
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     none = jnp.zeros(len(self.robot.feet))

@@ -79,8 +79,8 @@ class ArmTask(TabletopTask):
   further metric, `rotation_error_deg`, is how far the object is turned from the goal when the episode ends.
   """
 
-  episode_info = (*TabletopTask.episode_info, "reached_box")
-  summaries: ClassVar[Mapping[str, str]] = {**TabletopTask.summaries, "rotation_error_deg": "last"}
+  episode_info = ("reached_box",)
+  summaries: ClassVar[Mapping[str, str]] = {"rotation_error_deg": "last"}
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     return super().first_info(data, key, model) | {"reached_box": jnp.zeros(())}
@@ -122,7 +122,7 @@ class ProgressTask(TabletopTask):
   """
 
   # `first_step`: no step was made since the reset.
-  episode_info = (*TabletopTask.episode_info, "first_step", "best_potential")
+  episode_info = ("first_step", "best_potential")
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     begin = {"first_step": jnp.ones((), bool), "best_potential": jnp.zeros(())}

@@ -26,7 +26,7 @@ class HandOver(ProgressTask, Bimanual):
   its own side, when the episode ends; `position_error_cm` how far the box is then.
   """
 
-  episode_info = (*ProgressTask.episode_info, "picked")
+  episode_info = ("picked",)
 
   def first_info(self, data: PhysicsData, key: jax.Array, model: mjx.Model) -> dict[str, Any]:
     return super().first_info(data, key, model) | {"picked": jnp.zeros((), bool)}

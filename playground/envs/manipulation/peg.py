@@ -22,7 +22,7 @@ class SinglePegInsertion(Bimanual):
   the socket's middle and in line with it when the episode ends, `position_error_cm` how far it is then.
   """
 
-  summaries: ClassVar[Mapping[str, str]] = {**Bimanual.summaries, "peg_end2_dist_to_line": "last"}
+  summaries: ClassVar[Mapping[str, str]] = {"peg_end2_dist_to_line": "last"}
 
   def at_goal(self, c: ArmContext) -> jax.Array:
     depth, off_line = misalignment(c)

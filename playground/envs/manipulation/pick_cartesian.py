@@ -29,7 +29,7 @@ class PickCubeCartesian(ProgressTask, ArmTask):
   cube in the hand.
   """
 
-  episode_info = (*ProgressTask.episode_info, "reached_box", "current_pos", "no_solution", "action_history")
+  episode_info = ("reached_box", "current_pos", "no_solution", "action_history")
 
   def __init__(self, config: Any):
     """Builds the scene. `config`: see `configs/env/PandaPickCubeCartesian.yaml`."""

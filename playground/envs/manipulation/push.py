@@ -41,9 +41,8 @@ class PushCube(ArmTask):
   """
 
   # `goal_reached`: the goal was reached in the last step, and the next one is yet to appear.
-  episode_info = (*ArmTask.episode_info, "action_history", "applied_act", "goal_reached", "goals_reached", "goal_steps")
+  episode_info = ("action_history", "applied_act", "goal_reached", "goals_reached", "goal_steps")
   summaries: ClassVar[Mapping[str, str]] = {
-    **ArmTask.summaries,
     "success": "max",
     "success_1": "max",
     "success_2": "max",

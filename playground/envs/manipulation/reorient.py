@@ -40,7 +40,7 @@ class Reorient(HandTask):
     "rotation_error_deg": "mean",
     "position_error_cm": "mean",
   }
-  episode_info = (*HandTask.episode_info, "goal_spin", "steps_since_success", "success_count", "stuck")
+  episode_info = ("goal_spin", "steps_since_success", "success_count", "stuck")
 
   def __init__(self, config: Any):
     """Builds the scene. `config`: see `configs/env/LeapCubeReorient.yaml`."""
