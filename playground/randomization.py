@@ -109,8 +109,11 @@ class Randomizer:
     fields: names of the `mjx.Model` fields that any term touches, in order of first use.
   """
 
-  def __init__(self, mj_model: mujoco.MjModel, events: Mapping[str, Any], mode: str = "startup"):
-    """Binds those of `env.events` of func `model_field` and this mode to a model, whose values are the nominal ones."""
+  def __init__(self, mj_model: mujoco.MjModel, events: Mapping[str, Any], mode: str = "startup", impl: str = "jax"):
+    """Binds those of `env.events` of func `model_field` and this mode to a model, whose values are the nominal ones.
+
+    Raises ConfigError for an event that does not fit the model, or whose change the physics backend `impl` ignores.
+    """
     terms = model_fields(events, mode)
     self._draws = {name: _bind(mj_model, term, f"env.events.{name}.params") for name, term in terms.items()}
     slots = (slot for draw in self._draws.values() for slot in draw.slots)
@@ -118,6 +121,9 @@ class Randomizer:
     self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
     changed: set[str] = set()  # by the events before
     for name, draw in self._draws.items():
+      if impl == "warp" and any(_is_static(mj_model, slot) for slot in draw.slots):
+        remedy = f"leave out {format_value(draw.term.target)}, or train with env.impl=jax"
+        raise ConfigError(f"env.events.{name}: MuJoCo-Warp does not move what is fixed to the world: {remedy}.")
       if draw.term.operation != "add" or draw.term.field not in changed:
         self._check_sign(f"env.events.{name}.params", draw)
       changed.add(draw.term.field)
@@ -240,6 +246,15 @@ def _check_kind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> None:
   turns = values is not None and term.field.endswith(_TURNS) and values.ndim == 2 and term.column is None
   if term.operation == "rotate" and not turns:
     raise ConfigError(f"{key}.operation='rotate' needs a whole field of directions or quaternions, not {term.field!r}.")
+
+
+def _is_static(mj_model: mujoco.MjModel, slot: _Slot) -> bool:
+  """Whether a slot places a body or geom that is fixed to the world, which MuJoCo-Warp does once, when it starts."""
+  kind, _, what = slot.field.partition("_")
+  if kind not in ("body", "geom") or what not in ("pos", "quat"):
+    return False
+  bodies = np.ravel(slot.index[0]) if kind == "body" else mj_model.geom_bodyid[np.ravel(slot.index[0])]
+  return bool(((mj_model.body_weldid[bodies] == 0) & (mj_model.body_mocapid[bodies] < 0)).any())
 
 
 def _turn(row: jax.Array, by: jax.Array) -> jax.Array:

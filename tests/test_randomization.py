@@ -208,6 +208,30 @@ def test_a_mass_is_never_negative(change: dict[str, Any], message: str, small: m
   Randomizer(small, events(heavy, term | {"operation": "add", "range": [-99, 1]}))
 
 
+STATIC = {"field": "geom_pos", "target": "floor", "operation": "add", "range": [0.0, 0.1]}
+
+
+@pytest.mark.parametrize(
+  ("change", "refused"),
+  [
+    ({}, True),
+    ({"target": "palm"}, False),
+    ({"target": "all"}, True),
+    ({"field": "body_quat", "target": "hand"}, False),
+    ({"field": "geom_friction"}, False),
+  ],
+)
+def test_warp_moves_nothing_that_is_fixed_to_the_world(
+  change: dict[str, Any], refused: bool, small: mujoco.MjModel
+) -> None:
+  Randomizer(small, events(STATIC | change), impl="jax")
+  if not refused:
+    Randomizer(small, events(STATIC | change), impl="warp")
+    return
+  with pytest.raises(ConfigError, match=r"^env\.events\.term_0: MuJoCo-Warp does not move what is fixed"):
+    Randomizer(small, events(STATIC | change), impl="warp")
+
+
 def test_nothing_to_randomise(small: mujoco.MjModel) -> None:
   randomizer = Randomizer(small, shipped("none") | events(GOOD, mode="reset") | {"gone": None})
   assert randomizer.fields == () and randomizer.sample_batch(keys(3)) == {} and values_drawn(randomizer) == []

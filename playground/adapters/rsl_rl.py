@@ -134,7 +134,7 @@ def vec_env(
   batch = AutoReset(wrap_for_evaluation(env), keep_final_obs=True)
   groups = group_entries(env, groups)
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
-  randomizer = Randomizer(env.mj_model, events) if events else None
+  randomizer = Randomizer(env.mj_model, events, impl=env.impl) if events else None
   model = jax.jit(randomizer.sample_batch)(jax.random.split(model_key, num_envs)) if randomizer else {}
   state = jax.jit(batch.reset)(jax.random.split(reset_key, num_envs), model)
   step = jax.jit(batch.step)

@@ -31,6 +31,7 @@ _SIGNS: dict[str, list[float]] = {
   "quaternion": [1.0, -1.0, 1.0, -1.0],
 }
 _AXIS_TOLERANCE, _ANCHOR_TOLERANCE = 1e-3, 5e-3  # of a unit vector; m, as drawn robots are not quite symmetric
+_RANGE_TOLERANCE = 0.06  # rad; Spot's hips differ by 0.051
 
 
 class Reflection(NamedTuple):
@@ -111,13 +112,16 @@ def joint_reflection(robot: LeggedRobot) -> Reflection:
   apart = anchors * _SIGNS["polar"] - anchors[source]
   apart -= (apart * axes[source]).sum(axis=1, keepdims=True) * axes[source]  # a hinge may lie anywhere on its axis
   apart = np.abs(apart).max(axis=1)
-  pose = np.asarray(robot.default_pose)
+  pose, ranges = np.asarray(robot.default_pose), model.jnt_range[1:]
   for i, name in enumerate(robot.joint_names):
     other = robot.joint_names[source[i]]
     if abs(cosine[i]) < 1 - _AXIS_TOLERANCE or apart[i] > _ANCHOR_TOLERANCE:
       raise ConfigError(f"env.robot.mirror: joints {name} and {other} of the model are not mirror images.")
     if abs(pose[i] - sign[i] * pose[source[i]]) > _AXIS_TOLERANCE:
       raise ConfigError(f"env.robot.mirror: the default pose of {name} is not the mirror image of {other}'s.")
+    reach = ranges[source[i]] if sign[i] > 0 else -ranges[source[i]][::-1]
+    if np.abs(ranges[i] - reach).max() > _RANGE_TOLERANCE:
+      raise ConfigError(f"env.robot.mirror: the range of {name} is not the mirror image of {other}'s.")
   return Reflection(source, sign.astype(np.float32))
 
 

@@ -24,7 +24,7 @@ from playground.mdp.managers import (
   checked,
 )
 from playground.mdp.terms import bind
-from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
+from playground.physics.backend import DERIVED_FIELDS, PhysicsData, compile_spec, mjx
 from playground.randomization import Randomizer
 from playground.text import first_line, format_value
 
@@ -72,7 +72,7 @@ class Task(Env):
     """
     self.spec = spec
     try:
-      mj_model = spec.compile()
+      mj_model = compile_spec(spec)
     except ValueError as error:  # MuJoCo's: a mesh that is missing, a name that is there twice
       remedy = "; rename it in the robot's MJCF" * ("repeated name" in str(error))
       raise ConfigError(f"MuJoCo cannot compile the task's scene: {first_line(error)}{remedy}.") from None
@@ -94,7 +94,7 @@ class Task(Env):
     if isinstance(self.robot, Robot):
       for term in (*self.terms(), *self.events.groups["reset"]):
         self.robot.check_names(term.params, f"{term.key}.params")
-    self._episode_models = Randomizer(mj_model, config.get("events"), "reset")
+    self._episode_models = Randomizer(mj_model, config.get("events"), "reset", self.impl)
     self.redraws = bool(self._episode_models.fields)
     self._reward_total: str = config.reward_total
     self._reward_clip = config.reward_clip and tuple(config.reward_clip)

@@ -102,7 +102,7 @@ class Term(NamedTuple):
     except (TypeError, ValueError) as error:
       # The innermost term: `is_terminated` reads the terminations, of which another package's keeps its traceback.
       inner = vars(error).setdefault("term", self)
-      if inner is self and isinstance(error, jax.errors.JAXTypeError):  # Python's `if`, float() or NumPy on values of the step
+      if inner is self and isinstance(error, jax.errors.JAXTypeError):  # Python's `if` or NumPy on values of the step
         error.add_note(f"in {inner.key}: write jnp.where in place of `if`, and jnp in place of np and float().")
       if type(error) not in (TypeError, ValueError) or not inner.func.__module__.startswith("playground.mdp."):
         raise

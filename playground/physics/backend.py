@@ -35,6 +35,17 @@ WORLDS = "worlds"  # the axis of the batch of environments, for `jax.vmap(axis_n
 _FEW = 64  # smaller batches get the buffers of so many environments, since their mean may be above the average
 
 
+def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
+  """Compiles a model whose fields may be drawn; raises MuJoCo's ValueError.
+
+  No body is "simple": of such a one MJX and C MuJoCo assume in each step that the centre of mass is at its origin, and
+  C MuJoCo the nominal mass, so a free body with another centre of mass spins up in free fall.
+  """
+  for body in spec.bodies:
+    body.simple = 0
+  return spec.compile()
+
+
 class BufferUse(struct.PyTreeNode):
   """The use of Warp's buffers in the last control step, the most of any of its physics steps; each shape [].
 

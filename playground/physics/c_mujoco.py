@@ -30,6 +30,8 @@ class CPhysics(Physics):
     super().__init__(other.mj_model, derived=other.derived)
     self.model = other.model
     self._c_model = copy.copy(other.mj_model)
+    for frames in (self._c_model.body_sameframe, self._c_model.geom_sameframe, self._c_model.site_sameframe):
+      frames[:] = 0  # else `mj_kinematics` takes a drawn place in the body for the body's own
     # C MuJoCo would reset an unstable simulation. Its numbers should show instead, as in MJX.
     self._c_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     self._c_data = mujoco.MjData(self._c_model)

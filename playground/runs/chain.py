@@ -109,7 +109,7 @@ def _check(config: RunConfig) -> None:
     with in_stage(name):
       env = registry.load(stage.choices["env"], config=stage.env)
       need_camera(env.mj_model, stage.video.camera, "video.camera")
-      Randomizer(env.mj_model, stage.env.events)
+      Randomizer(env.mj_model, stage.env.events, impl=env.impl)
       trainer = Trainer(env, stage.agent, hardware.mesh, hardware.network_precision)
       trainer.notices()  # raises for a replay buffer larger than device memory
       size = env.observation_size

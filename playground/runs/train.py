@@ -292,7 +292,7 @@ def model_sampler(
   Raises:
     PlaygroundError: a term that does not fit the model.
   """
-  randomizer = Randomizer(env.mj_model, config.env.events)
+  randomizer = Randomizer(env.mj_model, config.env.events, impl=env.impl)
   sample = jax.jit(randomizer.sample_batch)
 
   def draw(seed: int) -> tuple[ModelFields, ModelFields]:

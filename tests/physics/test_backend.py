@@ -1,18 +1,22 @@
 """How physics reaches a backend; what it computes is in test_golden.py."""
 
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 import pytest
+from mujoco.mjx._src.math import quat_to_mat
 
 from playground import registry
 from playground.config import compose
 from playground.errors import ConfigError
 from playground.hardware.mesh import GROUP, make_mesh
 from playground.learning.trainer import Trainer, trainer_settings
-from playground.physics.backend import WORLDS, Physics, batch_size
+from playground.physics.backend import WORLDS, Physics, batch_size, compile_spec
+from playground.physics.c_mujoco import CPhysics
 from playground.runs.train import model_sampler
 
 
@@ -60,3 +64,37 @@ def test_agents_with_other_rewards_and_models_call_warp_once() -> None:
   (call,) = re.findall(r".*custom_call @\w*func_wrapper.*", program)
   contacts = 2 * 40 * env.config.naconmax_per_env
   assert f"tensor<80x{env.mj_model.nv}xf32>" in call and f"tensor<{contacts}x3x3xf32>" in call
+
+
+BOX = """
+<mujoco>
+  <worldbody>
+    <body name="box" pos="0 0 2"><freejoint/><geom name="cube" type="box" size=".1 .1 .1" mass="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("impl", ["jax", "warp", "c"])
+@pytest.mark.parametrize(
+  "drawn",
+  [
+    {"body_ipos": [[0, 0, 0], [0.05, 0.02, 0]]},
+    {"body_mass": [0, 3], "body_ipos": [[0, 0, 0], [0, 0.03, 0]]},
+    {"body_inertia": [[0, 0, 0], [0.01, 0.02, 0.03]], "body_iquat": [[1, 0, 0, 0], [0.8, 0.6, 0, 0]]},
+  ],
+)
+def test_a_body_with_a_drawn_centre_of_mass_falls_as_newton_says(impl: str, drawn: Any) -> None:
+  """At rest and free it falls without turning; a torque about its principal axes turns it by torque / inertia."""
+  physics = Physics(compile_spec(mujoco.MjSpec.from_string(BOX)), impl="jax" if impl == "c" else impl)
+  physics = CPhysics(physics) if impl == "c" else physics
+  changed = {name: jnp.array(value, jnp.float32) for name, value in drawn.items()}
+  model: Any = physics.model.tree_replace(changed)
+  inertia, place, frame = (getattr(model, f"body_{name}")[1] for name in ("inertia", "ipos", "iquat"))
+  torque = jnp.zeros((2, 6)).at[1, 3:].set(jnp.array([0.01, 0.02, 0.03]))
+  forward = jax.jit(lambda force: physics.forward(model, physics.make(xfrc_applied=force)).qacc)
+  np.testing.assert_allclose(forward(jnp.zeros((2, 6))), [0, 0, -9.81, 0, 0, 0], atol=1e-3)
+  to_world = quat_to_mat(frame)
+  turn = to_world @ (to_world.T @ torque[1, 3:] / inertia)
+  fall = jnp.array([0, 0, -9.81]) - jnp.cross(turn, place)
+  np.testing.assert_allclose(forward(torque), jnp.concatenate([fall, turn]), atol=2e-3)

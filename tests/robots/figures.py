@@ -37,6 +37,7 @@ class Scene:
     no_excludes: pairs of bodies, excluded from contact in the reference, that have nothing which collides.
     no_keyframes: keyframes of the reference that nothing starts from.
     no_tendon_lengths: tendons that touch a pulley at a point, so that rounding adds a turn around it or not.
+    ranges: of joints, rad, that are mistakes in the reference.
     spec: builds the scene, where it is another than a robot on a terrain.
   """
 
@@ -50,6 +51,7 @@ class Scene:
   no_excludes: tuple[tuple[str, str], ...] = ()
   no_keyframes: tuple[str, ...] = ()
   no_tendon_lengths: tuple[str, ...] = ()
+  ranges: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
   spec: Callable[[], mujoco.MjSpec] | None = None
 
 

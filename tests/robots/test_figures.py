@@ -1,5 +1,6 @@
 """Every robot's scenes against the figures of the reference models: number by number, and as dynamics (C MuJoCo)."""
 
+import copy
 import functools
 from typing import Any
 
@@ -28,6 +29,7 @@ from tests.robots.figures import (
 from tests.robots.figures import robot_config as config_of
 
 BARKOUR_LEGS = ("front_left", "hind_left", "front_right", "hind_right")
+G1_RANGES = {"right_hip_roll_joint": (-2.9671, 0.5236)}  # in 0.2.0 that of the left one, not mirrored
 SCENES = {
   "go1_feetonly_flat": Scene("go1"),
   "go1_full_flat": Scene("go1", collision="full_self", no_sensors=("head_pos",)),
@@ -51,8 +53,10 @@ SCENES = {
   "h1_feetonly": Scene("h1"),
   "op3_feetonly": Scene("op3"),
   "go1_feetonly_rough": Scene("go1", terrain="white_noise"),
-  **{f"{name}_feetonly_flat": Scene(name) for name in ("berkeley_humanoid", "g1", "t1")},
-  **{f"{name}_feetonly_rough": Scene(name, terrain="white_noise") for name in ("berkeley_humanoid", "g1", "t1")},
+  **{f"{name}_feetonly_flat": Scene(name) for name in ("berkeley_humanoid", "t1")},
+  **{f"{name}_feetonly_rough": Scene(name, terrain="white_noise") for name in ("berkeley_humanoid", "t1")},
+  "g1_feetonly_flat": Scene("g1", ranges=G1_RANGES),
+  "g1_feetonly_rough": Scene("g1", terrain="white_noise", ranges=G1_RANGES),
   "apollo_feetonly_flat": Scene(
     "apollo",
     more_sensors=("l_foot_global_linvel", "r_foot_global_linvel"),
@@ -100,6 +104,11 @@ class Subject:
 
   def __init__(self, name: str):
     self.name, self.scene, self.facts = name, SCENES[name], figures(name)
+    for joint, reach in self.scene.ranges.items():
+      self.facts = copy.deepcopy(self.facts)
+      for figure in (*self.facts["joints"], *self.facts["actuators"]):
+        if joint in (figure["name"], figure.get("target")):
+          figure["ctrlrange" if "target" in figure else "range"] = reach
     self.model = build(self.scene, self.facts)
     set_gains(self.model, **self.scene.pd)
     self.reference = rebuild(self.facts, self.model.hfield_data)

@@ -17,7 +17,7 @@ from playground.mdp.context import StepContext
 from playground.mdp.managers import RewardManager, TerminationManager
 from playground.mdp.terms import registered
 from playground.mdp.tolerance import tolerance
-from playground.physics.backend import DERIVED_FIELDS, PhysicsData, mjx
+from playground.physics.backend import DERIVED_FIELDS, PhysicsData, compile_spec, mjx
 from playground.text import format_value
 
 Terms = dict[str, jax.Array]
@@ -49,7 +49,7 @@ class SuiteTask(Env):
     added = [*self.rewards.terms, *self.terminations.terms]
     if self.rewards.terms or any(not term.func.__module__.startswith("playground.") for term in added):
       self.derived = DERIVED_FIELDS  # which a term may read
-    super().__init__(config, self.scene(config).compile())
+    super().__init__(config, compile_spec(self.scene(config)))
     model = self.mj_model
     self.body = {model.body(i).name: i for i in range(model.nbody)}
     self.site = {model.site(i).name: i for i in range(model.nsite)}
