@@ -76,6 +76,15 @@ def test_a_copy_is_made_once_and_again_for_another_policy(policies: Path) -> Non
   assert sorted(path.name for path in copied.parent.iterdir()) == [".lock", TASK, f"{TASK}_old"]
 
 
+def test_a_changed_copy_is_replaced(policies: Path, capsys: pytest.CaptureFixture[str]) -> None:
+  copied = Path(working_copy(TASK, [TASK]))
+  config = copied / "config.yaml"
+  config.write_text(config.read_text().replace("seed: ", "seed: 1"))
+  assert working_copy(TASK, [TASK]) == str(copied)
+  assert config.read_bytes() == (policies / TASK / "config.yaml").read_bytes()
+  assert "or your copy, has changed" in capsys.readouterr().out
+
+
 def test_a_copy_that_is_there_is_only_read(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   """Its folder may be one that cannot be written to."""
   copied = working_copy(TASK, [TASK])

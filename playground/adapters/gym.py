@@ -150,13 +150,17 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
     entry: str | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     render_mode: None = None,
+    max_episode_steps: None = None,
   ):
     """Builds a task; see `GymEnv` for arguments and errors.
 
     Raises:
       UnknownNameError: another autoreset mode than `NextStep` and `SameStep`.
-      ConfigError: a render mode.
+      ConfigError: a render mode, or `max_episode_steps`.
     """
+    if max_episode_steps is not None:
+      remedy = f"overrides={{'episode_length': {max_episode_steps}}} counts control steps"
+      raise ConfigError(f"max_episode_steps={max_episode_steps}: a batch has the task's own limit; {remedy}.")
     if render_mode is not None:
       raise ConfigError(f"render_mode={render_mode!r}: a batch renders nothing, one environment (gymnasium.make) does.")
     modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}

@@ -137,7 +137,8 @@ def load_on_c_physics(
   own = config_dict(config)
   if not interval_events:
     switch_off_interval_events(own)
-  own.impl = "warp" if uses_vision(own) else "jax"  # the smallest model to build; it is not simulated
+  if own.impl != "warp" and not uses_vision(own):  # JAX may not implement what a task on Warp has
+    own.impl = "jax"  # the smallest model to build; it is not simulated
   env = registry.load(task, config=own)
   if model_seed is not None:
     fields = _startup(env, task).sample(jax.random.PRNGKey(model_seed))

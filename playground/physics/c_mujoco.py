@@ -27,7 +27,8 @@ class CPhysics(Physics):
 
   def __init__(self, other: Physics):
     """Simulates the model of `other`, a task's physics in MJX, and keeps its `model`, which is rendered."""
-    super().__init__(other.mj_model, derived=other.derived)
+    # Only templates of states come from MJX, on the backend that has the model: the other may not implement it.
+    super().__init__(other.mj_model, impl=other.impl, derived=other.derived, **other._buffers)
     self.model = other.model
     self._c_model = copy.copy(other.mj_model)
     for frames in (self._c_model.body_sameframe, self._c_model.geom_sameframe, self._c_model.site_sameframe):
@@ -54,6 +55,9 @@ class CPhysics(Physics):
 
   def step(self, model: mjx.Model, data: PhysicsData, ctrl: jax.Array, num_substeps: int) -> PhysicsData:
     return self._call(model, data.replace(ctrl=ctrl), num_substeps)
+
+  def _keep(self, data: mjx.Data, derived: tuple[str, ...] | None = None) -> PhysicsData:
+    return super()._keep(data, derived).replace(buffers=None)
 
   def _call(self, model: mjx.Model, data: PhysicsData, num_substeps: int) -> PhysicsData:
     state = {name: getattr(data, name) for name in STATE_FIELDS}

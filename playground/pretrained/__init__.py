@@ -48,10 +48,15 @@ def locate(name: str) -> str:
   if task not in known:
     raise UnknownNameError(f"{name}: there are pretrained policies of {', '.join(known)}.{nearest(task, known)}")
   folder = POLICIES / task
-  for file, sha256 in yaml.safe_load((folder / CARD).read_text())["sha256"].items():
-    if not (folder / file).is_file() or _sha256(folder / file) != sha256:
-      raise CheckpointError(f"{folder / file} is not the file that was trained: install the package again.")
+  if changed := _changed(folder):
+    raise CheckpointError(f"{folder / changed[0]} is not the file that was trained: install the package again.")
   return str(folder)
+
+
+def _changed(folder: Path) -> list[str]:
+  """Returns the files of a policy that are not those that its card names, or are missing."""
+  files = yaml.safe_load((folder / CARD).read_text())["sha256"]
+  return [name for name in files if not (folder / name).is_file() or _sha256(folder / name) != files[name]]
 
 
 def working_copy(name: str, tasks: Container[str]) -> str:
@@ -82,7 +87,7 @@ def working_copy(name: str, tasks: Container[str]) -> str:
           shutil.copytree(source, Path(scratch) / source.name)
           if copy.exists():  # with the user's results
             old = copy.rename(numbered(copy.with_name(f"{copy.name}_old")))
-            print(f"The policy of {source.name} has changed; your results with the old one are in {old}.")
+            print(f"The policy of {source.name}, or your copy, has changed; the old one and its results are in {old}.")
           (Path(scratch) / source.name).rename(copy)
   except OSError as error:
     raise CheckpointError(f"{copy} cannot be written: {error.strerror}.") from error
@@ -90,9 +95,9 @@ def working_copy(name: str, tasks: Container[str]) -> str:
 
 
 def _is_copy(folder: Path, source: Path) -> bool:
-  """Whether a folder is a copy of this policy; not while another process replaces it."""
+  """Whether a folder is a whole copy of this policy; not while another process replaces it."""
   try:
-    return (folder / CARD).read_bytes() == (source / CARD).read_bytes()
+    return (folder / CARD).read_bytes() == (source / CARD).read_bytes() and not _changed(folder)
   except FileNotFoundError:
     return False
 

@@ -186,6 +186,8 @@ def test_what_a_batch_does_not_do_is_refused() -> None:
     GymVectorEnv(3, "CartpoleBalance", autoreset_mode="Disabled")
   with pytest.raises(ConfigError, match="render_mode='rgb_array': a batch renders nothing"):
     gymnasium.make_vec("playground/CartpoleBalance", num_envs=3, render_mode="rgb_array")
+  with pytest.raises(ConfigError, match=r"max_episode_steps=5: a batch has the task's own limit; overrides="):
+    gymnasium.make_vec("playground/CartpoleBalance", num_envs=3, max_episode_steps=5)
 
 
 def test_a_mask_begins_some_episodes_anew() -> None:

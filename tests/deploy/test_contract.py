@@ -34,6 +34,12 @@ def contract(
   return written
 
 
+def test_the_law_of_an_action_does_not_depend_on_where_the_joints_are() -> None:
+  """At `qpos0` the Go1's knees are straight, beyond their range."""
+  law = contract("Go1Getup", 42, {"clip_targets": True})["action"]
+  assert (law["law"], law["base"]) == ("ctrl = base + scale * action", "joint_pos")
+
+
 def test_a_joystick_policy() -> None:
   overrides = {
     "clip_targets": True,
