@@ -240,7 +240,7 @@ def _action(env: Env, config: Contract, state: State) -> dict[str, object]:
   """Returns how an action becomes `ctrl`: base + scale * action, if the task's `action_to_ctrl` computes that."""
   base = config.get("action_base", "last_target" if "action_scale" in config else "zero")
   scale = np.asarray(config.get("action_scale", 1.0))
-  home = jnp.asarray(_home(env, config)[1], state.data.qpos.dtype)  # within all ranges, as an episode's start may not be
+  home = jnp.asarray(_home(env, config)[1], state.data.qpos.dtype)  # within all ranges, as a start may not be
   state = state.replace(data=state.data.replace(qpos=home))
   control = lambda action: np.asarray(env.action_to_ctrl(state, jnp.asarray(action)))
   held, size = control(np.zeros(env.action_size)), env.action_size
