@@ -39,8 +39,8 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
   """Compiles a model whose fields may be drawn; raises MuJoCo's ValueError.
 
   No free body is "simple": of such a one MJX and C MuJoCo assume in each step that the centre of mass is at its origin,
-  and C MuJoCo the nominal mass, so with another centre of mass it spins up in free fall. Bodies on slides may be simple:
-  where their centre of mass is acts on nothing, and their constraints would be a little softer.
+  and C MuJoCo the nominal mass, so with another centre of mass it spins up in free fall. Bodies on slides may be
+  simple: where their centre of mass is acts on nothing, and their constraints would be a little softer.
   """
   for body in spec.bodies:
     if any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints):
