@@ -103,7 +103,7 @@ class Term(NamedTuple):
       # The innermost term: `is_terminated` reads the terminations, of which another package's keeps its traceback.
       inner = vars(error).setdefault("term", self)
       if inner is self and isinstance(error, jax.errors.JAXTypeError):  # Python's `if` or NumPy on values of the step
-        error.add_note(f"in {inner.key}: write jnp.where in place of `if`, and jnp in place of np and float().")
+        error.add_note(f"in {self.key}: write jnp.where in place of `if`, and jnp in place of np and float().")
       if type(error) not in (TypeError, ValueError) or not inner.func.__module__.startswith("playground.mdp."):
         raise
       raise ConfigError(f"{self.key} does not fit this task: {first_line(error)}.") from error
