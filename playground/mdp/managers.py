@@ -316,13 +316,13 @@ class EventManager(_Manager):
 
     Raises ConfigError where one returns no such state, or parts of another shape.
     """
-    model = env.mj_model
-    shapes = {"ctrl": (model.nu,), "mocap_pos": (model.nmocap, 3), "mocap_quat": (model.nmocap, 4)}  # may be None
     for term, k in _with_keys(self.groups["reset"], key):
       changed = term(k, env, initial)
       if not isinstance(changed, type(initial)):
         what = f"and returns {type(changed).__name__}: return initial.replace(...)"
         raise ConfigError(f"{term.key} must return the state that an episode starts with, {what}.")
+      model = env.mj_model
+      shapes = {"ctrl": (model.nu,), "mocap_pos": (model.nmocap, 3), "mocap_quat": (model.nmocap, 4)}  # may be None
       for name, value in vars(initial).items():
         old, new = shapes.get(name, jnp.shape(value)), jnp.shape(vars(changed)[name])
         if new != old and (value is not None or vars(changed)[name] is not None):
