@@ -33,6 +33,8 @@ class CPhysics(Physics):
     self._c_model = copy.copy(other.mj_model)
     for frames in (self._c_model.body_sameframe, self._c_model.geom_sameframe, self._c_model.site_sameframe):
       frames[:] = 0  # else `mj_kinematics` takes a drawn place in the body for the body's own
+    simple = self._c_model.dof_simplenum.astype(bool)  # of these MuJoCo reads the inertia (`dof_M0`), which is nominal
+    self._slides = simple & (self._c_model.jnt_type[self._c_model.dof_jntid] == mujoco.mjtJoint.mjJNT_SLIDE)
     # C MuJoCo would reset an unstable simulation. Its numbers should show instead, as in MJX.
     self._c_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     self._c_data = mujoco.MjData(self._c_model)
@@ -83,12 +85,17 @@ class CPhysics(Physics):
           setattr(self._c_data, name, value[i].reshape(np.shape(getattr(self._c_data, name))))
         for name, value in drawn.items():
           getattr(self._c_model, name)[:] = value[i]
+        self._c_model.dof_M0[self._slides] = self._inertia_of_slides()
         if num_substeps:
           mujoco.mj_step(self._c_model, self._c_data, num_substeps)
         else:
           mujoco.mj_forward(self._c_model, self._c_data)
         for name, values in out.items():
           values[i] = np.reshape(getattr(self._c_data, name), self._shapes[name].shape)
-      for name in drawn:
+      for name in (*drawn, "dof_M0"):
         getattr(self._c_model, name)[:] = getattr(self.mj_model, name)
     return out
+
+  def _inertia_of_slides(self) -> np.ndarray:
+    """Returns the kg of each slide that moves one body alone, with its armature."""
+    return (self._c_model.body_mass[self._c_model.dof_bodyid] + self._c_model.dof_armature)[self._slides]

@@ -110,3 +110,15 @@ def test_c_mujoco_simulates_what_jax_does_not_implement() -> None:
   assert jax.tree.structure(start) == jax.tree.structure(physics.make())
   after = jax.jit(lambda data: jax.lax.scan(step, data, None, 100)[0])(start)
   np.testing.assert_allclose(after.qpos[2], 0.2, atol=5e-3)  # it stands on the box
+
+
+def test_a_drawn_body_on_a_slide_is_as_heavy_in_c_mujoco() -> None:
+  ball = '<body><joint name="z" type="slide" axis="0 0 1" armature="0.5"/><geom size=".1" mass="1"/></body>'
+  motor = '<actuator><motor joint="z"/></actuator>'
+  spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{ball}</worldbody>{motor}</mujoco>")
+  physics = CPhysics(Physics(compile_spec(spec), impl="jax"))
+  for mass, armature in ((3.0, 0.5), (1.0, 0.5), (1.0, 2.0)):
+    model = physics.model.replace(body_mass=jnp.array([0, mass]), dof_armature=jnp.array([armature]))
+    qacc = physics.forward(model, physics.make(ctrl=jnp.array([2.0]))).qacc
+    np.testing.assert_allclose(qacc, [(2 - 9.81 * mass) / (mass + armature)], rtol=1e-6)
+  np.testing.assert_allclose(physics.forward(physics.model, physics.make()).qacc, [-9.81 / 1.5], rtol=1e-6)
