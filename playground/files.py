@@ -7,6 +7,7 @@ may have written.
 import csv
 import errno
 import fcntl
+import io
 import itertools
 import json
 import os
@@ -15,7 +16,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -170,6 +171,16 @@ def read_csv(path: Path) -> list[dict[str, str]]:
   """Returns the rows of a CSV by column."""
   with path.open(encoding="utf-8", newline="") as file:
     return list(csv.DictReader(file))
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, object]], header: bool = False) -> str:
+  """Returns lines of CSV: a missing cell is empty, cells of other columns are left out."""
+  text = io.StringIO()
+  writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
+  if header:
+    writer.writeheader()
+  writer.writerows(rows)
+  return text.getvalue()
 
 
 def numbered(path: Path) -> Path:

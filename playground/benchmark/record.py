@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from playground.benchmark.schema import commit_of
 from playground.catalog import entries
 from playground.errors import ConfigError
 from playground.extras import need
-from playground.files import is_locked, lock_holder, locking, need_folder, read_csv, write_text
+from playground.files import csv_text, is_locked, lock_holder, locking, need_folder, read_csv, write_text
 from playground.learning.checkpoints import find_checkpoints, find_stages
 from playground.limits import count
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN, read_table
@@ -237,6 +236,5 @@ def _header(path: Path) -> list[str]:
 
 def _append(path: Path, rows: Sequence[Row]) -> None:
   """Adds rows to a CSV atomically, in its columns, without touching the rows that it has."""
-  text, lines = path.read_bytes().decode("utf-8"), io.StringIO()
-  csv.DictWriter(lines, _header(path), restval="", extrasaction="ignore", lineterminator="\n").writerows(rows)
-  write_text(path, text + "\n" * (not text.endswith("\n")) + lines.getvalue())
+  text = path.read_bytes().decode("utf-8")
+  write_text(path, text + "\n" * (not text.endswith("\n")) + csv_text(_header(path), rows))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from playground.errors import ConfigError
+from playground.files import csv_text
 
 COLUMNS = {
   "benchmark": "the command, such as throughput, together, startup, topology, chain, compare, learning or golden",
@@ -85,11 +86,9 @@ class Table:
     if row["quantity"] not in QUANTITIES:
       raise KeyError(f"{row['quantity']} is not in QUANTITIES")
     full = {name: "" if row.get(name) is None else str(row[name]) for name in COLUMNS}
-    line = io.StringIO()
-    csv.DictWriter(line, list(COLUMNS), lineterminator="\n").writerow(full)
     with self._to_itself() as file:
       _end_last_row(file)
-      file.write(line.getvalue().encode())
+      file.write(csv_text(list(COLUMNS), [full]).encode())
     self._rows.append(full)
 
   def has(self, wanted: Mapping[str, object]) -> bool:

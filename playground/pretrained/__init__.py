@@ -5,7 +5,6 @@ checkpoint's policy, and `card.yaml`: how it was trained, what it reaches, and t
 pretrained` lists them, `playground export` writes the ONNX file of one, and `add` makes one from a run.
 """
 
-import csv
 import hashlib
 import json
 import re
@@ -18,7 +17,7 @@ import yaml
 
 from playground.envs.options import MEANING
 from playground.errors import CheckpointError, UnknownNameError, nearest
-from playground.files import locking, numbered, read_csv
+from playground.files import csv_text, locking, numbered, read_csv, write_text
 from playground.settings import Plain, Section
 
 PREFIX = "pretrained:"
@@ -172,10 +171,7 @@ def _keep_evaluations(metrics: Path) -> None:
   """Removes the rows of a metrics.csv between the evaluations, and the columns that are empty then."""
   rows = [row for row in read_csv(metrics) if row.get("eval/episode_reward")]
   columns = [name for name in rows[0] if any(row[name] for row in rows)]
-  with metrics.open("w", encoding="utf-8", newline="") as file:
-    writer = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
+  write_text(metrics, csv_text(columns, rows, header=True))
 
 
 def add(run: Path, task: str, entries: Section) -> Path:

@@ -24,7 +24,7 @@ from playground.learning.trainer import Trainer
 from playground.randomization import Randomizer
 from playground.rendering.video import need_camera
 from playground.runs.csv_tracker import STAGE, read_metrics
-from playground.runs.interrupts import Interrupts, exit_code
+from playground.runs.interrupts import Interrupts
 from playground.runs.plots import plot_learning_curve
 from playground.runs.progress import format_return
 from playground.runs.provenance import process_age_s
@@ -92,7 +92,7 @@ def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) 
   finished = is_main() and chain.summary["status"] == "finished"
   if is_main():
     _say_where(chain)
-  return 0 if interrupts.signum is None or finished else exit_code(interrupts.signum)
+  return interrupts.exit_code(finished)
 
 
 def _check(config: RunConfig) -> None:

@@ -1,13 +1,12 @@
 """Writes and reads metrics.csv: one row for each call of `log`, complete on disk when `log` returns."""
 
 import csv
-import io
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
-from playground.files import keep_copy, write_text
+from playground.files import csv_text, keep_copy, write_text
 
 if TYPE_CHECKING:
   import pandas as pd
@@ -76,7 +75,7 @@ class CsvTracker:
       self._file = self._path.open("a", encoding="utf-8", newline="")
     # float() first: NumPy scalars print as 'np.float32(0.1)' or at lower precision.
     row = {"step": str(int(step))} | {name: repr(float(value)) for name, value in metrics.items()}
-    self._file.write(self._text([row]))
+    self._file.write(csv_text(self._columns, [row]))
     self._file.flush()
 
   def truncate_after(self, step: int) -> int:
@@ -97,12 +96,7 @@ class CsvTracker:
 
   def _rewrite(self, rows: list[dict[str, str]]) -> None:
     self.close()
-    write_text(self._path, self._text([dict(zip(self._columns, self._columns, strict=True)), *rows]))
-
-  def _text(self, rows: list[dict[str, str]]) -> str:
-    buffer = io.StringIO()
-    csv.DictWriter(buffer, self._columns, restval="", lineterminator="\n").writerows(rows)
-    return buffer.getvalue()
+    write_text(self._path, csv_text(self._columns, rows, header=True))
 
 
 def read_metrics(path: Path) -> "pd.DataFrame":
@@ -142,7 +136,7 @@ def read_table(path: Path, known: Sequence[str] = ()) -> Table:
   if headless:
     names, lines, damage = [], [header, *lines], "its header is missing"
   columns = _unique([*(known or ["step"]), *names[max(len(known), 1) :]])
-  if not headless and header != _joined(columns):
+  if not headless and f"{header}\n" != csv_text(columns, [], header=True):
     damage = "its header has changed"
   rows = []
   for line in lines:
@@ -174,12 +168,6 @@ def _split(line: str) -> list[str]:
     return next(csv.reader([line]), [""]) or [""]
   except csv.Error:
     return [line]
-
-
-def _joined(cells: Sequence[str]) -> str:
-  buffer = io.StringIO()
-  csv.writer(buffer, lineterminator="").writerow(cells)
-  return buffer.getvalue()
 
 
 def _unique(names: Sequence[str]) -> list[str]:

@@ -74,6 +74,10 @@ class Interrupts:
     """Ends saving; a flag that is set stays set."""
     self.saving = False
 
+  def exit_code(self, completed: bool) -> int:
+    """Returns 0, or the signal's exit code if there was one before the work was completed."""
+    return 0 if self.signum is None or completed else exit_code(self.signum)
+
   def _handle(self, signum: int, frame: FrameType | None) -> None:
     again, self.signum = self.signum is not None, signum
     if not self.saving or again:

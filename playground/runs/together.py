@@ -180,7 +180,7 @@ def _train_group(
     )
   if any(member.error for member in members):
     return 2
-  return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+  return interrupts.exit_code(completed)
 
 
 @contextlib.contextmanager

@@ -1,8 +1,6 @@
 """Reads a profiler trace: a table of operations by self time."""
 
-import csv
 import gzip
-import io
 import json
 import re
 from collections import defaultdict
@@ -10,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from playground.files import write_text
+from playground.files import csv_text, write_text
 from playground.settings import Plain
 
 Event = dict[str, Plain]
@@ -36,11 +34,8 @@ def write_top_ops(folder: Path) -> list[Op]:
   """
   traces = sorted(folder.rglob("*.trace.json.gz"), key=lambda path: path.stat().st_mtime)
   ops = top_ops(traces[-1]) if traces else []
-  buffer = io.StringIO()
-  writer = csv.writer(buffer, lineterminator="\n")
-  writer.writerow(("op", "calls", "self_s", "share"))
-  writer.writerows((op.name, op.calls, f"{op.self_s:.6f}", f"{op.share:.4f}") for op in ops)
-  write_text(folder / "top_ops.csv", buffer.getvalue())
+  rows = ({"op": op.name, "calls": op.calls, "self_s": f"{op.self_s:.6f}", "share": f"{op.share:.4f}"} for op in ops)
+  write_text(folder / "top_ops.csv", csv_text(("op", "calls", "self_s", "share"), rows, header=True))
   return ops
 
 

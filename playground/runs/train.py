@@ -208,7 +208,7 @@ def _train_locked(
       callbacks = NonMainCallbacks(config, training.env, interrupts, plan.step)
       loop = Loop(training.trainer, program, training.events, [config.seed], [callbacks])
       _, completed = training.run(loop, [plan], interrupts)
-    return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+    return interrupts.exit_code(completed)
   with (
     open_run(config, plan) as run_dir,
     run_dir.recorded(),
@@ -237,7 +237,7 @@ def _train_locked(
       callbacks.end_training()
       callbacks.finish(loop, training.trainer.policy(state), completed)
   say_where(run_dir)
-  return 0 if interrupts.signum is None or completed else exit_code(interrupts.signum)
+  return interrupts.exit_code(completed)
 
 
 @contextlib.contextmanager
