@@ -12,9 +12,9 @@ events:
 
 Those of mode `startup` are drawn once an environment and become model fields with a batch axis; those of mode `reset`
 are drawn in each episode (`playground.envs.task`), on top of the environment's own model. They apply in order, each to
-the result of those before. Lights, cameras, colours and materials are fields like any others (docs/vision.md). Derived
-quantities (`body_subtreemass`, `dof_invweight0`, `body_invweight0`, `dof_M0`) keep their nominal values, as in
-Playground 0.2.0.
+the result of those before. Lights, cameras, colours and materials are fields like any others (docs/vision.md). What
+sensors and contacts need follows: `body_subtreemass` from masses, `geom_rbound` and `geom_aabb` from sizes. Other
+derived fields (`dof_invweight0`, `body_invweight0`, `dof_M0`) keep their nominal values, as in Playground 0.2.0.
 """
 
 import dataclasses
@@ -49,7 +49,25 @@ _LINKED: dict[str, tuple[tuple[str, int | None, float], ...]] = {
 _SCALED_ONLY = ("body_density",)
 _NOT_NEGATIVE = ("body_mass", "body_inertia", "geom_friction", "pair_friction", "dof_damping", "dof_armature")
 _NOT_NEGATIVE += ("dof_frictionloss",)
+# Fields that act only on rows for which the model has another field on.
+_SWITCHES = {
+  "jnt_range": "jnt_limited",
+  "jnt_actfrcrange": "jnt_actfrclimited",
+  "actuator_actrange": "actuator_actlimited",
+}
+_SWITCHES |= {"actuator_ctrlrange": "actuator_ctrllimited", "actuator_forcerange": "actuator_forcelimited"}
+_SWITCHES |= {"tendon_range": "tendon_limited", "tendon_actfrcrange": "tendon_actfrclimited"}
+_DERIVED = {"body_mass": ("body_subtreemass",), "geom_size": ("geom_rbound", "geom_aabb")}
 _TURNS = ("quat", "_axis", "_dir", "_pos")  # ends of the names of fields of directions, quaternions and places
+
+_GEOM = mujoco.mjtGeom
+_PRIMITIVES = (
+  _GEOM.mjGEOM_SPHERE,
+  _GEOM.mjGEOM_CAPSULE,
+  _GEOM.mjGEOM_ELLIPSOID,
+  _GEOM.mjGEOM_CYLINDER,
+  _GEOM.mjGEOM_BOX,
+)
 
 _OPERATIONS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
   "set": lambda nominal, draw: jnp.broadcast_to(draw, nominal.shape),
@@ -106,7 +124,7 @@ class Randomizer:
   """Draws model fields for environments.
 
   Attributes:
-    fields: names of the `mjx.Model` fields that any term touches, in order of first use.
+    fields: names of the `mjx.Model` fields that any term touches, in order of first use, then of those that follow.
   """
 
   def __init__(self, mj_model: mujoco.MjModel, events: Mapping[str, Any], mode: str = "startup", impl: str = "jax"):
@@ -116,14 +134,19 @@ class Randomizer:
     """
     terms = model_fields(events, mode)
     self._draws = {name: _bind(mj_model, term, f"env.events.{name}.params") for name, term in terms.items()}
-    slots = (slot for draw in self._draws.values() for slot in draw.slots)
-    self.fields: tuple[str, ...] = tuple(dict.fromkeys(slot.field for slot in slots))
+    touched = list(dict.fromkeys(slot.field for draw in self._draws.values() for slot in draw.slots))
+    derived = (name for field in touched for name in _DERIVED.get(field, ()))
+    self.fields: tuple[str, ...] = tuple(dict.fromkeys([*touched, *derived]))
     self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
+    if impl == "warp" and "geom_aabb" in self._nominal:
+      self._nominal["geom_aabb"] = self._nominal["geom_aabb"].reshape(-1, 2, 3)
+    self._carried = _carried(mj_model)
+    self._geom_types = np.array(mj_model.geom_type)
     changed: set[str] = set()  # by the events before
     for name, draw in self._draws.items():
-      if impl == "warp" and any(_is_static(mj_model, slot) for slot in draw.slots):
-        remedy = f"leave out {format_value(draw.term.target)}, or train with env.impl=jax"
-        raise ConfigError(f"env.events.{name}: MuJoCo-Warp does not move what is fixed to the world: {remedy}.")
+      for slot in draw.slots:
+        if reason := _acts_not(mj_model, draw.term, slot, impl):
+          raise ConfigError(f"env.events.{name}: {reason}.")
       if draw.term.operation != "add" or draw.term.field not in changed:
         self._check_sign(f"env.events.{name}.params", draw)
       changed.add(draw.term.field)
@@ -141,6 +164,10 @@ class Randomizer:
       for field, index, sign in draw.slots:
         new = sign * operation(sign * values[field][index], drawn)
         values[field] = values[field].at[index].set(new.astype(values[field].dtype))
+    if "body_mass" in values:
+      values["body_subtreemass"] = (self._carried * values["body_mass"]).sum(-1)
+    if "geom_size" in values:
+      values |= _bounds(self._geom_types, values["geom_size"], values["geom_rbound"], values["geom_aabb"])
     return values
 
   def sample_batch(self, keys: jax.Array) -> dict[str, jax.Array]:
@@ -187,14 +214,14 @@ def model_fields(events: Mapping[str, Any] | None, mode: str = "startup") -> dic
 
 
 def domain_randomizer(
-  mj_model: mujoco.MjModel, events: Mapping[str, Any]
+  mj_model: mujoco.MjModel, events: Mapping[str, Any], impl: str = "jax"
 ) -> Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]:
   """Returns Playground 0.2.0's kind of randomizer, for Brax's wrappers.
 
   The callable maps `(mjx_model, rng[N])` to `(model, in_axes)`: the model with a leading axis N on every randomised
   field, and the same structure with 0 at those fields and None elsewhere, for `jax.vmap`.
   """
-  randomizer = Randomizer(mj_model, events)
+  randomizer = Randomizer(mj_model, events, impl=impl)
 
   def randomize(mjx_model: mjx.Model, rng: jax.Array) -> tuple[mjx.Model, mjx.Model]:
     in_axes: Any = jax.tree.map(lambda _: None, mjx_model)
@@ -248,6 +275,26 @@ def _check_kind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> None:
     raise ConfigError(f"{key}.operation='rotate' needs a whole field of directions or quaternions, not {term.field!r}.")
 
 
+def _acts_not(mj_model: mujoco.MjModel, term: ModelField, slot: _Slot, impl: str) -> str:
+  """Returns why the simulator would ignore a change, and the remedy; '' where it acts."""
+  field, rows = slot.field, np.ravel(slot.index[0])
+  others, named = f"train with env.impl={'jax' if impl == 'warp' else 'warp'}", format_value(term.target)
+  if (switch := _SWITCHES.get(field)) and not getattr(mj_model, switch)[rows].any():
+    return f"{field} acts on nothing, since {switch} is off in the model: give {named} a range in the MJCF"
+  if field == "body_gravcomp" and not mj_model.ngravcomp:
+    return "body_gravcomp acts on nothing, since the model has none: give a body some in the MJCF"
+  if field == "geom_size" and not np.isin(mj_model.geom_type[rows], _PRIMITIVES).all():
+    return "geom_size acts on spheres, capsules, cylinders, ellipsoids and boxes alone: name those in params.target"
+  if field in ("body_pos", "body_quat") and 0 in rows:
+    return f"{field} would move the world: name the bodies in params.target"
+  from_0 = field in ("dof_frictionloss", "tendon_frictionloss") and term.operation != "scale"
+  if from_0 and impl == "jax" and (getattr(mj_model, field)[rows] == 0).any():
+    return f"MJX on JAX leaves out friction that is 0 in the model: give {named} some in the MJCF, or {others}"
+  if impl == "warp" and _is_static(mj_model, slot):
+    return f"MuJoCo-Warp does not move what is fixed to the world: leave out {named}, or {others}"
+  return ""
+
+
 def _is_static(mj_model: mujoco.MjModel, slot: _Slot) -> bool:
   """Whether a slot places a body or geom that is fixed to the world, which MuJoCo-Warp does once, when it starts."""
   kind, _, what = slot.field.partition("_")
@@ -255,6 +302,30 @@ def _is_static(mj_model: mujoco.MjModel, slot: _Slot) -> bool:
     return False
   bodies = np.ravel(slot.index[0]) if kind == "body" else mj_model.geom_bodyid[np.ravel(slot.index[0])]
   return bool(((mj_model.body_weldid[bodies] == 0) & (mj_model.body_mocapid[bodies] < 0)).any())
+
+
+def _carried(mj_model: mujoco.MjModel) -> np.ndarray:
+  """Returns which bodies each body carries, itself included, [nbody, nbody] of 0 and 1."""
+  carried = np.eye(mj_model.nbody, dtype=np.float32)
+  for body in range(mj_model.nbody - 1, 0, -1):
+    carried[mj_model.body_parentid[body]] += carried[body]
+  return carried
+
+
+def _bounds(types: np.ndarray, size: jax.Array, rbound: jax.Array, aabb: jax.Array) -> dict[str, jax.Array]:
+  """Returns the spheres and boxes about geoms of these sizes, [ngeom, 3]; those of planes and meshes stay."""
+  sphere, capsule, ellipsoid, cylinder, box = (types == kind for kind in _PRIMITIVES)
+  x, second, third = size.T
+  y = jnp.where(ellipsoid | box, second, x)
+  z = jnp.where(sphere, x, jnp.where(capsule, x + second, jnp.where(cylinder, second, third)))
+  half = jnp.stack([x, y, z], -1)
+  radius = jnp.where(box, jnp.linalg.norm(half, axis=-1), jnp.where(cylinder, jnp.hypot(x, z), half.max(-1)))
+  primitive = np.isin(types, _PRIMITIVES)
+  boxes = jnp.concatenate([jnp.zeros_like(half), half], -1).reshape(aabb.shape)
+  return {
+    "geom_rbound": jnp.where(primitive, radius, rbound),
+    "geom_aabb": jnp.where(primitive.reshape(-1, *[1] * (aabb.ndim - 1)), boxes, aabb),
+  }
 
 
 def _turn(row: jax.Array, by: jax.Array) -> jax.Array:

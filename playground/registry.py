@@ -177,7 +177,8 @@ def get_domain_randomizer(name: str) -> DomainRandomizer | None:
 
   @functools.cache
   def randomizer() -> "Callable[[mjx.Model, jax.Array], tuple[mjx.Model, mjx.Model]]":
-    return domain_randomizer(load(name).mj_model, events)
+    env = load(name)
+    return domain_randomizer(env.mj_model, events, env.unwrapped.impl)
 
   return lambda mjx_model, rng: randomizer()(mjx_model, rng)
 

@@ -67,7 +67,7 @@ def keys(count: int, seed: int = 0) -> jax.Array:
 
 def test_go1_changes_only_what_it_names_within_range(go1: mujoco.MjModel) -> None:
   randomizer = Randomizer(go1, GO1)
-  fields = {"geom_friction", "dof_frictionloss", "dof_armature", "body_ipos", "body_mass", "qpos0"}
+  fields = {"geom_friction", "dof_frictionloss", "dof_armature", "body_ipos", "body_mass", "qpos0", "body_subtreemass"}
   batch = {k: np.array(v) for k, v in jax.jit(randomizer.sample_batch)(keys(64)).items()}
   assert set(batch) == set(randomizer.fields) == fields
   nominal = {k: getattr(go1, k) for k in fields}
@@ -232,6 +232,52 @@ def test_warp_moves_nothing_that_is_fixed_to_the_world(
     Randomizer(small, events(STATIC | change), impl="warp")
 
 
+@pytest.mark.parametrize(
+  ("change", "impls", "message"),
+  [
+    ({"field": "jnt_range", "target": "wrist"}, ("jax", "warp"), "jnt_range acts on nothing, since jnt_limited is off"),
+    ({"field": "actuator_forcerange", "target": "all"}, ("jax", "warp"), "since actuator_forcelimited is off"),
+    ({"field": "body_gravcomp", "target": "hand"}, ("jax", "warp"), "body_gravcomp acts on nothing"),
+    ({"field": "geom_size", "target": "all"}, ("jax", "warp"), "geom_size acts on spheres, capsules, "),
+    ({"field": "body_pos", "target": "all"}, ("jax", "warp"), "body_pos would move the world"),
+    ({"field": "dof_frictionloss", "target": "joints"}, ("jax",), "MJX on JAX leaves out friction that is 0"),
+    ({"field": "dof_frictionloss", "target": "joints", "operation": "scale"}, (), ""),
+  ],
+)
+def test_what_the_simulator_ignores_is_refused(
+  change: dict[str, Any], impls: tuple[str, ...], message: str, small: mujoco.MjModel
+) -> None:
+  section = events({"operation": "add", "range": [0.0, 0.1]} | change)
+  for impl in ("jax", "warp"):
+    if impl in impls:
+      with pytest.raises(ConfigError, match=rf"^env\.events\.term_0: .*{re.escape(message)}"):
+        Randomizer(small, section, impl=impl)
+    else:
+      Randomizer(small, section, impl=impl)
+
+
+KINDS = {"sphere": ".1", "capsule": ".1 .2", "ellipsoid": ".1 .2 .3", "cylinder": ".1 .3", "box": ".1 .2 .3"}
+
+
+@pytest.mark.parametrize("impl", ["jax", "warp"])
+def test_what_sensors_and_contacts_read_follows_masses_and_sizes(impl: str) -> None:
+  geoms = "".join(f'<body><geom name="{kind}" type="{kind}" size="{size}"/></body>' for kind, size in KINDS.items())
+  mjcf = f'<mujoco><worldbody><geom type="plane" size="1 1 1"/><body><freejoint/>{geoms}</body></worldbody></mujoco>'
+  larger = mujoco.MjSpec.from_string(mjcf)
+  for geom in larger.geoms[1:]:
+    geom.size, geom.density = 2 * geom.size, 1000 / 8  # of the same masses
+  compiled, nominal = larger.compile(), mujoco.MjModel.from_xml_string(mjcf)
+  twice = {"operation": "scale", "range": [2, 2]}
+  section = events(
+    {"field": "geom_size", "target": list(KINDS), **twice}, {"field": "body_mass", "target": "all", **twice}
+  )
+  drawn = Randomizer(nominal, section, impl=impl).sample(jax.random.PRNGKey(0))
+  np.testing.assert_allclose(drawn["geom_rbound"], compiled.geom_rbound, rtol=1e-6)
+  np.testing.assert_allclose(np.reshape(drawn["geom_aabb"], compiled.geom_aabb.shape), compiled.geom_aabb, rtol=1e-6)
+  np.testing.assert_allclose(drawn["body_subtreemass"], 2 * compiled.body_subtreemass, rtol=1e-6)
+  assert drawn["geom_aabb"].shape == mjx.put_model(nominal, impl=impl).geom_aabb.shape
+
+
 def test_nothing_to_randomise(small: mujoco.MjModel) -> None:
   randomizer = Randomizer(small, shipped("none") | events(GOOD, mode="reset") | {"gone": None})
   assert randomizer.fields == () and randomizer.sample_batch(keys(3)) == {} and values_drawn(randomizer) == []
@@ -332,7 +378,7 @@ def test_distributions(small: mujoco.MjModel) -> None:
   target=st.sampled_from(["all", "base", "hand"]), seed=st.integers(0, 2**31 - 1),
 )  # fmt: skip
 def test_ranges_hold(low: float, width: float, operation: str, target: str, seed: int) -> None:
-  model = mujoco.MjModel.from_xml_string(SMALL)
+  model = mujoco.MjModel.from_xml_string(SMALL.replace('"base"', '"base" gravcomp="1"'))
   model.body_gravcomp[:] = model.body_mass  # a field that may be negative
   term = {"field": "body_gravcomp", "target": target, "operation": operation, "range": [low, low + width]}
   sample = np.asarray(Randomizer(model, events(term)).sample(jax.random.PRNGKey(seed))["body_gravcomp"])

@@ -159,11 +159,11 @@ def draw_models(env: Env, task: str, number: int, seed: int) -> dict[str, jax.Ar
 def set_fields(mj_model: mujoco.MjModel, fields: Mapping[str, jax.Array]) -> None:
   """Changes fields of a model in place."""
   for name, value in fields.items():
-    getattr(mj_model, name)[:] = np.asarray(value)
+    getattr(mj_model, name)[:] = np.reshape(value, np.shape(getattr(mj_model, name)))
 
 
 def _startup(env: Env, task: str) -> Randomizer:
-  randomizer = Randomizer(env.mj_model, env.config.get("events"))
+  randomizer = Randomizer(env.mj_model, env.config.get("events"), impl=env.impl)
   if not randomizer.fields:
     raise ConfigError(f"--randomize: {task} has no events of mode startup here, which draw the model.")
   return randomizer

@@ -35,8 +35,9 @@ class CPhysics(Physics):
       frames[:] = 0  # else `mj_kinematics` takes a drawn place in the body for the body's own
     simple = self._c_model.dof_simplenum.astype(bool)  # of these MuJoCo reads the inertia (`dof_M0`), which is nominal
     self._slides = simple & (self._c_model.jnt_type[self._c_model.dof_jntid] == mujoco.mjtJoint.mjJNT_SLIDE)
-    # C MuJoCo would reset an unstable simulation. Its numbers should show instead, as in MJX.
-    self._c_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    # C MuJoCo would reset an unstable simulation. Its numbers should show instead, as in MJX. And it would look for the
+    # contacts of a body with several geoms where the nominal geoms are.
+    self._c_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     self._c_data = mujoco.MjData(self._c_model)
     self._lock = threading.Lock()  # programs may run at the same time
     example = self._keep(self._template())
@@ -84,7 +85,7 @@ class CPhysics(Physics):
         for name, value in state.items():
           setattr(self._c_data, name, value[i].reshape(np.shape(getattr(self._c_data, name))))
         for name, value in drawn.items():
-          getattr(self._c_model, name)[:] = value[i]
+          getattr(self._c_model, name)[:] = value[i].reshape(np.shape(getattr(self._c_model, name)))
         self._c_model.dof_M0[self._slides] = self._inertia_of_slides()
         if num_substeps:
           mujoco.mj_step(self._c_model, self._c_data, num_substeps)

@@ -41,7 +41,7 @@ def save_views(env: Env, events: Mapping[str, object], path: str | Path, count: 
     have = ", ".join(camera_names(env.mj_model)) or "none"
     raise ConfigError(f"The task has no images: add env.vision.enable=true env.vision.camera=<name>, of {have}.")
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))
-  model = Randomizer(env.mj_model, events).sample_batch(jax.random.split(model_key, count))
+  model = Randomizer(env.mj_model, events, impl=env.impl).sample_batch(jax.random.split(model_key, count))
   state = jax.jit(Vectorize(env).reset)(jax.random.split(reset_key, count), model)
   page = sheet(np.asarray(newest_image(env, state.obs)))
   path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,6 +17,7 @@ from playground.hardware.mesh import GROUP, make_mesh
 from playground.learning.trainer import Trainer, trainer_settings
 from playground.physics.backend import WORLDS, Physics, batch_size, compile_spec
 from playground.physics.c_mujoco import CPhysics
+from playground.randomization import Randomizer
 from playground.runs.train import model_sampler
 
 
@@ -110,6 +111,40 @@ def test_c_mujoco_simulates_what_jax_does_not_implement() -> None:
   assert jax.tree.structure(start) == jax.tree.structure(physics.make())
   after = jax.jit(lambda data: jax.lax.scan(step, data, None, 100)[0])(start)
   np.testing.assert_allclose(after.qpos[2], 0.2, atol=5e-3)  # it stands on the box
+
+
+HAMMER = """
+<mujoco>
+  <worldbody>
+    <geom type="box" size="1 1 .1" pos="0 0 -.1"/>
+    <body name="hammer" pos="0 0 {height}"><freejoint/><inertial pos="0 0 0" mass="{mass}" diaginertia=".01 .01 .01"/>
+      <geom name="left" type="box" size="{size}" pos="-.3 0 0"/>
+      <geom name="right" type="box" size="{size}" pos=".3 0 0"/>
+    </body>
+  </worldbody>
+  <sensor><subtreelinvel body="hammer"/></sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("impl", ["jax", "warp", "c"])
+def test_drawn_sizes_and_masses_are_those_of_contacts_and_sensors(impl: str) -> None:
+  nominal = compile_spec(mujoco.MjSpec.from_string(HAMMER.format(size=".05 .05 .05", mass=1, height=0.18)))
+  scaled = lambda field, target, by: {"field": field, "target": target, "operation": "scale", "range": [by, by]}
+  drawn = [scaled("geom_size", ["left", "right"], 4), scaled("body_mass", "all", 2)]
+  section = {f"{i}": {"mode": "startup", "func": "model_field", "params": params} for i, params in enumerate(drawn)}
+  physics = Physics(nominal, impl="jax" if impl == "c" else impl, njmax=80, naconmax_per_env=20)
+  physics = CPhysics(physics) if impl == "c" else physics
+  model: Any = physics.model.tree_replace(Randomizer(nominal, section, impl=physics.impl).sample(jax.random.PRNGKey(0)))
+  velocity = jnp.zeros(nominal.nv).at[0].set(1.0)
+  ours = jax.jit(lambda: physics.forward(model, physics.make(qvel=velocity)))()
+  truth = mujoco.MjModel.from_xml_string(HAMMER.format(size=".2 .2 .2", mass=2, height=0.18))
+  theirs = mujoco.MjData(truth)
+  theirs.qvel[:] = velocity
+  mujoco.mj_forward(truth, theirs)
+  assert theirs.qacc[2] > 0  # the larger hammer touches the ground
+  np.testing.assert_allclose(ours.sensordata, [1, 0, 0], atol=1e-6)
+  np.testing.assert_allclose(ours.qacc[2], theirs.qacc[2], rtol=0.1)  # constraints keep their nominal softness
 
 
 def test_a_drawn_body_on_a_slide_is_as_heavy_in_c_mujoco() -> None:
