@@ -32,6 +32,7 @@ from playground.pytree import PyTree
 ACTIVATIONS: dict[ActivationName, Activation] = {name: getattr(linen, name) for name in get_args(ActivationName)}
 
 MIN_STD = 1e-3  # of actions before squashing
+MAX_TERMS = 2**21  # in the sums of observation statistics
 
 Normalizer = running_statistics.RunningStatisticsState
 ObservationSize = int | Mapping[str, tuple[int, ...]]
@@ -50,11 +51,22 @@ class Count:
 
 
 def update_normalizer(normalizer: Normalizer, obs: Mapping[str, jax.Array]) -> Normalizer:
-  """Adds observations, [..., D] each, of all devices to the statistics, by Brax's Welford algorithm."""
+  """Adds observations, [..., D] each, of all devices to the statistics, by Brax's Welford algorithm.
+
+  In float32 a sum of 2**24 equal terms no longer grows. So after `MAX_TERMS` updates count and sum are halved, and from
+  then on older observations count less.
+  """
+  if not obs:
+    return normalizer
   count: Any = normalizer.count
   counted = normalizer.replace(count=UInt64(count.hi, count.lo))  # pyright: ignore[reportCallIssue]
   updated: Any = running_statistics.update(counted, obs, pmap_axis_name=AXIS)
-  return updated.replace(count=Count(updated.count.hi, updated.count.lo))
+  hi, lo = updated.count.hi, updated.count.lo
+  samples = jax.tree.leaves(obs)[0].size // jax.tree.leaves(updated.mean)[0].size * jax.lax.axis_size(AXIS)
+  full = hi * 2.0**32 + lo >= samples * float(MAX_TERMS)
+  kept = jax.tree.map(lambda total: jnp.where(full, total / 2, total), updated.summed_variance)
+  half = Count(jnp.where(full, hi >> 1, hi), jnp.where(full, lo >> 1 | hi << 31, lo))
+  return updated.replace(count=half, summed_variance=kept)
 
 
 class Actor:

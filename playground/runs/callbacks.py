@@ -31,6 +31,8 @@ from playground.runs.run_dir import RunDirectory
 from playground.runs.top_ops import format_ops, write_top_ops
 from playground.runs.trackers import make_trackers
 
+MAX_WAITING = 3  # videos, each with its recording in memory
+
 
 class NonfiniteError(PlaygroundError):
   """Too many environment steps were NaN, infinite or too large: the run stops."""
@@ -62,7 +64,7 @@ class RunCallbacks:
     self._trackers = make_trackers(config.resolved, run_dir, continued, progress.print, plan.columns)
     self._store = CheckpointStore(run_dir.checkpoints, config.checkpoint.keep, continued)
     self._videos = ThreadPoolExecutor(1, thread_name_prefix="video")
-    self._video: Future[Path | None] | None = None
+    self._rendering: list[Future[Path | None]] = []  # the oldest is under way
     self._filmed: int | None = None  # step of the newest video
     self._earlier_s = plan.wall_clock_s
     self._began = time.perf_counter()
@@ -133,16 +135,19 @@ class RunCallbacks:
     if not wanted or self._filmed == self._step:
       return
     if self._recording is not None:
-      self._start_video(self._step, self._recording)
+      self._start_video(self._step, self._recording, at_end=True)
     elif not self._video_at(self._step).exists():  # killed after the last evaluation, resumed without one
       command = f"`playground play {self._run_dir.path} --video <file>.mp4`"
       self._progress.print(f"No video of the last evaluation: {command} films an episode.")
 
   def finish(self, loop: Loop, policy: Policy, completed: bool) -> None:
     """Waits for the video, and writes the run's result with the last policy; call `end_training` first."""
-    if self._video:
+    for video in self._rendering:
       self._progress.phase("rendering the video")
-      self._video.result()
+      if self.should_stop():
+        self._videos.shutdown(wait=False, cancel_futures=True)
+      if not video.cancelled():
+        video.result()
     plot_learning_curve(self._run_dir.metrics_csv, self._run_dir.plots)
     self.close("finished" if completed else "preempted")
     if self._rejected:
@@ -214,20 +219,29 @@ class RunCallbacks:
   def _video_at(self, step: int) -> Path:
     return self._run_dir.videos / f"step_{step:012d}.mp4"
 
-  def _start_video(self, step: int, recording: Recording) -> None:
-    """Renders the first recorded episodes in a child process while training continues."""
+  def _start_video(self, step: int, recording: Recording, at_end: bool = False) -> None:
+    """Renders the first recorded episodes in a child process while training continues.
+
+    Where rendering takes longer than the time between evaluations, it leaves out videos, but not the one `at_end`.
+    """
     view = self._config.video
+    self._rendering = [video for video in self._rendering if not video.done()]
+    if len(self._rendering) > MAX_WAITING and not at_end:
+      self._progress.print(f"No video after {step:,} steps: {MAX_WAITING} others wait to be rendered.")
+      return
     self._filmed = step
-    self._video = self._videos.submit(
-      render_video,
-      self._drawn,
-      out_path=self._video_at(step),
-      dt=self._env.dt * self._env.action_repeat,
-      camera=view.camera,
-      width=view.width,
-      height=view.height,
-      notify=self._progress.print,
-      **episodes_of(recording, view.episodes),
+    self._rendering.append(
+      self._videos.submit(
+        render_video,
+        self._drawn,
+        out_path=self._video_at(step),
+        dt=self._env.dt * self._env.action_repeat,
+        camera=view.camera,
+        width=view.width,
+        height=view.height,
+        notify=self._progress.print,
+        **episodes_of(recording, view.episodes),
+      )
     )
 
   def _advance_trace(self, metrics: Metrics) -> None:

@@ -14,7 +14,7 @@ from playground.errors import ConfigError
 from playground.hardware.mesh import AXIS
 from playground.learning.algorithm import build_algorithm
 from playground.learning.hyperparameters import PPOConfig
-from playground.learning.networks import ActorCritic, NetworkConfig, update_normalizer
+from playground.learning.networks import MAX_TERMS, ActorCritic, NetworkConfig, update_normalizer
 from playground.settings import build
 from tests.dummy import Point
 
@@ -95,7 +95,7 @@ def test_python_and_the_command_line_refuse_the_same_values(config: dict[str, An
     compose(["env=CartpoleBalance", "agent=ppo", *(f"agent.{key}={format_value(x)}" for key, x in config.items())])
 
 
-def test_statistics_are_of_all_observations_on_all_devices_and_count_beyond_32_bits() -> None:
+def test_statistics_are_of_all_observations_on_all_devices_and_of_any_number() -> None:
   """Two devices and two updates; a tree with fetched statistics stays on the host."""
   obs = np.random.default_rng(0).normal(3.0, 2.0, (2, 2, 50, 4)).astype(np.float32)  # update, device, environment, D
   normalizer: Any = ActorCritic({"state": (4,)}, 2, NetworkConfig((8,), (8,))).init_normalizer()
@@ -110,4 +110,23 @@ def test_statistics_are_of_all_observations_on_all_devices_and_count_beyond_32_b
   assert (int(normalizer.count.hi), int(normalizer.count.lo)) == (0, 200)
   full = normalizer.replace(count=normalizer.count.replace(lo=np.uint32(2**32 - 1)))
   count = update(obs[0], full).count
-  assert (int(count.hi), int(count.lo)) == (1, 99)
+  assert (int(count.hi), int(count.lo)) == (0, (2**32 + 99) // 2)
+
+
+def test_the_spread_of_observations_stays_after_very_many_updates() -> None:
+  """In float32, 2**24 or more equal terms make a sum that the next one does not change."""
+  normalizer: Any = ActorCritic({"state": (1,)}, 2, NetworkConfig((8,), (8,))).init_normalizer()
+  many = 3 * MAX_TERMS // 4
+  normalizer = normalizer.replace(
+    count=normalizer.count.replace(lo=jnp.uint32(many)), summed_variance={"state": jnp.full(1, float(many))}
+  )
+
+  def update(state: Any, key: jax.Array) -> tuple[Any, None]:
+    each = jax.random.rademacher(key, (1, 1, 1), jnp.float32)  # of variance 1
+    return jax.vmap(lambda obs: update_normalizer(state, {"state": obs}), out_axes=None, axis_name=AXIS)(each), None
+
+  rounds = jax.jit(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, MAX_TERMS))[0])
+  for i in range(2):
+    normalizer = rounds(normalizer, jax.random.PRNGKey(i))
+    assert int(normalizer.count.lo) < MAX_TERMS and int(normalizer.count.hi) == 0
+    np.testing.assert_allclose(normalizer.std["state"], 1.0, atol=0.01)

@@ -135,7 +135,8 @@ def test_drawn_sizes_and_masses_are_those_of_contacts_and_sensors(impl: str) -> 
   section = {f"{i}": {"mode": "startup", "func": "model_field", "params": params} for i, params in enumerate(drawn)}
   physics = Physics(nominal, impl="jax" if impl == "c" else impl, njmax=80, naconmax_per_env=20)
   physics = CPhysics(physics) if impl == "c" else physics
-  model: Any = physics.model.tree_replace(Randomizer(nominal, section, impl=physics.impl).sample(jax.random.PRNGKey(0)))
+  fields: Any = Randomizer(nominal, section, impl=physics.impl).sample(jax.random.PRNGKey(0))
+  model: Any = physics.model.tree_replace(fields)
   velocity = jnp.zeros(nominal.nv).at[0].set(1.0)
   ours = jax.jit(lambda: physics.forward(model, physics.make(qvel=velocity)))()
   truth = mujoco.MjModel.from_xml_string(HAMMER.format(size=".2 .2 .2", mass=2, height=0.18))

@@ -30,6 +30,7 @@ from playground.learning import checkpoints
 from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoints
 from playground.learning.loop import Loop, schedule
 from playground.runs import train as train_module
+from playground.runs.callbacks import MAX_WAITING, RunCallbacks
 from playground.runs.restore_plan import RestorePlan, networks_of
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import cut_short, open_run, say_where, train
@@ -452,6 +453,37 @@ def test_a_run_that_trains_longer_ends_as_one_of_that_budget(tmp_path: Path, mon
   steps = [pd.read_csv(run.metrics_csv)["step"].to_numpy()[-1] for run in (one, other)]
   assert steps == [1600, 1600] and one.status["status"] == one.summary["status"] == "finished"
   assert filmed == [run.videos / "step_000000001600.mp4" for run in (other, one)], "the third evaluation"
+
+
+@pytest.mark.parametrize("signalled", [False, True])
+def test_videos_that_take_longer_than_training_are_left_out(
+  signalled: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  trained, filmed = threading.Event(), []
+
+  def render(*_: object, out_path: Path, **__: object) -> None:
+    assert trained.wait(60)
+    time.sleep(0.3)
+    filmed.append(out_path.name)
+
+  def end(*args: Any) -> None:
+    if signalled:
+      os.kill(os.getpid(), signal.SIGTERM)
+    trained.set()
+    finish(*args)
+
+  finish = RunCallbacks.finish
+  monkeypatch.setattr("playground.runs.callbacks.render_video", render)
+  monkeypatch.setattr(RunCallbacks, "finish", end)
+  budget = [f"agent.num_timesteps={9 * BATCH}", "agent.num_evals=10", "video.enable=true", "video.every_evals=1"]
+  assert train(compose([*TASK, *budget, f"run_dir={tmp_path}"])) == 0
+  assert RunDirectory(tmp_path).status["status"] == "finished"
+  left_out = capsys.readouterr().out.count(f"{MAX_WAITING} others wait to be rendered.")
+  if signalled:
+    assert 1 <= len(filmed) <= 2, "the one under way, and the next if that just ended"
+  else:
+    assert len(filmed) == 1 + MAX_WAITING + 1 and left_out == 10 - (1 + MAX_WAITING)
+    assert filmed[-1] == f"step_{9 * BATCH:012d}.mp4"
 
 
 def test_of_two_starts_in_one_folder_the_second_changes_nothing(tmp_path: Path) -> None:
