@@ -233,8 +233,12 @@ def read_json(path: Path, **kinds: type | tuple[type, ...]) -> dict[str, Plain]:
   return content
 
 
-def check_aliases(path: Path) -> None:
-  """Raises YAMLError if the aliases of a file stand for so many values that reading them might take for ever."""
+def check_aliases(path: Path) -> yaml.Node | None:
+  """Returns a YAML file's node.
+
+  Raises:
+    yaml.YAMLError: it is no YAML, or its aliases stand for so many values that reading them might take for ever.
+  """
   sizes: dict[int, int] = {}  # values that a node stands for
 
   def size(node: yaml.Node) -> int:
@@ -248,9 +252,10 @@ def check_aliases(path: Path) -> None:
     node = yaml.compose(file, yaml.SafeLoader)
   if node is not None and size(node) > len(sizes) + _MOST_ALIASED:
     raise yaml.YAMLError(f"its aliases stand for more than {_MOST_ALIASED:,} values")
+  return node
 
 
 def read_yaml(path: Path) -> Plain:
   """Reads a YAML file that another user may have written; raises as `check_aliases` does, OSError and ValueError."""
-  check_aliases(path)
-  return yaml.safe_load(path.read_text(encoding="utf-8"))
+  node = check_aliases(path)
+  return None if node is None else yaml.SafeLoader("").construct_document(node)

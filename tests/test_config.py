@@ -23,7 +23,7 @@ from playground.config.files import experiment_name
 from playground.config.run_options import ProfileConfig, TrackingConfig, VideoConfig, WandbConfig
 from playground.errors import ConfigError, UnknownNameError
 from playground.hardware.options import DistributedConfig
-from playground.learning.hyperparameters import config_class
+from playground.learning.hyperparameters import MOST_EVALS, config_class
 from playground.mdp.options import is_model_field
 from playground.settings import plain
 from tests.aliases import LAUGHS
@@ -704,6 +704,7 @@ def test_a_resumed_run_may_train_longer_with_evaluations_as_far_apart(run: Path)
   assert after.num_timesteps == 3 * before.num_timesteps
   assert after.num_evals - 1 == 3 * (before.num_evals - 1)
   assert dataclasses.replace(after, num_timesteps=before.num_timesteps, num_evals=before.num_evals) == before
+  assert compose([f"resume={run}", f"agent.num_timesteps={10**12}"]).agent.num_evals == MOST_EVALS
 
 
 @pytest.mark.parametrize(

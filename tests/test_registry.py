@@ -129,6 +129,8 @@ def test_a_changed_task_is_not_pickled():
     ("CartpoleBalance", {"episode_lenth": 1}, r"env\.episode_lenth does not exist.*'env\.episode_length'"),
     ("Go1JoystickFlatTerrain", {"rewards.joint_powr_l1.weight": 1}, "Did you mean 'joint_power_l1'"),
     ("CartpoleBalance", {"ctrl_dt": "slow"}, r"env\.ctrl_dt=slow .* must be a number"),
+    ("CartpoleBalance", {"ctrl_dt": 0.015}, r"env\.ctrl_dt=0\.015 must be a whole multiple of env\.sim_dt=0\.01\."),
+    ("CartpoleBalance", {"action_repeat": 9, "episode_length": 8}, r"env\.action_repeat=9 is longer than an episode: "),
     ("CartpoleBalance", {"vision.brightness": {}}, r"^env\.vision\.brightness=\{\}: Cannot merge"),
     ("CartpoleBalance", {"episode_length": 0}, r"env\.episode_length=0 must be a whole number from 1"),
   ],

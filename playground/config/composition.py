@@ -67,7 +67,7 @@ from playground.config.sweep_options import GridConfig, SlurmConfig, SweepSettin
 from playground.envs.options import TermsConfig
 from playground.errors import ConfigError, PlaygroundError, nearest
 from playground.hardware.options import HardwareConfig
-from playground.learning.hyperparameters import config_class
+from playground.learning.hyperparameters import MOST_EVALS, config_class
 from playground.mdp.options import is_model_field
 from playground.pretrained import locate
 from playground.settings import Plain, Section, build, defaults, nodes, select
@@ -495,12 +495,12 @@ def _compose_resumed(run: Path, parsed: Sequence[Override], roots: Sequence[Path
 
 
 def _trained_longer(agent: Section, longer: Override, run: Path) -> dict[str, Plain]:
-  """Returns an agent's section with a larger budget and so many more evaluations that they stay as far apart."""
+  """Returns an agent's section with a larger budget and, up to the limit, evaluations as far apart as before."""
   new = _apply(_literal({"agent": agent}), [longer], {"agent": agent})["agent"]
   before, steps = agent["num_timesteps"], new["num_timesteps"]
   if steps < before:
     raise ConfigError(f"{longer.text}: {run} trains {before:,} steps, and can only train longer.")
-  return {**new, "num_evals": 1 + round((agent["num_evals"] - 1) * steps / before)}
+  return {**new, "num_evals": min(MOST_EVALS, 1 + round((agent["num_evals"] - 1) * steps / before))}
 
 
 def _check_resumable(run: Path, parsed: Iterable[Override]) -> None:

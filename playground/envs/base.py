@@ -101,6 +101,9 @@ class Env(abc.ABC):
       raise ConfigError(f"env.ctrl_dt={self.dt} must be a whole multiple of env.sim_dt={self.sim_dt}.")
     self.episode_length: int = config.episode_length
     self.action_repeat: int = config.action_repeat
+    if self.action_repeat > self.episode_length:
+      longer = f"env.action_repeat={self.action_repeat} is longer than an episode"
+      raise ConfigError(f"{longer}: env.episode_length={self.episode_length}.")
     mj_model.opt.timestep = self.sim_dt
     self.mj_model = mj_model
     self.impl = choose_impl(config.impl, config.cuda_impl, uses_vision(config))

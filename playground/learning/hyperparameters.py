@@ -20,6 +20,7 @@ from playground.settings import build
 ENTRY_POINTS = "playground.agents"
 ELSEWHERE = {"rsl_rl_ppo": " RSL-RL trains through its own runner: docs/rsl-rl.md."}  # agents of earlier versions
 SCHEDULE = ("num_timesteps", "num_evals", "num_resets_per_eval")
+MOST_EVALS = 10_000
 _MOST = 2**31 - 1  # transitions on a device: they are drawn by int32
 
 # Settings of several classes.
@@ -55,7 +56,7 @@ class AgentConfig:
   num_timesteps: Annotated[
     int, count(1, 1e12), "environment steps in all, action repeats counted, to within one batch"
   ] = 50_000_000
-  num_evals: Annotated[int, count(1, 10_000), "evaluations, those before and after training included"] = 10
+  num_evals: Annotated[int, count(1, MOST_EVALS), "evaluations, those before and after training included"] = 10
   num_resets_per_eval: Annotated[
     int, count(0, 1000), "resets of all environments between two evaluations; 0 is never"
   ] = 0
