@@ -142,14 +142,14 @@ class Randomizer:
       self._nominal["geom_aabb"] = self._nominal["geom_aabb"].reshape(-1, 2, 3)
     self._carried = _carried(mj_model)
     self._geom_types = np.array(mj_model.geom_type)
-    changed: set[str] = set()  # by the events before
+    spans = {field: [self._nominal[field]] * 2 for field in touched}  # least and greatest values so far
     for name, draw in self._draws.items():
       for slot in draw.slots:
         if reason := _acts_not(mj_model, draw.term, slot, impl):
           raise ConfigError(f"env.events.{name}: {reason}.")
-      if draw.term.operation != "add" or draw.term.field not in changed:
-        self._check_sign(f"env.events.{name}.params", draw)
-      changed.add(draw.term.field)
+      for slot in draw.slots:
+        if slot.field in _NOT_NEGATIVE:
+          spans[slot.field] = _span_after(spans[slot.field], draw.term, slot, f"env.events.{name}.params")
 
   def sample(self, key: jax.Array, model: mjx.Model | None = None) -> dict[str, jax.Array]:
     """Draws one environment's fields, each whole and in its model shape. Pure: jit and vmap freely.
@@ -173,16 +173,6 @@ class Randomizer:
   def sample_batch(self, keys: jax.Array) -> dict[str, jax.Array]:
     """Draws N environments' fields from keys [N]: each field gets a leading axis N."""
     return jax.vmap(self.sample)(keys)
-
-  def _check_sign(self, key: str, draw: _Draw) -> None:
-    """Raises ConfigError where a range takes nominal values of a quantity like a mass below 0."""
-    term, change = draw.term, _OPERATIONS[draw.term.operation]
-    for slot in (slot for slot in draw.slots if slot.field in _NOT_NEGATIVE):
-      nominal = jnp.asarray(self._nominal[slot.field][slot.index])
-      lowest = min((float(change(nominal, jnp.asarray(end)).min()) for end in term.range or ()), default=0.0)
-      if lowest < 0:
-        shown = f"{key}.range={format_value(term.range)}"
-        raise ConfigError(f"{shown}: {term.operation} gives {term.field} {lowest:g}, but it is never negative.")
 
   def without_nominal(self) -> list[str]:
     """Returns a sentence for each term that sets values in a range in which the nominal ones are not."""
@@ -273,6 +263,23 @@ def _check_kind(mj_model: mujoco.MjModel, term: ModelField, key: str) -> None:
   turns = values is not None and term.field.endswith(_TURNS) and values.ndim == 2 and term.column is None
   if term.operation == "rotate" and not turns:
     raise ConfigError(f"{key}.operation='rotate' needs a whole field of directions or quaternions, not {term.field!r}.")
+
+
+def _span_after(span: list[np.ndarray], term: ModelField, slot: _Slot, key: str) -> list[np.ndarray]:
+  """Returns the least and greatest values of a field after a term, of a normal draw those of its mean.
+
+  Raises:
+    ConfigError: a quantity like a mass can be below 0.
+  """
+  name, ends = ("range", term.range) if term.range else ("mean", (term.mean,))
+  change = _OPERATIONS[term.operation]
+  results = [np.asarray(change(jnp.asarray(bound[slot.index]), jnp.asarray(end))) for bound in span for end in ends]
+  if (lowest := min(float(result.min()) for result in results)) < 0:
+    shown = f"{key}.{name}={format_value(getattr(term, name))}"
+    raise ConfigError(f"{shown}: {term.operation} gives {term.field} {lowest:g}, but it is never negative.")
+  after = [bound.copy() for bound in span]
+  after[0][slot.index], after[1][slot.index] = np.min(results, 0), np.max(results, 0)
+  return after
 
 
 def _acts_not(mj_model: mujoco.MjModel, term: ModelField, slot: _Slot, impl: str) -> str:

@@ -204,8 +204,13 @@ def test_a_mass_is_never_negative(change: dict[str, Any], message: str, small: m
   term = {"field": "body_mass", "target": "hand"}
   with pytest.raises(ConfigError, match=re.escape(message)):
     Randomizer(small, events(term | change))
-  heavy = term | {"operation": "set", "range": [100, 100]}
+  heavy = term | {"operation": "set", "range": [100, 200]}
   Randomizer(small, events(heavy, term | {"operation": "add", "range": [-99, 1]}))
+  with pytest.raises(ConfigError, match=re.escape("term_1.params.range=[-101.0, 1.0]: add gives body_mass -1")):
+    Randomizer(small, events(heavy, term | {"operation": "add", "range": [-101, 1]}))
+  with pytest.raises(ConfigError, match=re.escape("term_1.params.mean=-101.0: add gives body_mass -1")):
+    normal = {"operation": "add", "distribution": "normal", "mean": -101.0, "std": 1.0}
+    Randomizer(small, events(heavy, term | normal))
 
 
 STATIC = {"field": "geom_pos", "target": "floor", "operation": "add", "range": [0.0, 0.1]}

@@ -248,6 +248,8 @@ class Trainer:
       data[:held] = checkpoint.restore("replay", jax.ShapeDtypeStruct((held, *shape[1:]), dtype))
       return Replay(data, replay.inserted), whole  # pyright: ignore[reportArgumentType]  # on the host
     refill = f"{self.config.prefill_updates * self.config.num_envs:,} transitions are collected before it learns on"
+    if checkpoint.step + self.config.prefill_updates * self.steps_per_update >= self.config.num_timesteps:
+      refill += ", and no steps are left then: it learns nothing more"
     empty = Replay(data, np.zeros_like(replay.inserted))  # pyright: ignore[reportArgumentType]
     return empty, f"the training state without its replay buffer ({refill})"
 

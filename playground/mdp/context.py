@@ -30,7 +30,10 @@ class Robot:
     default_pose: positions of those joints in `init_qpos`, rad, shape [joints].
     joint_range: (lower, upper) limits of those joints, rad, shape [2, joints].
     joint_groups: regular expressions of joint names, by the name of a group.
+    ground_peak: height of the highest ground where robots start, m.
   """
+
+  ground_peak = 0.0
 
   def __init__(self, mj_model: mujoco.MjModel, joints: Sequence[str], sensors: Mapping[str, Any] | None = None):
     """Looks up names; `sensors` maps a name that terms read to a sensor of the model, or to several in a row.

@@ -85,14 +85,14 @@ def reset_cube_pose(
 def reset_fallen(
   key: jax.Array, env: "Task", initial: "InitialState", probability: Share, height: AtLeast0
 ) -> "InitialState":
-  """Drops the robot, with this probability: from a height (m), in any orientation, at any joint angles."""
+  """Drops the robot, with this probability: from a height over the ground, m, turned anyhow, at any joint angles."""
   need_free_root(env)
   drop_key, turn_key, joints_key = jax.random.split(key, 3)
   quat = jax.random.normal(turn_key, (4,))
   quat = quat / (jnp.linalg.norm(quat) + 1e-6)
   lower, upper = env.robot.joint_range
   joints = jax.random.uniform(joints_key, lower.shape, minval=lower, maxval=upper)
-  fallen = jnp.concatenate([jnp.array([0.0, 0.0, height]), quat, joints])
+  fallen = jnp.concatenate([initial.qpos[:2], jnp.array([env.robot.ground_peak + height]), quat, joints])
   return initial.replace(qpos=jnp.where(jax.random.bernoulli(drop_key, probability), fallen, initial.qpos))
 
 

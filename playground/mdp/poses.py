@@ -44,7 +44,7 @@ def two_rows(quat: jax.Array) -> jax.Array:
 
 
 def sensed_pose(key: jax.Array, pose: Pose, config: Any, level: float) -> Pose:
-  """Returns a tracker's reading of a pose (paper, Appendix C.4); `level` is a factor on all noise.
+  """Returns a tracker's reading of a pose (paper, Appendix C.4); `level` is a factor on all three.
 
   `config` has `pos` (m, uniform in +- on each axis), `angle` (rad, largest turn, about a random axis) and `injection`:
   with this probability the reading has nothing to do with the pose: within +- 0.5 m, in any orientation.
@@ -52,6 +52,6 @@ def sensed_pose(key: jax.Array, pose: Pose, config: Any, level: float) -> Pose:
   pos_key, quat_key, wrong_key, wrong_pos_key, wrong_quat_key = jax.random.split(key, 5)
   offset = jax.random.uniform(pos_key, (3,), minval=-1.0, maxval=1.0)
   pos, quat = pose[0] + level * config.pos * offset, turn_at_random(quat_key, pose[1], level * config.angle)
-  wrong = level * jax.random.bernoulli(wrong_key, config.injection)
+  wrong = jax.random.bernoulli(wrong_key, jnp.minimum(level * config.injection, 1.0))
   wrong_pos = jax.random.uniform(wrong_pos_key, (3,), minval=-_INJECTED_REACH, maxval=_INJECTED_REACH)
-  return pos * (1 - wrong) + wrong_pos * wrong, quat * (1 - wrong) + uniform_quat(wrong_quat_key) * wrong
+  return jnp.where(wrong, wrong_pos, pos), jnp.where(wrong, uniform_quat(wrong_quat_key), quat)

@@ -98,6 +98,14 @@ def _add_height_field(spec: mujoco.MjSpec, heights: np.ndarray) -> float:
   return float(heights[_distance() <= START].max())
 
 
+def ground_peak(mj_model: mujoco.MjModel) -> float:
+  """Returns what the terrain's function has returned: the highest ground where robots start, m."""
+  if not mj_model.nhfield:
+    return 0.0
+  heights = mj_model.hfield_data.reshape(POINTS, POINTS) * mj_model.hfield_size[0, 2]
+  return float(heights[_distance() <= START].max() + mj_model.geom("floor").pos[2])
+
+
 def _distance() -> np.ndarray:
   """Distance of every point from the middle, m, the greater of its two coordinates."""
   axis = np.abs(np.linspace(-HALF_EXTENT, HALF_EXTENT, POINTS))

@@ -27,7 +27,7 @@ def env(dt: float = 0.02) -> Any:
   """A robot with a free root and two joints, and the cube of a hand."""
   robot = SimpleNamespace(
     qpos=slice(7, None), joint_range=jnp.array([LOWER, UPPER]), root=1, mass=lambda model: jnp.array(MASS),
-    keyframe=lambda name: {"crouch": KEYFRAME}[name], cube=1, cube_qpos=slice(0, 7),
+    keyframe=lambda name: {"crouch": KEYFRAME}[name], cube=1, cube_qpos=slice(0, 7), ground_peak=0.25,
   )  # fmt: skip
   return SimpleNamespace(dt=dt, robot=robot, mj_model=SimpleNamespace(njnt=3, jnt_type=[mujoco.mjtJoint.mjJNT_FREE]))
 
@@ -85,11 +85,11 @@ def test_joints_are_spread_within_their_limits(name: str, params: Any) -> None:
 
 def test_some_robots_fall_turned_anyhow_with_any_joint_angles() -> None:
   qpos, _ = starts("reset_fallen", probability=0.6, height=0.5)
-  fallen = qpos[:, 2] == 0.5
+  fallen = qpos[:, 2] == 0.25 + 0.5  # above the ground
   assert abs(fallen.mean() - 0.6) < 0.05
   assert changed(qpos[~fallen]) == []
   dropped = qpos[fallen]
-  assert not dropped[:, :2].any()
+  assert (dropped[:, :2] == START.qpos[:2]).all()
   np.testing.assert_allclose(np.linalg.norm(dropped[:, 3:7], axis=1), 1, rtol=1e-4)
   up = 1 - 2 * (dropped[:, 4] ** 2 + dropped[:, 5] ** 2)  # uniform in [-1, 1] for uniform rotations
   assert abs(up.mean()) < 0.07 and up.min() < -0.9 and up.max() > 0.9

@@ -85,3 +85,6 @@ def test_some_poses_are_plainly_wrong() -> None:
   assert angle[~wrong].max() <= 0.1 + 1e-3
   assert angle[wrong].mean() > 1.8
   assert np.abs(pos + POSE[0])[wrong].max() <= 0.5
+  pos, angle = errors(level=0.5, injection=0.3)
+  wrong = np.abs(pos).max(axis=1) > 0.01 + 1e-6
+  assert abs(wrong.mean() - 0.15) < 0.04 and angle[wrong].mean() > 1.8 and angle[~wrong].max() <= 0.05 + 1e-3

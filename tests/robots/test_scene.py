@@ -8,6 +8,7 @@ import pytest
 
 from playground.errors import ConfigError, UnknownNameError
 from playground.robots.scene import COLLISIONS, build_scene, find_mjcf
+from playground.robots.terrain import add_terrain, ground_peak
 
 LEG_GEOMS = ("hip", "thigh1", "thigh2", "thigh3", "calf1", "calf2")
 
@@ -155,6 +156,13 @@ def test_a_model_without_a_body(tmp_path: Path) -> None:
   (tmp_path / "empty.xml").write_text("<mujoco/>")
   with pytest.raises(ConfigError, match=r"empty\.xml has no body: the robot must be the first body of its <worldbody>"):
     build_scene(str(tmp_path / "empty.xml"))
+
+
+@pytest.mark.parametrize("terrain", ["flat", "rough", "slope"])
+def test_a_model_tells_how_high_the_ground_is_where_robots_start(terrain: str) -> None:
+  peak = ground_peak(build_scene("go1", terrain=terrain).compile())
+  np.testing.assert_allclose(peak, add_terrain(mujoco.MjSpec(), terrain, {}), atol=1e-6)
+  assert (peak > 0) == (terrain == "rough")
 
 
 def test_a_robot_may_have_a_ground_material_of_its_own(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from playground.mdp.context import StepContext
 from playground.mdp.legged import LeggedContext, LeggedRobot
 from playground.physics.backend import PhysicsData, mjx
 from playground.robots.scene import build_scene, check_keys, set_gains
+from playground.robots.terrain import ground_peak
 
 # The base of an action: the joints' default pose, their position, or their target in the step before.
 _ACTION_BASES: dict[str, Callable[[LeggedRobot, PhysicsData], jax.Array]] = {
@@ -71,7 +72,9 @@ class LeggedTask(Task):
       _need_servos(mj_model, config.robot.mjcf)
 
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> LeggedRobot:
-    return LeggedRobot(mj_model, config.robot)
+    robot = LeggedRobot(mj_model, config.robot)
+    robot.ground_peak = ground_peak(mj_model)
+    return robot
 
   def rest_ctrl(self, initial: InitialState) -> jax.Array:
     return initial.qpos[7:]
