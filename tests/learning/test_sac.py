@@ -217,6 +217,9 @@ def test_without_the_buffer_it_is_filled_again(tmp_path: Path) -> None:
   template = trainer.template(MODEL)
   state, said = trainer.restore(Checkpoint(older), template)
   assert "without its replay buffer (64 transitions are collected before it learns on)" in said
+  ends_before = point_trainer(dataclasses.replace(SMALL_SAC, num_timesteps=70))
+  nothing = "before it learns on, and no steps are left then: it learns nothing more) of"
+  assert nothing in ends_before.restore(Checkpoint(older), template)[1]
   before, state = numbers(state.algorithm.params), trainer.place(state)
   state, _ = trainer.train(state, MODEL, np.int32(PREFILL))
   for a, b in zip(before, numbers(state.algorithm.params), strict=True):
