@@ -53,21 +53,18 @@ _NOT_NEGATIVE += ("dof_frictionloss",)
 _SWITCHES = {
   "jnt_range": "jnt_limited",
   "jnt_actfrcrange": "jnt_actfrclimited",
+  "tendon_range": "tendon_limited",
+  "tendon_actfrcrange": "tendon_actfrclimited",
+  "actuator_ctrlrange": "actuator_ctrllimited",
+  "actuator_forcerange": "actuator_forcelimited",
   "actuator_actrange": "actuator_actlimited",
 }
-_SWITCHES |= {"actuator_ctrlrange": "actuator_ctrllimited", "actuator_forcerange": "actuator_forcelimited"}
-_SWITCHES |= {"tendon_range": "tendon_limited", "tendon_actfrcrange": "tendon_actfrclimited"}
+# Fields that MuJoCo's compiler derives from another one, and that follow its draws.
 _DERIVED = {"body_mass": ("body_subtreemass",), "geom_size": ("geom_rbound", "geom_aabb")}
 _TURNS = ("quat", "_axis", "_dir", "_pos")  # ends of the names of fields of directions, quaternions and places
 
-_GEOM = mujoco.mjtGeom
-_PRIMITIVES = (
-  _GEOM.mjGEOM_SPHERE,
-  _GEOM.mjGEOM_CAPSULE,
-  _GEOM.mjGEOM_ELLIPSOID,
-  _GEOM.mjGEOM_CYLINDER,
-  _GEOM.mjGEOM_BOX,
-)
+_KINDS = ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
+_PRIMITIVES = tuple(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}") for kind in _KINDS)
 
 _OPERATIONS: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
   "set": lambda nominal, draw: jnp.broadcast_to(draw, nominal.shape),

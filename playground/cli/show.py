@@ -68,9 +68,8 @@ def describe(config: RunConfig, env: "Env") -> Iterator[RenderableType]:
   from playground.randomization import Randomizer
 
   section, choices = config.resolved["env"], config.choices
-  Randomizer(
-    env.mj_model, config.env.get("events") or {}, impl=env.impl
-  )  # an event without a target raises before the first table
+  # An event without a target raises before the first table.
+  Randomizer(env.mj_model, config.env.get("events") or {}, impl=env.impl)
   metrics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
   yield _facts(choices["env"], _facts_of(env, section, choices))
   yield _table("observations", list(_observations(env)))

@@ -99,11 +99,11 @@ def _add_height_field(spec: mujoco.MjSpec, heights: np.ndarray) -> float:
 
 
 def ground_peak(mj_model: mujoco.MjModel) -> float:
-  """Returns what the terrain's function has returned: the highest ground where robots start, m."""
-  if not mj_model.nhfield:
+  """Returns the height of the highest ground where robots start, m; the ground is geom 0."""
+  if mj_model.geom_type[0] != mujoco.mjtGeom.mjGEOM_HFIELD:
     return 0.0
-  heights = mj_model.hfield_data.reshape(POINTS, POINTS) * mj_model.hfield_size[0, 2]
-  return float(heights[_distance() <= START].max() + mj_model.geom("floor").pos[2])
+  field = mj_model.hfield(mj_model.geom_dataid[0])
+  return float(mj_model.geom_pos[0, 2] + field.size[2] * field.data[_distance() <= START].max())
 
 
 def _distance() -> np.ndarray:
