@@ -43,7 +43,16 @@ def quoted(value: object) -> str:
 
 def wrong_type(key: str, value: object, allowed: str) -> ConfigError:
   """Returns the error for a value of a wrong type."""
-  return ConfigError(f"{key}={format_value(value)} has the wrong type: it must be {allowed}.")
+  shown = quoted(value) if isinstance(value, str) and _is_number(value) else format_value(value)
+  return ConfigError(f"{key}={shown} has the wrong type: it must be {allowed}.")
+
+
+def _is_number(text: str) -> bool:
+  try:
+    float(text)
+  except ValueError:
+    return False
+  return True
 
 
 class _Dumper(yaml.SafeDumper):
@@ -51,11 +60,9 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represent_text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-  try:
-    float(text)
-  except ValueError:
-    return dumper.represent_str(text)
-  return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="'")
+  if _is_number(text):
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="'")
+  return dumper.represent_str(text)
 
 
 _Dumper.add_representer(str, _represent_text)

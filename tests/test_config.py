@@ -439,6 +439,7 @@ ERRORS = {
   "agent=sac agent.grad_updates_per_step=0": ["agent.grad_updates_per_step=0 must be a whole number from 1 to"],
   "agent=sac agent.min_replay_size=-1": ["agent.min_replay_size=-1 must be a whole number from 0 to"],
   "agent.discounting=2": ["agent.discounting=2.0 must be a number from 0 to 1."],
+  "agent.num_timesteps='5e6'": ["agent.num_timesteps='5e6' has the wrong type: it must be a whole number"],
   "seed=-1": ["seed=-1 must be a whole number from 0 to 4294967295."],
   "env=PandaPickCube env.success_distance=-1": ["env.success_distance=-1.0 must be a number above 0 and at most"],
   "env=PandaPickCubeCartesian env.gripper_delay=-1": ["env.gripper_delay=-1 must be a whole number from 0 to 1000."],
