@@ -135,10 +135,12 @@ class Randomizer:
     derived = (name for field in touched for name in _DERIVED.get(field, ()))
     self.fields: tuple[str, ...] = tuple(dict.fromkeys([*touched, *derived]))
     self._nominal = {field: np.array(getattr(mj_model, field)) for field in self.fields}
-    if impl == "warp" and "geom_aabb" in self._nominal:
-      self._nominal["geom_aabb"] = self._nominal["geom_aabb"].reshape(-1, 2, 3)
-    self._carried = _carried(mj_model)
-    self._geom_types = np.array(mj_model.geom_type)
+    if "body_mass" in touched:
+      self._carried = _carried(mj_model)
+    if "geom_size" in touched:
+      self._geom_types = np.array(mj_model.geom_type)
+      if impl == "warp":
+        self._nominal["geom_aabb"] = self._nominal["geom_aabb"].reshape(-1, 2, 3)
     spans = {field: [self._nominal[field]] * 2 for field in touched}  # least and greatest values so far
     for name, draw in self._draws.items():
       for slot in draw.slots:
