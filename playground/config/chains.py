@@ -64,7 +64,7 @@ def check_chain(resolved: Section, parsed: Sequence[Override], roots: Sequence[P
   """
   curriculum = resolved["curriculum"]
   if missing := [key for key in SINGLE_RUN if key not in curriculum]:
-    raise ConfigError(f"curriculum.{missing[0]} is missing: let the defaults of a chain's file begin with none.")
+    raise ConfigError(f"curriculum.{missing[0]} is missing: write defaults: [none, _self_] in the curriculum's file.")
   stages, start_at = curriculum["stages"], curriculum["start_at"]
   given = {override.key: override for override in parsed if not override.is_group}
   if not stages:

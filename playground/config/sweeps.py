@@ -132,7 +132,7 @@ def command_lines(overrides: Sequence[str]) -> list[str]:
   lines = [line for line in expand(overrides) if is_of_command(line)]
   for line in lines:
     if parse_with_hydra(line).is_sweep_override():
-      raise ConfigError(f"{line}: all jobs of a sweep have the same one.")
+      raise ConfigError(f"{line}: give one value, which applies to all jobs of the sweep.")
   return lines
 
 

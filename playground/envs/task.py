@@ -151,7 +151,7 @@ class Task(Env):
     return model.tree_replace(info[_MODEL_FIELDS]) if self.redraws else model  # pyright: ignore[reportReturnType]
 
   def redraw(self, info: dict[str, Any], key: jax.Array, model: mjx.Model | None = None) -> dict[str, Any]:
-    """Returns `info` with the model fields that a new episode draws, and with what events know of the model.
+    """Returns `info` with new draws of model fields, and with the entries that events compute from the model.
 
     `model` is that of the environment, which the draws change; None is the task's own.
     """

@@ -57,7 +57,7 @@ class Wrapper:
 class Vectorize(Wrapper):
   """Runs N copies of a task: `reset(keys [N])`, `step(state, actions [N, action_size])`, each on its own model.
 
-  `fields` are the models of callers that pass none.
+  `fields` are the randomised model fields that apply if a call passes no `model`.
   """
 
   def __init__(self, env: Env, fields: ModelFields | None = None):
@@ -150,13 +150,13 @@ _SUMMARIES: dict[str, Callable[[jax.Array, jax.Array, jax.Array], jax.Array]] = 
 class Episode(Wrapper):
   """Ends episodes after `length` control steps and repeats each action.
 
-  `info["episode_metrics"]` holds the episode's `sum_reward`, `length` and of each metric the sum over policy steps, or
-  the reduction of the task's `summaries`; a non-finite step counts in sums only, with 0. A policy step's metrics are
-  such a sum or reduction of its repeats until the episode ends.
+  `info["episode_metrics"]` holds the episode's `sum_reward` and `length`, and the sum of each metric over policy steps,
+  or the reduction that the task's `summaries` names. A non-finite step adds 0 to sums and is left out of the other
+  reductions. A policy step's metrics are reduced over its repeats in the same way, up to the end of the episode.
 
-  A time-out, of this limit or of a termination term with `time_out`, gives done = 1 with `info["truncation"]` = 1, kept
-  apart from the task's own termination. With repeats an episode that ends in an earlier one stays done and earns
-  nothing in the later ones.
+  A time-out, by this limit or by a termination term with `time_out`, sets done = 1 and `info["truncation"]` = 1; a
+  termination sets done = 1 and truncation 0. If an episode ends in one repeat of an action, it stays done and the later
+  repeats add no reward.
   """
 
   def __init__(self, env: Any, length: int, action_repeat: int = 1):

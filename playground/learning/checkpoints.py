@@ -443,7 +443,7 @@ def _return_of(folder: Path) -> float | None:
 
 
 def of_a_better_one(named: str | Path, newest: Checkpoint) -> list[str]:
-  """Returns a sentence if a run was named whose best checkpoint returned a tenth more than its newest, else nothing.
+  """Returns a sentence if `named` is a run whose newest return is over a tenth below its best, else nothing.
 
   Args:
     named: what the user gave, see `find_checkpoints`.

@@ -103,7 +103,7 @@ class FastSAC(OffPolicy[FastSACConfig, FastSACNetworks]):
   def learn(self, start: Learned, batches: Transition, key: jax.Array, step: jax.Array) -> tuple[Learned, jax.Array]:
     """Makes gradient steps, one for each batch.
 
-    Each is one of the critics, of the temperature, at times of the actor, then of the target critics.
+    Each updates the critics, the temperature, every `policy_frequency`-th time the actor, then the target critics.
     """
     config, networks, optimizer = self.config, self.networks, self.optimizer
     params, target_q, opt_state = start

@@ -219,8 +219,8 @@ def n_step(windows: Transition, discounting: float) -> Transition:
     discounting: discount of one step.
 
   Returns:
-    From the first observation and action to the last `next_obs`, where `discount` also holds the discount of all steps
-    but one; it is not finite where any of its steps is not.
+    A transition from the first observation and action to the last `next_obs`. `discount` is multiplied by that of all
+    steps but one; `nonfinite` is 1 if any of the combined steps is non-finite.
   """
   assert windows.first is not None
   whole = jax.tree.map(lambda x: x[0], windows)

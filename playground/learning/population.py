@@ -37,9 +37,9 @@ class Population:
       update: number of training steps so far; with the seed it determines the draws, also of a resumed run.
 
     Returns:
-      The index of the agent that each copies, [agents], and the new settings: an agent that copies another
-      multiplies each of the explored ones by 0.8 or 1.25, within its limit; of a share above a half, such as a
-      discount, its distance from 1.
+      The index of the agent that each agent copies, [agents], and the new settings. An agent that copies another
+      multiplies each setting of `explore` by 0.8 or 1.25, within its limit; for a share x above 0.5, such as a
+      discount, the factor applies to 1 - x.
     """
     rng = np.random.default_rng([self.seed, update])
     ranked = np.argsort(np.where(np.isnan(returns), -np.inf, returns), kind="stable")

@@ -1,8 +1,8 @@
 """Command terms: velocities to track, and gaits.
 
 A command is a class whose fields are the term's `params`. `bind(env)` looks names up once; `reset(key)` returns the
-entries of `info` that an episode starts with, `step(c, key)` those for the next step. They outlast an auto-reset: the
-next episode keeps the command and, unless time cut the episode before it, draws a new time for it.
+entries of `info` that an episode starts with, `step(c, key)` those for the next step. An auto-reset keeps them: the
+next episode has the same command. A termination, but not a time-out, redraws a velocity command's duration.
 """
 
 import dataclasses

@@ -3,10 +3,10 @@
 - mode `startup`, func `model_field`: a field of the model, drawn once an environment; in mode `reset` in each episode.
 - mode `reset`: a function `(key, env, initial, **params) -> initial` changes the state that an episode starts with.
 - mode `interval`: a class whose fields are the term's `params`. `bind(env)` looks names up once; `reset(key, model)`
-  returns the entries of `info` that an episode starts with, `step(data, info)` acts before the physics of a step. Where
-  entries follow from the model, `of_model(model)` returns them again for the model that an auto-reset draws. Other
-  entries outlast an auto-reset. In the step after one, what the physics derives from the state (`sensordata`, `xpos`,
-  ...) is still that of the last episode's end.
+  returns the entries of `info` that an episode starts with, `step(data, info)` acts before the physics of a step. An
+  auto-reset keeps these entries, except those that depend on the model: `of_model(model)` computes them for the model
+  that the auto-reset draws. In the first step after an auto-reset, derived fields (`sensordata`, `xpos`, ...) still
+  have their values of the end of the last episode.
 """
 
 import dataclasses

@@ -122,8 +122,8 @@ class ObservationManager(_Manager):
   def __init__(self, config: Any, delay: tuple[int, int] | None = None):
     """Binds `observations` of a task's config, with the settings of `TermsConfig`; raises as `terms.bind`.
 
-    With `delay`, the group `state` as a whole is that of so many steps ago (drawn in each step, from and up to), at
-    first that of the episode's start.
+    `delay` = (lowest, highest) delays the whole group `state` by a number of steps that is drawn in each step, both
+    ends included. The buffer starts filled with the episode's first observation.
     """
     section, order = config.observations, config.observation_order or {}
     self._delay = delay

@@ -142,7 +142,7 @@ def lin_vel_z_l2(c: LeggedContext, sensors: Sequence[str] = ("global_linvel",)) 
 
 
 def lin_vel_z_l2_in_gaits(c: LeggedContext, gaits: Sequence[str]) -> jax.Array:
-  """v_z² in the world frame while the episode's gait is one of those; 0 in the others, in which the base flies."""
+  """v_z² in the world frame in episodes with one of these gaits; 0 in other gaits, which have a flight phase."""
   command = c.env.config.commands.get("gait")
   if command is None:
     raise ConfigError("it needs env.commands.gait, which draws the gait of an episode.")

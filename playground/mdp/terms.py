@@ -84,9 +84,9 @@ class Term(NamedTuple):
 
   @contextlib.contextmanager
   def reading(self, *args: Any) -> Iterator[None]:
-    """Raises ConfigError, with the term's key, where it reads what the task, robot or context in `args` lacks.
+    """Raises ConfigError, with the term's key, if it reads an attribute that task, robot or context in `args` lack.
 
-    So it does where a term of this package gets arrays whose sizes do not go together.
+    Arrays whose sizes do not match, in a term of this package, raise it, too.
     """
     try:
       yield

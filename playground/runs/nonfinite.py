@@ -83,7 +83,7 @@ class Dump:
 
 
 def nonfinite_results(state: State) -> list[str]:
-  """Counts as `nonfinite_fields`, in what a step computes."""
+  """Returns `nonfinite_fields` of a state's physics, observation and reward."""
   return nonfinite_fields({"data": state.data, "obs": state.obs, "reward": state.reward})
 
 

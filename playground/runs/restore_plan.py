@@ -118,7 +118,7 @@ class RestorePlan:
     return cls()
 
   def start_over(self, config: RunConfig) -> None:
-    """Plans that a resumed run starts from the beginning: from the weights that it started from, without checkpoints.
+    """Makes a resumed run start from the beginning, with its initial weights and without its checkpoints.
 
     Raises:
       CheckpointError: the weights are missing or damaged.

@@ -37,9 +37,9 @@ Group = tuple[list["RunConfig"], Population | None]  # runs that train together,
 def train_together(configs: Sequence["RunConfig"], exploit_every: int = 0, explore: Sequence[str] = ()) -> int:
   """Trains runs that have the same program, new or to resume.
 
-  A run that fails (non-finite numbers, a full disk, no intact checkpoint; one to resume, because another process trains
-  it) ends alone. Runs at different steps (an earlier start was interrupted between two runs) are trained one group
-  after another, those of the same step together. A population continues from the newest step that all its runs have.
+  If a run fails (non-finite numbers, a full disk, no intact checkpoint, a run to resume that another process trains),
+  the others continue. Runs at the same step train together. Groups at different steps, as after an interruption
+  between two runs, train one after another. A population continues from the newest step that all its runs have.
 
   Args:
     configs: of the runs.
