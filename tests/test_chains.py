@@ -244,5 +244,5 @@ def test_stages_that_are_none(configs: Path, stages: str, message: str):
 
 def test_a_chain_without_the_fields_of_none(configs: Path):
   write(configs, STAGES, head="")
-  with pytest.raises(ConfigError, match=r"curriculum\.scale is missing: let the defaults of a chain's file begin with"):
+  with pytest.raises(ConfigError, match=r"^curriculum\.scale is missing: write defaults: \[none, _self_\] in the"):
     compose(MINE, configs)
