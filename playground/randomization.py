@@ -124,10 +124,18 @@ class Randomizer:
     fields: names of the `mjx.Model` fields that any term touches, in order of first use, then of those that follow.
   """
 
-  def __init__(self, mj_model: mujoco.MjModel, events: Mapping[str, Any], mode: str = "startup", impl: str = "jax"):
+  def __init__(
+    self,
+    mj_model: mujoco.MjModel,
+    events: Mapping[str, Any],
+    mode: str = "startup",
+    impl: str = "jax",
+    in_c: bool = False,
+  ):
     """Binds those of `env.events` of func `model_field` and this mode to a model, whose values are the nominal ones.
 
-    Raises ConfigError for an event that does not fit the model, or whose change the physics backend `impl` ignores.
+    Raises ConfigError for an event that does not fit the model, or whose change the simulator ignores: the physics
+    backend `impl`, or with `in_c` C MuJoCo, in which policies of either backend are played.
     """
     terms = model_fields(events, mode)
     self._draws = {name: _bind(mj_model, term, f"env.events.{name}.params") for name, term in terms.items()}
@@ -144,9 +152,8 @@ class Randomizer:
     spans = {field: [self._nominal[field]] * 2 for field in touched}  # least and greatest values so far
     for name, draw in self._draws.items():
       for slot in draw.slots:
-        if reason := _acts_not(mj_model, draw.term, slot, impl):
+        if reason := _acts_not(mj_model, draw.term, slot, "c" if in_c else impl):
           raise ConfigError(f"env.events.{name}: {reason}.")
-      for slot in draw.slots:
         if slot.field in _NOT_NEGATIVE:
           spans[slot.field] = _span_after(spans[slot.field], draw.term, slot, f"env.events.{name}.params")
 

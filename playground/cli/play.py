@@ -103,7 +103,8 @@ def play(
     opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
   exported, env = opened.exported, opened.env
   better = of_a_better_one(path, opened.trained.checkpoint) if opened.trained else ()
-  unlike = [] if randomize else Randomizer(env.mj_model, env.config.get("events"), impl=env.impl).without_nominal()
+  events = env.config.get("events")
+  unlike = [] if randomize else Randomizer(env.mj_model, events, impl=env.impl, in_c=True).without_nominal()
   unlike = [f"{sentence} --randomize plays on models like those of training." for sentence in unlike]
   for sentence in (*better, *of_events_that_are_off(env.config, overrides), *unlike):
     console.print(sentence, soft_wrap=True, markup=False, highlight=False)

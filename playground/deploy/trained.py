@@ -163,7 +163,7 @@ def set_fields(mj_model: mujoco.MjModel, fields: Mapping[str, jax.Array]) -> Non
 
 
 def _startup(env: Env, task: str) -> Randomizer:
-  randomizer = Randomizer(env.mj_model, env.config.get("events"), impl=env.impl)
+  randomizer = Randomizer(env.mj_model, env.config.get("events"), impl=env.impl, in_c=True)
   if not randomizer.fields:
     raise ConfigError(f"--randomize: {task} has no events of mode startup here, which draw the model.")
   return randomizer
