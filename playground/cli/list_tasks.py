@@ -10,7 +10,7 @@ from rich.text import Text
 from playground.catalog import STATUSES, entries
 from playground.config import compose
 from playground.console import wide_console
-from playground.errors import UnknownNameError, nearest
+from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.settings import Section
 from playground.text import millions
 
@@ -44,14 +44,20 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
     return 0
   console = wide_console()
   console.print(_table(rows))
+  for row in rows:
+    if "error" in row:
+      console.print(f"{row['task']}: {row['error']}", soft_wrap=True, markup=False, highlight=False)
   count = f"{len(rows)} task{'s' * (len(rows) != 1)}"
   console.print(f"{count}. Train one with playground train env=<task>.", soft_wrap=True)
   return 0
 
 
 def _composed(name: str) -> Section:
-  """Returns what the configuration tells of a task that the catalogue lacks."""
-  config = compose([f"env={name}"])
+  """Returns what the configuration tells of a task that the catalogue lacks, or why it does not compose."""
+  try:
+    config = compose([f"env={name}"])
+  except ConfigError as error:
+    return {"task": name, "error": str(error)}
   settings = {"agent": config.agent_name, "budget": config.agent.num_timesteps}
   return {"task": name, "robot": config.choices.get("robot") or "", "backend": config.env.cuda_impl, **settings}
 

@@ -26,7 +26,7 @@ def replay(file: str) -> int:
   env = registry.load(run.choices["env"], config=run.env)
   before = dump.state(env)
   console.print(f"{run.choices['env']} at physics time {float(before.data.time):.3f} s, action {dump.action.tolist()}")
-  console.print(f"recorded: {_listed(nonfinite_fields(dump.after))}")
+  console.print(f"physics as recorded: {_listed(nonfinite_fields(dump.after))}")
   bad = nonfinite_results(dump.replay(env))
   console.print(f"replayed on {hardware.machine['device']} with impl={env.impl}: {_listed(bad)}")
   return 0 if bad else 1

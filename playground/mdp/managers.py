@@ -182,7 +182,7 @@ class ObservationManager(_Manager):
     return obs if len(obs) > 1 else obs[ACTOR], past
 
   def _read(self, term: Term, c: StepContext, key: jax.Array, drawn: dict[str, jax.Array]) -> jax.Array:
-    value, options = jnp.asarray(term(c), float).ravel(), term.options
+    value, options = term.array(c).astype(float).ravel(), term.options
     kind, size = next(iter(options.noise.items())) if options.noise else (None, 0.0)
     if kind == "same_as":
       if drawn[str(size)].shape != value.shape:

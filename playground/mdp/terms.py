@@ -21,8 +21,10 @@ import functools
 import importlib
 import inspect
 import re
+import traceback
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -75,9 +77,17 @@ class Term(NamedTuple):
       raise ConfigError(f"{self.key} returns nothing: {self.func.__name__} lacks a `return`.")
     return value
 
+  def array(self, *args: Any) -> jax.Array:
+    """Returns the function's value; raises ConfigError where it is no array of numbers."""
+    value = self(*args)
+    try:
+      return jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+      raise ConfigError(f"{self.key} must return an array of numbers, and returns {type(value).__name__}.") from error
+
   def scalar(self, *args: Any) -> jax.Array:
     """Returns the function's value, shape []; raises ConfigError where it has another shape."""
-    value = jnp.asarray(self(*args))
+    value = self.array(*args)
     if value.ndim:
       raise ConfigError(f"{self.key} must return one number, and returns {value.size} of them: add .sum() or .any().")
     return value
@@ -86,7 +96,8 @@ class Term(NamedTuple):
   def reading(self, *args: Any) -> Iterator[None]:
     """Raises ConfigError, with the term's key, if it reads an attribute that task, robot or context in `args` lack.
 
-    Arrays whose sizes do not match, in a term of this package, raise it, too.
+    So do arrays whose sizes do not match, in a term of this package, and Python's `if` or NumPy on values of the step,
+    in another's, whose other errors get the key as a note.
     """
     try:
       yield
@@ -94,19 +105,21 @@ class Term(NamedTuple):
       has_key = str(error).startswith(tuple(f"env.{kind}." for kind in MODULES))  # of a term that this one reads
       key = f"{self.key}." if str(error).startswith("params.") else f"{self.key}: "
       raise error if has_key else type(error)(f"{key}{error}") from None
-    except AttributeError as error:
+    except Exception as error:
+      if vars(error).setdefault("term", self) is not self:  # of a term that this one reads, as `is_terminated` does
+        raise
+      ours = self.func.__module__.startswith("playground.mdp.")
       parts = [part for arg in args for part in (arg, getattr(arg, "env", arg), getattr(arg, "robot", arg))]
-      if not any(error.obj is part for part in parts):
-        raise
-      raise ConfigError(f"{self.key} needs {error.name!r}, which this task does not have.") from error
-    except (TypeError, ValueError) as error:
-      # The innermost term: `is_terminated` reads the terminations, of which another package's keeps its traceback.
-      inner = vars(error).setdefault("term", self)
-      if inner is self and isinstance(error, jax.errors.JAXTypeError):  # Python's `if` or NumPy on values of the step
-        error.add_note(f"in {self.key}: write jnp.where in place of `if`, and jnp in place of np and float().")
-      if type(error) not in (TypeError, ValueError) or not inner.func.__module__.startswith("playground.mdp."):
-        raise
-      raise ConfigError(f"{self.key} does not fit this task: {first_line(error)}.") from error
+      if isinstance(error, AttributeError) and any(error.obj is part for part in parts):
+        near = "" if ours else nearest(str(error.name), dir(error.obj))
+        raise ConfigError(f"{self.key} needs {error.name!r}, which this task does not have.{near}") from error
+      if ours and type(error) in (TypeError, ValueError):
+        raise ConfigError(f"{self.key} does not fit this task: {first_line(error)}.") from error
+      if not ours and isinstance(error, jax.errors.JAXTypeError):
+        instead = "write jnp.where in place of `if`, and jnp in place of np and float()."
+        raise ConfigError(f"{self.key}: {_line(self.func, error)}: {instead}") from error
+      error.add_note(f"in {self.key}")
+      raise
 
   def instantiate(self, env: Any) -> "Term":
     """Returns the same term with an instance of its class, bound to a task."""
@@ -129,6 +142,13 @@ class Term(NamedTuple):
     for name, value in params.items() if instance is not None else ():
       setattr(instance, name, value)
     return self._replace(params=self.params | params, options=self.options._replace(**options), instance=instance)
+
+
+def _line(func: Callable[..., Any], error: Exception) -> str:
+  """Returns file and line of the innermost call that an error went through in a function's file."""
+  file = inspect.getsourcefile(inspect.unwrap(func))
+  lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+  return f"{Path(file).name}:{lines[-1]}" if file and lines else func.__name__
 
 
 @functools.cache
@@ -217,7 +237,9 @@ def find(kind: str, name: str, key: str, others: Iterable[str] = ()) -> Callable
     return table[name]
   if ":" not in name:
     renamed = renamed_function(kind, name)
-    near = f" Did you mean {renamed!r}?" if renamed else nearest(name, [*others, *table])
+    module, _, function = name.rpartition(".")
+    meant = f"{module}:{function}" if module else renamed
+    near = f" Did you mean {meant!r}?" if meant else nearest(name, [*others, *table])
     raise UnknownNameError(
       f"{key}: no function {name!r} is registered for env.{kind}; name one, or write func: module:function.{near}"
     )

@@ -129,7 +129,7 @@ class RunCallbacks:
   def end_training(self) -> None:
     """Waits for pending checkpoints, takes the run's time and starts the last video, for which `finish` waits."""
     self._progress.phase("saving")
-    self._store.close()
+    self._store.wait()
     self._trained_s = self.wall_clock_s
     wanted = self._config.video.enable and self._config.video.at_end and not self.should_stop()
     if not wanted or self._filmed == self._step:
@@ -175,13 +175,16 @@ class RunCallbacks:
     )
 
   def close(self, status: str = "failed") -> None:
-    """Closes the trackers and the video thread, once; the default status is that of a run that raised an error."""
+    """Ends what is being written, and videos and trackers, once; the default status is that of a run that failed."""
     if not self._closed:
       self._closed = True
       if self._trace == "on":  # the run ended while it was traced
         jax.profiler.stop_trace()
-      self._videos.shutdown(cancel_futures=True)
-      self._trackers.close(status)
+      try:
+        self._store.close()
+      finally:
+        self._videos.shutdown(cancel_futures=True)
+        self._trackers.close(status)
 
   def _scores(self) -> dict[str, float | None]:
     """Returns the result from metrics.csv, which covers all starts of the run, and the best checkpoint."""

@@ -77,6 +77,8 @@ def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) 
         if share(run_dir.status.get("status", "")) != "finished":
           if is_main():
             chain.set_status("running", f"stage {folder}")
+            if before is not None:
+              _write_curve(chain, folders)  # of the stages so far
             print(f"\nStage {folder} of {chain.path}: {stage.agent.num_timesteps:,} steps of {stage.choices['env']}")
           with in_stage(name):
             train_run(replace(stage, init_from=before), interrupts, began_s)
@@ -170,8 +172,7 @@ def _write_result(chain: RunDirectory, folders: Mapping[str, str]) -> None:
     chain: directory of the chain.
     folders: names of the stages' folders, by stage.
   """
-  _write_metrics(chain, folders)
-  plot_learning_curve(chain.metrics_csv, chain.plots)
+  _write_curve(chain, folders)
   stages = _stages(chain, folders)
   begun = [stage for stage in stages if stage["steps"] is not None]
   open_ = [stage["status"] for stage in stages if stage["status"] != "finished"]
@@ -202,8 +203,8 @@ def _stages(chain: RunDirectory, folders: Mapping[str, str]) -> list[dict[str, P
   return stages
 
 
-def _write_metrics(chain: RunDirectory, folders: Mapping[str, str]) -> None:
-  """Writes one table of all stages: steps and wall-clock time accumulate, column `stage` names the stage."""
+def _write_curve(chain: RunDirectory, folders: Mapping[str, str]) -> None:
+  """Writes and plots one table of all stages: steps and wall-clock time accumulate, column `stage` names the stage."""
   import pandas as pd
 
   tables, steps, seconds = [], 0, 0.0
@@ -220,6 +221,7 @@ def _write_metrics(chain: RunDirectory, folders: Mapping[str, str]) -> None:
     tables.append(table)
   if tables:
     write_text(chain.metrics_csv, pd.concat(tables, ignore_index=True).to_csv(index=False))
+  plot_learning_curve(chain.metrics_csv, chain.plots)
 
 
 def _say_where(chain: RunDirectory) -> None:

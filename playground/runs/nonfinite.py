@@ -83,8 +83,9 @@ class Dump:
 
 
 def nonfinite_results(state: State) -> list[str]:
-  """Returns `nonfinite_fields` of a state's physics, observation and reward."""
-  return nonfinite_fields({"data": state.data, "obs": state.obs, "reward": state.reward})
+  """Returns `nonfinite_fields` of a state's physics, observation, reward and, by name, rewards."""
+  rewards = {name: value for name, value in state.metrics.items() if name.startswith("reward/")}
+  return nonfinite_fields({"data": state.data, "obs": state.obs, "reward": state.reward, "metrics": rewards})
 
 
 def nonfinite_fields(tree: PyTree) -> list[str]:

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from playground.catalog import entries
+from playground.cli import list_tasks
 from playground.cli.main import main
-from playground.errors import CheckpointError
+from playground.errors import CheckpointError, ConfigError
 from playground.mdp import observations
 from playground.text import millions
 from tests.command import Command, caller
@@ -58,6 +59,18 @@ def test_list(command: Command, capsys: pytest.CaptureFixture[str]):
   assert "--status=opened: choose from learning, not measured, open, solved." in capsys.readouterr().err
   assert command("list", "cartpool") == 2
   assert "error: No task's name contains 'cartpool'" in capsys.readouterr().err
+
+
+def test_a_task_of_another_package_that_does_not_compose_is_listed_with_the_reason(
+  monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+  def compose(_: list[str]) -> None:
+    raise ConfigError("The files of env=Broken do not compose: line 4.")
+
+  monkeypatch.setattr(list_tasks, "compose", compose)
+  assert list_tasks.list_tasks(["Broken", "CartpoleBalance"], {}, as_json=False) == 0
+  out = capsys.readouterr().out
+  assert "Broken: The files of env=Broken do not compose: line 4.\n2 tasks." in out and "dm_control" in out
 
 
 def test_list_needs_no_jax():

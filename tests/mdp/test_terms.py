@@ -340,16 +340,30 @@ def test_functions_of_the_wrong_form(kind: str, entry: dict[str, Any], message: 
     bind(kind, {"mine": entry | {"func": f"{__name__}:{entry['func']}"}})
 
 
-def test_pythons_if_on_a_value_of_the_step_names_the_term(arm: ArmContext) -> None:
-  def jumps(c: Any) -> Any:
-    return 1.0 if c.data.qpos[0] > 0 else 0.0
-
-  term = bind("rewards", {"action_rate_l2": {"weight": 1.0}})[0]._replace(func=jumps)
-  at = lambda qpos: term(ArmContext(arm.env, arm.data.replace(qpos=qpos), {}, arm.action))
-  with pytest.raises(jax.errors.TracerBoolConversionError) as error:
+@pytest.mark.parametrize(
+  ("func", "message"),
+  [
+    (
+      lambda c: 1.0 if c.data.qpos[0] > 0 else 0.0,
+      r": test_terms.py:\d+: write jnp.where in place of `if`, and jnp in place of np and float\(\).",
+    ),
+    (lambda c: c.joint_poss[0], " needs 'joint_poss', which this task does not have. Did you mean 'joint_pos'?"),
+    (lambda c: {"a": c.action[0]}, " must return an array of numbers, and returns dict."),
+    (lambda _: "much", " must return an array of numbers, and returns str."),
+  ],
+)
+def test_what_a_function_of_another_package_does_wrong(func: Any, message: str, arm: ArmContext) -> None:
+  term = bind("rewards", {"action_rate_l2": {"weight": 1.0}})[0]._replace(func=func)
+  at = lambda qpos: term.scalar(ArmContext(arm.env, arm.data.replace(qpos=qpos), {}, arm.action))
+  with pytest.raises(ConfigError, match=rf"^env\.rewards\.action_rate_l2{message}"):
     jax.eval_shape(at, arm.data.qpos)
-  note = "in env.rewards.action_rate_l2: write jnp.where in place of `if`, and jnp in place of np and float()."
-  assert error.value.__notes__[0] == note
+
+
+def test_another_error_of_a_function_of_another_package_has_the_terms_key_as_a_note(arm: ArmContext) -> None:
+  term = bind("rewards", {"action_rate_l2": {"weight": 1.0}})[0]._replace(func=lambda c: c.action / {}["missing"])
+  with pytest.raises(KeyError, match="missing") as error:
+    term(arm)
+  assert error.value.__notes__ == ["in env.rewards.action_rate_l2"]
 
 
 def test_nothing_is_registered_that_cannot_be_a_term_of_its_kind() -> None:

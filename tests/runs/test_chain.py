@@ -192,6 +192,7 @@ def test_a_signal_at_any_moment_changes_nothing(
     def row(job: RunCallbacks, reached: int, *args: Any) -> None:
       on_metrics(job, reached, *args)
       if (job._run_dir.path.name, reached) == (stage, step):
+        assert (path / "metrics.csv").exists() == (stage == "2_far"), "the curve of the stages before"
         kill()
 
     return row

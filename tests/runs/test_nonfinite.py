@@ -20,7 +20,7 @@ from playground.learning import algorithm
 from playground.learning.checkpoints import find_checkpoints
 from playground.learning.rollout import Step
 from playground.runs.callbacks import NonfiniteError
-from playground.runs.nonfinite import Dump, write_dump
+from playground.runs.nonfinite import Dump, nonfinite_results, write_dump
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import train
 from tests.runs.helpers import TASK, resume
@@ -53,7 +53,7 @@ def test_nan_is_counted_dumped_and_kept_out(
 
   assert replay(str(dump)) == 0
   recorded, replayed = capsys.readouterr().out.split("replayed on cpu with impl=jax: NaN, infinite or too large in ")
-  assert "recorded: NaN, infinite or too large in" in recorded
+  assert "physics as recorded: NaN, infinite or too large in" in recorded
   assert "['qvel']: " in recorded
   assert "['data'].qvel: " in replayed
 
@@ -68,7 +68,7 @@ def test_nan_is_counted_dumped_and_kept_out(
 def test_all_repeats_of_an_action_are_replayed(repeats: int, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
   """Up to the first that is not finite."""
   state = lambda number: types.SimpleNamespace(
-    data=np.array([0.0, 0.0, 0.0, np.nan, 0.0])[number], obs=0.0, reward=number
+    data=np.array([0.0, 0.0, 0.0, np.nan, 0.0])[number], obs=0.0, reward=number, metrics={}
   )
   step = lambda before, *_: state(before.reward + 1)
   dump = object.__new__(Dump)
@@ -76,6 +76,12 @@ def test_all_repeats_of_an_action_are_replayed(repeats: int, steps: int, monkeyp
   monkeypatch.setattr(Dump, "state", lambda self, env: state(0))
   env: Any = types.SimpleNamespace(action_repeat=repeats, jitted=(None, step))
   assert dump.replay(env).reward == steps
+
+
+def test_a_reward_that_is_nan_is_named() -> None:
+  metrics = {"reward/mine": np.float32(np.nan), "reward/other": np.float32(1), "tracking_error": np.float32(np.nan)}
+  state: Any = types.SimpleNamespace(data=np.zeros(3), obs=np.zeros(2), reward=np.float32(np.nan), metrics=metrics)
+  assert nonfinite_results(state) == ["['metrics']['reward/mine']: 1 of 1", "['reward']: 1 of 1"]
 
 
 def test_no_dump_at_all_is_one_sentence() -> None:

@@ -486,6 +486,32 @@ def test_videos_that_take_longer_than_training_are_left_out(
     assert filmed[-1] == f"step_{9 * BATCH:012d}.mp4"
 
 
+@pytest.mark.parametrize("by", ["a second signal", "an error"])
+def test_whatever_ends_a_run_its_last_checkpoint_is_written(
+  by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  """Under the run's lock: another start would remove what is half written."""
+  written = []
+
+  def write(*args: Any) -> None:
+    time.sleep(0.5)
+    save(*args)
+    written.append(is_locked(tmp_path / "run.lock"))
+
+  def end(*_: object) -> None:
+    if by == "an error":
+      raise OSError("no space left")
+    os.kill(os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+  save = checkpoints.CheckpointStore._write
+  monkeypatch.setattr(checkpoints.CheckpointStore, "_write", write)
+  monkeypatch.setattr(RunCallbacks, "end_training", end)
+  with pytest.raises(CheckpointError, match="no space left") if by == "an error" else contextlib.nullcontext():
+    assert train(compose([*TASK, f"run_dir={tmp_path}"])) == 143
+  assert written[-1] and Checkpoint(find_checkpoints(tmp_path)[0]).step == last_row(tmp_path)
+
+
 def test_of_two_starts_in_one_folder_the_second_changes_nothing(tmp_path: Path) -> None:
   """Both found it free."""
   config = compose([*TASK, f"run_dir={tmp_path}"])
