@@ -21,6 +21,7 @@ import functools
 import importlib
 import inspect
 import re
+import sys
 import traceback
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -117,7 +118,7 @@ class Term(NamedTuple):
         raise ConfigError(f"{self.key} does not fit this task: {first_line(error)}.") from error
       if not ours and isinstance(error, jax.errors.JAXTypeError):
         instead = "write jnp.where in place of `if`, and jnp in place of np and float()."
-        raise ConfigError(f"{self.key}: {_line(self.func, error)}: {instead}") from error
+        raise ConfigError(f"{self.key}: {_line(self.func, error)}{instead}") from error
       error.add_note(f"in {self.key}")
       raise
 
@@ -145,10 +146,10 @@ class Term(NamedTuple):
 
 
 def _line(func: Callable[..., Any], error: Exception) -> str:
-  """Returns file and line of the innermost call that an error went through in a function's file."""
-  file = inspect.getsourcefile(inspect.unwrap(func))
+  """Returns 'file:line: ' of the innermost call in a function's module that an error went through, '' without one."""
+  file = getattr(sys.modules.get(func.__module__), "__file__", None)
   lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-  return f"{Path(file).name}:{lines[-1]}" if file and lines else func.__name__
+  return f"{Path(file).name}:{lines[-1]}: " if file and lines else ""
 
 
 @functools.cache
