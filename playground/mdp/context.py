@@ -157,13 +157,13 @@ class StepContext:
   @property
   @mirrors_as("joints")
   def last_act(self) -> jax.Array:
-    """The action of the step before, 0 at the start of an episode [action_size]."""
+    """The action before the newest one, 0 at the start of an episode [action_size]."""
     return self.info["last_act"]
 
   @property
   @mirrors_as("joints")
   def action_before_last(self) -> jax.Array:
-    """The action two steps before [action_size]."""
+    """The action before `last_act` [action_size]."""
     return self.info["last_last_act"]
 
   @property

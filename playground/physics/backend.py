@@ -27,7 +27,6 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that 
 # Integrators: the part of a step that follows forward dynamics.
 _INTEGRATE = {
   mujoco.mjtIntegrator.mjINT_EULER: mjx.euler,
-  mujoco.mjtIntegrator.mjINT_RK4: mjx.rungekutta4,
   mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit,
 }
 
@@ -138,8 +137,13 @@ class Physics:
         of a batch, the axis `WORLDS` of the `jax.vmap` around, share the contacts.
 
     Raises:
-      ConfigError: the model has something that MJX does not implement.
+      ConfigError: the model has something that MJX does not implement, or the integrator RK4.
     """
+    if mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+      raise ConfigError(
+        "The model's integrator is RK4, with which MJX and C MuJoCo read sensors at different times: write "
+        "integrator='Euler' or 'implicitfast' in the MJCF."
+      )
     self.mj_model = mj_model
     self.impl = impl
     self.derived = derived

@@ -48,6 +48,12 @@ def test_what_mjx_does_not_implement(option: str, impl: str) -> None:
     Physics(model, impl=impl)
 
 
+def test_sensors_are_those_of_one_time_in_mjx_and_c_mujoco() -> None:
+  model = mujoco.MjModel.from_xml_string("<mujoco><option integrator='RK4'/></mujoco>")
+  with pytest.raises(ConfigError, match=r"^The model's integrator is RK4, .* 'implicitfast' in the MJCF\.$"):
+    Physics(model)
+
+
 @pytest.mark.slow
 def test_agents_with_other_rewards_and_models_call_warp_once() -> None:
   sizes = ["num_envs=40", "num_eval_envs=4", "batch_size=40", "num_minibatches=1", "unroll_length=2"]
