@@ -79,6 +79,7 @@ def evaluate_run(
   name = f"step_{checkpoint.step:012d}_seed_{seed}_episodes_{count}{settings}.json"
   save(trained.run_dir.path / "eval" / name, report, console, trained.run_dir.path)
   if film:
+    console.print(f"rendering {film}", soft_wrap=True, highlight=False, markup=False)
     render_video(
       drawn,
       out_path=film,

@@ -137,6 +137,7 @@ def play(
   if film:
     filmed = copy.copy(env.mj_model)
     set_fields(filmed, {name: values[0] for name, values in models.items()})
+    console.print(f"rendering {film}", soft_wrap=True, highlight=False, markup=False)
     render_video(
       filmed,
       out_path=film,

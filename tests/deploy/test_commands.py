@@ -270,6 +270,7 @@ def test_a_video_by_the_camera_that_is_named(
   monkeypatch.setenv("HOME", str(tmp_path))
   video = ["--episodes", "1", "--video=~/new/a.mp4"]
   assert command("play", str(run), *video, "--camera", "lookatcart") == 0
+  assert f"rendering {filmed[0][0]}\n" in capsys.readouterr().out
   assert command("play", str(run), *video) == 0
   config = shutil.copytree(run, tmp_path / "run") / "config.yaml"
   config.write_text(re.sub(r"^  camera: null$", "  camera: fixed", config.read_text(), flags=re.MULTILINE))
