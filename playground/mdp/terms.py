@@ -78,7 +78,7 @@ class Term(NamedTuple):
       raise ConfigError(f"{self.key} returns nothing: {self.func.__name__} lacks a `return`.")
     return value
 
-  def array(self, *args: Any) -> jax.Array:
+  def array(self, *args: object) -> jax.Array:
     """Returns the function's value; raises ConfigError where it is no array of numbers."""
     value = self(*args)
     try:
@@ -145,7 +145,7 @@ class Term(NamedTuple):
     return self._replace(params=self.params | params, options=self.options._replace(**options), instance=instance)
 
 
-def _line(func: Callable[..., Any], error: Exception) -> str:
+def _line(func: object, error: Exception) -> str:
   """Returns 'file:line: ' of the innermost call in a function's module that an error went through, '' without one."""
   file = getattr(sys.modules.get(func.__module__), "__file__", None)
   lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
