@@ -222,7 +222,7 @@ class SweepDirectory:
     cls, path: str | Path, name: str, command: Sequence[str], settings: Sequence[str], lines: Sequence[str],
     jobs: Sequence[Job], numbered: bool = False,
   ) -> "SweepDirectory":  # fmt: skip
-    """Makes the folder and writes sweep.yaml; see the attributes. Raises CheckpointError if that fails.
+    """Makes the folder and writes sweep.yaml; see the attributes. Raises CheckpointError if it fails or there is one.
 
     With `numbered` it is a new folder, `<path>_2`, ... where the name is taken, as by a sweep of the same second.
     """
@@ -231,7 +231,10 @@ class SweepDirectory:
       path = make_numbered(path) if numbered else path
       sweep = cls(path, name, list(command), list(settings), list(lines), list(jobs), Path.cwd(), now())
       sweep.path.mkdir(parents=True, exist_ok=True)
-      sweep.save()
+      with sweep.controlled():
+        if (sweep.path / "sweep.yaml").exists():
+          raise CheckpointError(f"sweep_dir={path} became another sweep's while this one started: repeat the command.")
+        sweep.save()
     except OSError as error:
       raise CheckpointError(f"sweep_dir={path} cannot be written: {error.strerror}.") from error
     return sweep
@@ -249,7 +252,7 @@ class SweepDirectory:
       content = read_yaml(file)
       _check(content)
       return cls(path, **content | {"jobs": [Job(**job) for job in content["jobs"]], "cwd": Path(content["cwd"])})
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
       raise CheckpointError(f"{file} is damaged: {first_line(error)}.") from None
 
   @property
@@ -307,13 +310,13 @@ class SweepDirectory:
 
 
 def _check(content: Plain) -> None:
-  """Raises KeyError, TypeError or ValueError if a sweep.yaml does not have the form that `create` writes."""
+  """Raises TypeError or ValueError if a sweep.yaml does not have the form that `create` writes."""
   texts = lambda key, value: _need(key, value, list) and [_need(key, text, str) for text in value]
   _need("it", content, dict)
   for key, kind in {"name": str, "cwd": str, "jobs": list}.items():
-    _need(key, content[key], kind)
+    _need(key, content.get(key), kind)
   for key in ("command", "settings", "lines"):
-    texts(key, content[key])
+    texts(key, content.get(key))
   for entry in content["jobs"]:
     job = Job(**_need("a job", entry, dict))
     if not _JOB_NAME.fullmatch(_need("a job's name", job.name, str)):  # a path would lead out of the sweep's folder

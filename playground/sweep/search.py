@@ -130,11 +130,12 @@ class Search:
 
   def best(self) -> str:
     """Returns a sentence about the best trial."""
-    if not self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+    finished = self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if not finished:
       return "No trial has finished."
     trial = self._study.best_trial
     values = " ".join(f"{key}={configs.format_value(value)}" for key, value in trial.params.items())
-    return f"Best of {len(self._sweep.jobs)} trials: {self._config.metric} {trial.value:g} with {values}"
+    return f"Best of {len(finished)} trials: {self._config.metric} {trial.value:g} with {values}"
 
 
 def distribution(override: HydraOverride) -> CategoricalDistribution | FloatDistribution | IntDistribution:

@@ -23,6 +23,7 @@ from playground.interpreter import PYTHON
 from playground.settings import Plain
 from playground.sweep.folder import ENDED, STOP_FILE, Job, JobFolder, SweepDirectory
 from playground.sweep.worker import COMMAND, Worker
+from playground.text import first_line
 
 try:
   import submitit
@@ -32,6 +33,7 @@ except ImportError:
 SETTLED = tuple(status for status in ENDED if status not in ("preempted", "killed"))  # Slurm may restart others
 _SLURM_ID = re.compile(r"\d+(_\d+)?")  # an id must not be an option of squeue or scancel
 QUEUE_S = 5.0  # s between queries of Slurm
+ANSWER_S = 60.0  # s after which an answer of Slurm is given up
 
 
 @dataclasses.dataclass
@@ -80,9 +82,11 @@ class Queue:
     """Returns Slurm's state of a job, None if it left the queue; at most `QUEUE_S` old, UNKNOWN without an answer."""
     if time.monotonic() - self._asked > QUEUE_S:
       command = ["squeue", "--me", "--all", "--noheader", "--format=%i %T"]
-      answer = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-      lines = [line.split(maxsplit=1) for line in answer.stdout.splitlines()]
-      self._states = dict(lines) if answer.returncode == 0 else None
+      try:
+        answer = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=ANSWER_S)
+        self._states = dict(line.split(maxsplit=1) for line in answer.stdout.splitlines())
+      except (OSError, subprocess.SubprocessError):
+        self._states = None
       self._asked = time.monotonic()
     return "UNKNOWN" if self._states is None else self._states.get(job_id)
 
@@ -119,8 +123,13 @@ class SlurmLauncher:
         f"launcher.minutes={config.minutes} leaves no time to train: jobs are asked to save {_notice_s(config)} s "
         "(launcher.grace + 30) before it is over."
       )
-    if shutil.which("sbatch") is None:
-      raise HardwareError("launcher=slurm, but there is no sbatch here: start it on a machine of the cluster.")
+    if "parsable" in config.parameters:
+      raise ConfigError(
+        "launcher.parameters has parsable, which hides sbatch's sentence with the job's number: drop it."
+      )
+    for program in ("sbatch", "squeue"):
+      if shutil.which(program) is None:
+        raise HardwareError(f"launcher=slurm, but there is no {program} here: start it on a machine of the cluster.")
 
   def start(self, job: Job) -> bool:
     at_once = self._config.max_parallel
@@ -135,10 +144,16 @@ class SlurmLauncher:
       submitted = self._executor.submit(task)
     except submitit.core.utils.FailedJobError as error:
       folder.write_waiting("queued")
-      why = str(error).strip().splitlines()[-1].removeprefix("sbatch: ")
+      why = (str(error).strip() or "without a reason").splitlines()[-1].removeprefix("sbatch: ")
       raise HardwareError(
         f"launcher=slurm: sbatch refused job {job.name} ({why}); what was submitted before goes on, and so does the "
         "same command once that is mended."
+      ) from None
+    except submitit.core.utils.FailedSubmissionError as error:
+      folder.write_waiting("queued")
+      raise HardwareError(
+        f"launcher=slurm: sbatch names no number of job {job.name} ({first_line(error)}): if squeue shows the job, "
+        "cancel it; what was submitted before goes on, and so does the same command once that is mended."
       ) from None
     (folder.path / "slurm_id").write_text(submitted.job_id)
     self.submitted[job.name] = submitted

@@ -184,6 +184,12 @@ class Worker:
     run = folder.run.status if folder.run.status != self._before[folder] else {}  # else of an earlier start
     if run.get("status") == "finished" or (code == 0 and len(self._records) == 1):
       return "finished", ""
+    if run.get("status") == "failed" and run.get("reason"):  # before it was asked to stop, or while it saved
+      return "failed", run["reason"]
+    lines = _lines(next(iter(self._records)).log)
+    own = f"{folder.path.name} failed: "
+    if said := [line.removeprefix(own) for line in lines if line.startswith(own)]:  # of one run among several
+      return "failed", said[-1]
     if why == "timeout":
       return "timeout", f"took longer than launcher.timeout={self._timeout:g} s"
     if why == "stopped" or run.get("status") == "preempted":
@@ -192,12 +198,6 @@ class Worker:
     if code < 0:
       name = signal.Signals(-code).name
       return "killed", f"killed by {name}{', perhaps for want of memory' if code == -signal.SIGKILL else ''}"
-    if run.get("status") == "failed" and run.get("reason"):
-      return "failed", run["reason"]
-    lines = _lines(next(iter(self._records)).log)
-    own = f"{folder.path.name} failed: "
-    if said := [line.removeprefix(own) for line in lines if line.startswith(own)]:  # of one run among several
-      return "failed", said[-1]
     return "failed", f"exit code {code}: {lines[-1] if lines else 'no output'}"
 
 

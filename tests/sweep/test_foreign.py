@@ -76,6 +76,7 @@ def test_a_relative_folder_of_compiled_programs_is_the_users(tmp_path: Path, mon
 def test_a_link_out_of_a_sweep_is_not_followed(tmp_path: Path, name: str) -> None:
   sweep = make_sweep(tmp_path / "sweep", 0)
   (sweep.path / name).parent.mkdir(parents=True, exist_ok=True)
+  (sweep.path / name).unlink(missing_ok=True)
   (sweep.path / name).symlink_to(tmp_path / "outside")
   for command in (run, lambda sweep: commands.collect(str(sweep.path)), lambda sweep: commands.stop(str(sweep.path))):
     with pytest.raises(CheckpointError, match=f"{name} is a link that leads out of {sweep.path}: put what it stands"):

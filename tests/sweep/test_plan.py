@@ -1,6 +1,7 @@
 """From a command line to a sweep on disk."""
 
 import sys
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,8 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 from playground.config.sweep_options import LocalConfig, SlurmConfig
-from playground.errors import ConfigError, PlaygroundError
+from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.sweep import local
+from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.plan import plan, settings_of
 
 LINE = ["env=CartpoleBalance,PointMass", "seed=1,2", "agent.max_grad_norm=null,1.0", "debug=fast"]
@@ -67,6 +69,21 @@ def test_the_same_command_finds_its_sweep_again(here: Path) -> None:
     plan(["seed=4,5", f"sweep_dir={first.path}"])
 
 
+def test_of_two_commands_for_one_new_folder_the_second_writes_nothing(
+  here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  check = local.LocalLauncher.check
+
+  def late(config: LocalConfig, jobs: Sequence[Job]) -> None:
+    monkeypatch.setattr(local.LocalLauncher, "check", check)
+    plan(["seed=1,2", "sweep_dir=mine"])
+
+  monkeypatch.setattr(local.LocalLauncher, "check", late)
+  with pytest.raises(CheckpointError, match=r"^sweep_dir=mine became another sweep's while .*: repeat the command\.$"):
+    plan(["seed=3,4", "sweep_dir=mine"])
+  assert [job.varies for job in SweepDirectory.open("mine").jobs] == [{"seed": 1}, {"seed": 2}]
+
+
 def test_sweeps_of_one_second_have_folders_of_their_own(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   started, other = datetime(2026, 1, 1), Path("results/sweeps/quickstart/2026-01-01_00-00-00")
   monkeypatch.setattr("playground.sweep.plan.datetime", SimpleNamespace(now=lambda: started))
@@ -99,7 +116,7 @@ def test_a_damaged_sweep_does_not_stop_another(here: Path, capsys: pytest.Captur
   first, _ = plan(["seed=1,2"])
   (first.path / "sweep.yaml").write_text("a: 1\n")
   assert plan(["seed=1,2"])[0].path != first.path
-  assert f"{first.path / 'sweep.yaml'} is damaged: 'name'. It is passed over." in capsys.readouterr().err
+  assert f"{first.path / 'sweep.yaml'} is damaged: name is null. It is passed over." in capsys.readouterr().err
 
 
 def test_what_a_job_needs(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from playground.config.sweep_options import SlurmConfig
 from playground.errors import ConfigError, HardwareError
 from playground.sweep import slurm
 from playground.sweep.folder import Job
-from playground.sweep.slurm import SlurmLauncher, slurm_parameters
+from playground.sweep.slurm import Queue, SlurmLauncher, slurm_parameters
 from tests.sweep.helpers import STUB, make_sweep, run, starts, statuses
 
 
@@ -92,23 +92,54 @@ def test_without_slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   sweep = make_sweep(tmp_path / "sweep", 0)
   with pytest.raises(HardwareError, match="there is no sbatch here"):
     run(sweep, "launcher=slurm")
+  program(tmp_path / "sbatch", "")
+  with pytest.raises(HardwareError, match="there is no squeue here"):
+    run(sweep, "launcher=slurm")
+  with pytest.raises(ConfigError, match=r"^launcher\.parameters has parsable, .*: drop it\.$"):
+    run(sweep, "launcher=slurm", "launcher.parameters={parsable: true}")
   with pytest.raises(ConfigError, match=r"leave launcher\.max_parallel out"):
     run(sweep, "launcher=slurm", "launcher.wait=false", "launcher.max_parallel=3")
   with pytest.raises(ConfigError, match=r"launcher\.minutes=1 leaves no time to train: .* save 90 s"):
     run(sweep, "launcher=slurm", "launcher.minutes=1")
 
 
-def test_what_sbatch_refuses_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-  for name in ("sbatch", "srun"):
-    (tmp_path / name).write_text(
-      "#!/bin/sh\necho sbatch: error: a word >&2\necho sbatch: error: No such partition >&2\nexit 1\n"
-    )
-    (tmp_path / name).chmod(0o755)
+def program(path: Path, script: str) -> None:
+  path.write_text(f"#!/bin/sh\n{script}\n")
+  path.chmod(0o755)
+
+
+@pytest.mark.parametrize(
+  ("script", "message"),
+  [
+    (
+      "echo a word >&2; echo sbatch: error: No such partition >&2; exit 1",
+      "refused job 0.* \\(error: No such partition\\)",
+    ),
+    ("exit 1", "refused job 0.* \\(without a reason\\)"),
+    ("echo queued as foo", "names no number of job 0.* \\(Could not .*foo.*\\): if squeue shows the job, cancel it"),
+  ],
+)
+def test_what_sbatch_refuses_is_one_sentence(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, message: str
+) -> None:
+  for name in ("sbatch", "srun", "squeue"):
+    program(tmp_path / name, script if name == "sbatch" else "")
   monkeypatch.setenv("PATH", str(tmp_path))
   sweep = make_sweep(tmp_path / "sweep", 0, needs=0)
-  with pytest.raises(HardwareError, match=r"sbatch refused job 000_seed=0 \(error: No such partition\)"):
+  with pytest.raises(HardwareError, match=rf"^launcher=slurm: sbatch {message}"):
     run(sweep, "launcher=slurm")
   assert statuses(sweep) == {0: "queued"}
+
+
+@pytest.mark.parametrize("script", ["exit 1", "sleep 60", None])
+def test_a_queue_without_an_answer_is_unknown(
+  tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str | None
+) -> None:
+  monkeypatch.setattr(slurm, "ANSWER_S", 0.2)
+  if script is not None:
+    program(tmp_path / "squeue", f"PATH=/bin:/usr/bin {script}")
+  monkeypatch.setenv("PATH", str(tmp_path))
+  assert Queue().state("7") == "UNKNOWN"
 
 
 def test_a_search_waits_for_its_jobs() -> None:

@@ -184,6 +184,15 @@ def test_a_removed_folder_costs_the_others_nothing(tmp_path: Path, lost: str) ->
   assert records[lost]["reason"] == said
 
 
+def test_a_job_that_failed_before_the_others_were_stopped_says_so(tmp_path: Path) -> None:
+  sweep = make(tmp_path / "sweep", "seed=1", "seed=2")
+  group = "import time\nprint('001 failed: it is damaged.', flush=True)\ntime.sleep(60)"
+  assert run(sweep, "launcher=together", "launcher.timeout=2", command=(sys.executable, "-c", group)) == 2
+  records = {job.name: sweep.folder(job).record for job in sweep.jobs}
+  found = {name: (record["status"], record["reason"]) for name, record in records.items()}
+  assert found == {"000": ("timeout", "took longer than launcher.timeout=2 s"), "001": ("failed", "it is damaged.")}
+
+
 @pytest.mark.slow
 def test_a_sweep_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   sweep = ["-m", *TASK, "agent.num_timesteps=200", "seed=1,2", "launcher=together", f"sweep_dir={tmp_path / 'sweep'}"]
