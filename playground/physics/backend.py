@@ -24,12 +24,6 @@ from playground.text import first_line
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that Warp is not installed
   from mujoco import mjx
 
-# Integrators: the part of a step that follows forward dynamics.
-_INTEGRATE = {
-  mujoco.mjtIntegrator.mjINT_EULER: mjx.euler,
-  mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit,
-}
-
 WORLDS = "worlds"  # the axis of the batch of environments, for `jax.vmap(axis_name=...)`: Warp's buffers grow with it
 _FEW = 64  # smaller batches get the buffers of so many environments, since their mean may be above the average
 
@@ -205,7 +199,10 @@ class Physics:
     """`mjx.step`, with the forward dynamics that everything here shares."""
     if self.impl == "warp":
       return mjx.step(model, data)
-    return _INTEGRATE[self.mj_model.opt.integrator](model, self._forward(model, data))
+    data = self._forward(model, data)
+    if self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+      return mjx.euler(model, data)
+    return mjx.implicit(_without_saturated(model, data), data)
 
   def _template(self) -> mjx.Data:
     if self.impl == "jax":
@@ -241,6 +238,19 @@ def _axis_size(name: str) -> int:
     return jax.lax.axis_size(name)
   except NameError:  # nothing around is mapped over it
     return 1
+
+
+def _without_saturated(model: mjx.Model, data: mjx.Data) -> mjx.Model:
+  """The model for `mjx.implicit`: a force at its limit does not change with the velocity.
+
+  C MuJoCo and MuJoCo-Warp leave such forces out of the derivative; MJX 3.17 does not, which damps the joint.
+  """
+  if not model.actuator_forcelimited.any():
+    return model
+  low, high = model.actuator_forcerange.T
+  saturated = model.actuator_forcelimited & ((data.actuator_force <= low) | (data.actuator_force >= high))
+  prm = {name: getattr(model, name).at[:, 2].multiply(~saturated) for name in ("actuator_biasprm", "actuator_gainprm")}
+  return model.replace(**prm)
 
 
 def _put_on_warp(mj_model: mujoco.MjModel) -> mjx.Model:

@@ -54,6 +54,21 @@ def test_sensors_are_those_of_one_time_in_mjx_and_c_mujoco() -> None:
     Physics(model)
 
 
+def test_a_saturated_servo_is_not_damped() -> None:
+  servo = "<position joint='hinge' kp='1' kv='0.1' ctrllimited='false' forcelimited='true' forcerange='-1 1'/>"
+  model = mujoco.MjModel.from_xml_string(
+    "<mujoco><option timestep='0.01' integrator='implicitfast'/><worldbody><body><joint name='hinge' axis='0 0 1'/>"
+    f"<geom type='box' size='.1 .1 .1' mass='1'/></body></worldbody><actuator>{servo}</actuator></mujoco>"
+  )
+  data, physics = mujoco.MjData(model), Physics(model)
+  for target in (2.0, 0.0):  # saturated, and not
+    data.ctrl[:] = target
+    before = physics.make(qpos=data.qpos, qvel=data.qvel)
+    mujoco.mj_step(model, data)
+    after = jax.jit(physics.step, static_argnums=3)(physics.model, before, jnp.full(1, target), 1)
+    np.testing.assert_allclose(after.qvel, data.qvel, rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_agents_with_other_rewards_and_models_call_warp_once() -> None:
   sizes = ["num_envs=40", "num_eval_envs=4", "batch_size=40", "num_minibatches=1", "unroll_length=2"]
