@@ -1,5 +1,6 @@
 """One environment of a task in NumPy, which the interfaces of other libraries wrap."""
 
+import os
 from typing import NamedTuple
 
 import jax
@@ -14,6 +15,8 @@ from playground.pytree import PyTree
 from playground.settings import Section
 
 Arrays = np.ndarray | dict[str, np.ndarray]
+
+_builders: set[int] = set()  # this process, and those that it is a fork of, if they have built a task
 
 
 class Moment(NamedTuple):
@@ -85,6 +88,13 @@ def load_task(task: str, overrides: Section | None = None, physics: str = "mjx")
 
   Raises:
     UnknownNameError: no such task, key or physics.
+    ConfigError: this process is a fork of one that has built a task; JAX would wait for threads that it lacks.
   """
+  _builders.add(os.getpid())
+  if len(_builders) > 1:
+    raise ConfigError(
+      "This process is a fork of one that has started JAX, and would hang: spawn processes, in gymnasium.make_vec with "
+      "vector_kwargs={'context': 'spawn'}."
+    )
   place = lookup({"c": on_c_physics, "mjx": lambda env: env}, physics, "physics")
   return place(registry.load(task, overrides=overrides))

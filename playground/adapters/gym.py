@@ -59,9 +59,11 @@ class GymEnv(gymnasium.Env[PyTree, np.ndarray]):
       render_mode: `rgb_array` or None.
 
     Raises:
-      UnknownNameError: no such task, key, physics or entry.
+      UnknownNameError: no such task, key, physics, entry or render mode.
+      ConfigError: as `load_task`.
     """
-    lookup({None: None, "rgb_array": None}, render_mode, "render_mode")  # pyright: ignore[reportArgumentType]
+    if render_mode is not None:
+      lookup({"rgb_array": None}, render_mode, "render_mode")
     self._episodes = Episodes(task, overrides, physics)
     env = self._episodes.env
     self._entry = entry
@@ -156,8 +158,10 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[PyTree, np.ndarray, np.ndarray]):
 
     Raises:
       UnknownNameError: another autoreset mode than `NextStep` and `SameStep`.
-      ConfigError: a render mode, or `max_episode_steps`.
+      ConfigError: no environment, a render mode, or `max_episode_steps`.
     """
+    if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+      raise ConfigError(f"num_envs={num_envs!r} must be a whole number, at least 1.")
     if max_episode_steps is not None:
       remedy = f"overrides={{'episode_length': {max_episode_steps}}} counts control steps"
       raise ConfigError(f"max_episode_steps={max_episode_steps}: a batch has the task's own limit; {remedy}.")

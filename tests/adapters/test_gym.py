@@ -186,8 +186,30 @@ def test_what_a_batch_does_not_do_is_refused() -> None:
     GymVectorEnv(3, "CartpoleBalance", autoreset_mode="Disabled")
   with pytest.raises(ConfigError, match="render_mode='rgb_array': a batch renders nothing"):
     gymnasium.make_vec("playground/CartpoleBalance", num_envs=3, render_mode="rgb_array")
+  for number in (0, 1.5, "2"):
+    with pytest.raises(ConfigError, match=rf"^num_envs={number!r} must be a whole number, at least 1\.$"):
+      GymVectorEnv(number, "CartpoleBalance")  # pyright: ignore[reportArgumentType]
+  with pytest.raises(ConfigError, match="render_mode: 'human' is unknown; choose from rgb_array"):
+    GymEnv("CartpoleBalance", render_mode="human")
   with pytest.raises(ConfigError, match=r"max_episode_steps=5: a batch has the task's own limit; overrides="):
     gymnasium.make_vec("playground/CartpoleBalance", num_envs=3, max_episode_steps=5)
+
+
+def test_a_fork_of_a_process_with_jax_is_refused() -> None:
+  """It would hang: gymnasium's AsyncVectorEnv forks by default."""
+  code = """
+import os
+from playground.adapters.gym import GymEnv
+from playground.errors import ConfigError
+GymEnv("CartpoleBalance").reset(seed=0)
+if child := os.fork():
+  raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+try:
+  GymEnv("CartpoleBalance")
+except ConfigError as error:
+  os._exit(7 * ("vector_kwargs={'context': 'spawn'}" in str(error)))
+"""
+  assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 7
 
 
 def test_a_mask_begins_some_episodes_anew() -> None:
