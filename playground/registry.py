@@ -16,7 +16,7 @@ Classes of any other package are refused unless the user trusts it (`playground.
 import dataclasses
 import functools
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Protocol, cast
 
 from ml_collections import ConfigDict
@@ -87,6 +87,9 @@ def load(
     UnknownNameError: no such task or key.
     ConfigError: an invalid value.
   """
+  for given in (overrides, config_overrides):
+    if not isinstance(given, Mapping | ConfigDict | None):
+      raise ConfigError(f"overrides={given!r} must be a dict of dotted keys, such as {{'episode_length': 500}}.")
   default = _composed(name).env if config is None else config
   if isinstance(config, ConfigDict) and list(config) == sorted(config):  # a copy of a ConfigDict has its keys sorted
     default = in_order_of(_composed(name).env, config)
@@ -185,6 +188,7 @@ def get_domain_randomizer(name: str) -> DomainRandomizer | None:
 
 def _composed(name: str) -> RunConfig:
   """Composes a task without a tuned set, whose values for the task belong to an algorithm."""
-  if name not in (task_names() if "/" not in name else options("env")):
-    raise UnknownNameError(f"Task {name!r} does not exist; `playground list` shows all.{nearest(name, task_names())}")
+  if name not in (options("env") if "/" in str(name) else task_names()):
+    near = nearest(str(name), task_names())
+    raise UnknownNameError(f"Task {name!r} does not exist; `playground list` shows all.{near}")
   return compose([f"env={name}", "tuned=null"])

@@ -126,6 +126,8 @@ def test_a_changed_task_is_not_pickled():
   [
     ("CartpolBalance", {}, r"'CartpolBalance' does not exist.*Did you mean 'CartpoleBalance'\?"),
     ("joystick", {}, "'joystick' does not exist"),
+    (None, {}, "Task None does not exist; `playground list`"),
+    ("CartpoleBalance", ["ctrl_dt=1"], r"^overrides=\['ctrl_dt=1'\] must be a dict of dotted keys, such as \{'ep"),
     ("CartpoleBalance", {"episode_lenth": 1}, r"env\.episode_lenth does not exist.*'env\.episode_length'"),
     ("Go1JoystickFlatTerrain", {"rewards.joint_powr_l1.weight": 1}, "Did you mean 'joint_power_l1'"),
     ("CartpoleBalance", {"ctrl_dt": "slow"}, r"env\.ctrl_dt=slow .* must be a number"),
@@ -135,7 +137,7 @@ def test_a_changed_task_is_not_pickled():
     ("CartpoleBalance", {"episode_length": 0}, r"env\.episode_length=0 must be a whole number from 1"),
   ],
 )
-def test_load_refuses(name: str, overrides: dict[str, Any], message: str):
+def test_load_refuses(name: Any, overrides: Any, message: str):
   with pytest.raises(ConfigError, match=message):
     registry.load(name, overrides=overrides)
 

@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Annotated
 
+from playground import registry
 from playground.benchmark.arguments import check_limits
 from playground.benchmark.jobs import Measurement, Plan
 from playground.config import RunConfig, compose
@@ -65,7 +66,7 @@ class OfTasks(Measuring):
         f"hardware.devices= is no override of {self.name}: only topology, with devices=, measures on several."
       )
     for task in self.chosen() if self.overrides else self.chosen()[:1]:  # without overrides, all tasks are valid
-      self.configured(task)
+      registry.check(self.configured(task).env)
 
   def chosen(self) -> list[str]:
     """Returns the tasks of `suite` and `tasks`, each once; tasks of a suite that this package lacks are left out."""

@@ -112,7 +112,8 @@ def _devices() -> Iterator[Finding]:
     devices = jax.devices()
     jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((8, 8))))
   except Exception as error:
-    yield Finding("JAX backend", first_line(error), False, "unset JAX_PLATFORMS, or set it to cpu")
+    found = first_line(error) if str(error) else f"no device of JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}"
+    yield Finding("JAX backend", found, False, "unset JAX_PLATFORMS, or set it to cpu")
     return
   kinds = ", ".join(sorted({d.device_kind for d in devices}))
   yield Finding("JAX backend", f"{jax.default_backend()}, {len(devices)} x {kinds}")
@@ -147,15 +148,20 @@ def _caches() -> Iterator[Finding]:
   # The default of hardware/setup.py, which cannot be imported here: it needs a JAX that works.
   home = Path("~/.cache/playground").expanduser()
   xla = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or home / "xla")
-  yield Finding("XLA cache", f"{xla}, {_size(xla)}")
+  yield _cache("XLA cache", xla)
   if package_version("warp-lang"):
     warp = Path(os.environ.get("WARP_CACHE_PATH") or home / "warp")
-    yield Finding("Warp cache", f"{warp}, {_size(warp)}")
+    yield _cache("Warp cache", warp)
+
+
+def _cache(name: str, folder: Path) -> Finding:
+  there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+  if not there.is_dir() or not os.access(there, os.W_OK):
+    return Finding(name, f"{folder}, {there} is no folder to write to", None, "name another, or compile in each run")
+  return Finding(name, f"{folder}, {_size(folder) if there == folder else 'empty'}")
 
 
 def _size(folder: Path) -> str:
-  if not folder.is_dir():
-    return "empty"
   total = 0
   for path in folder.rglob("*"):
     with contextlib.suppress(OSError):  # another process may be cleaning up

@@ -40,6 +40,7 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Command:
     (["throughput", "tasks=CheetahRun", "minutes=nan"], "minutes=nan must be a number above 0"),
     (["throughput", "tasks=CheetahRun", "gpus=[-1]"], "gpus=[-1] must be a list of whole numbers from 0"),
     (["throughput", "tasks=CheetahRun", "hardware.devices=2"], "hardware.devices= is no override of throughput"),
+    (["throughput", "tasks=CheetahRun", "env.task=x"], "env.task=x is not of the form module:name"),
     (["throughput", "tasks=CartpoleBalance,CheetahRun", "env.swing_up=true"], "env.swing_up does not exist"),
     (["scaling", "tasks=CheetahRun", "num_envs="], "num_envs= is empty"),
     (["scaling", "tasks=CheetahRun", "num_envs=64,-4"], "num_envs=[64, -4] must be a list of whole numbers from 1"),

@@ -62,6 +62,19 @@ def test_a_gpu_that_jax_does_not_use(report, monkeypatch: pytest.MonkeyPatch, dr
   assert "not used by JAX" in row(text, "GPU") and f"pip install -e '.[{extra}]'" in row(text, "GPU")
 
 
+def test_a_cache_that_cannot_be_written_is_named(report, monkeypatch: pytest.MonkeyPatch):
+  monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", f"{__file__}/xla")
+  code, text = report()
+  assert code == 0 and "test_doctor.py is no folder to write to" in row(text, "XLA cache")
+
+
+def test_a_platform_that_jax_lacks_is_named():
+  environment = os.environ | {"JAX_PLATFORMS": "cuda", "COLUMNS": "200", "CUDA_VISIBLE_DEVICES": ""}
+  code = "import sys; from playground.cli.doctor import doctor; sys.exit(doctor())"
+  done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+  assert done.returncode == 1 and "AssertionError" not in row(done.stdout, "JAX backend")
+
+
 def test_no_gl_says_how_to_get_it(report, monkeypatch: pytest.MonkeyPatch):
   monkeypatch.setattr(module, "find_gl", lambda: None)
   code, text = report()
