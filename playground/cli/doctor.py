@@ -147,17 +147,16 @@ def _rendering() -> Iterator[Finding]:
 def _caches() -> Iterator[Finding]:
   # The default of hardware/setup.py, which cannot be imported here: it needs a JAX that works.
   home = Path("~/.cache/playground").expanduser()
-  xla = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or home / "xla")
-  yield _cache("XLA cache", xla)
+  yield _cache("XLA cache", "JAX_COMPILATION_CACHE_DIR", home / "xla")
   if package_version("warp-lang"):
-    warp = Path(os.environ.get("WARP_CACHE_PATH") or home / "warp")
-    yield _cache("Warp cache", warp)
+    yield _cache("Warp cache", "WARP_CACHE_PATH", home / "warp")
 
 
-def _cache(name: str, folder: Path) -> Finding:
-  there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-  if not there.is_dir() or not os.access(there, os.W_OK):
-    return Finding(name, f"{folder}, {there} is no folder to write to", None, "name another, or compile in each run")
+def _cache(name: str, variable: str, default: Path) -> Finding:
+  folder = Path(os.environ.get(variable) or default)
+  there = next(path for path in (folder, *folder.absolute().parents) if os.path.exists(path))
+  if not os.path.isdir(there) or not os.access(there, os.W_OK):
+    return Finding(name, f"{folder}, {there} is no folder to write to", None, f"set {variable} to one, or compile anew")
   return Finding(name, f"{folder}, {_size(folder) if there == folder else 'empty'}")
 
 

@@ -66,6 +66,7 @@ def test_a_cache_that_cannot_be_written_is_named(report, monkeypatch: pytest.Mon
   monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", f"{__file__}/xla")
   code, text = report()
   assert code == 0 and "test_doctor.py is no folder to write to" in row(text, "XLA cache")
+  assert "set JAX_COMPILATION_CACHE_DIR to one" in row(text, "XLA cache")
 
 
 def test_a_platform_that_jax_lacks_is_named():
