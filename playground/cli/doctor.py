@@ -156,7 +156,7 @@ def _cache(name: str, variable: str, default: Path) -> Finding:
   folder = Path(os.environ.get(variable) or default)
   there = next(path for path in (folder, *folder.absolute().parents) if os.path.exists(path))
   if not os.path.isdir(there) or not os.access(there, os.W_OK):
-    return Finding(name, f"{folder}, {there} is no folder to write to", None, f"set {variable} to one, or compile anew")
+    return Finding(name, f"{folder}, {there} is no folder to write to", None, f"set {variable} to one")
   return Finding(name, f"{folder}, {_size(folder) if there == folder else 'empty'}")
 
 
