@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from playground.extras import install_command
+from playground.files import unwritable
 from playground.hardware.gpus import query_gpus
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.runs.provenance import package_version
@@ -154,10 +155,9 @@ def _caches() -> Iterator[Finding]:
 
 def _cache(name: str, variable: str, default: Path) -> Finding:
   folder = Path(os.environ.get(variable) or default)
-  there = next(path for path in (folder, *folder.absolute().parents) if os.path.exists(path))
-  if not os.path.isdir(there) or not os.access(there, os.W_OK):
-    return Finding(name, f"{folder}, {there} is no folder to write to", None, f"set {variable} to one")
-  return Finding(name, f"{folder}, {_size(folder) if there == folder else 'empty'}")
+  if why := unwritable(folder):
+    return Finding(name, why, None, f"set {variable} to one")
+  return Finding(name, f"{folder}, {_size(folder) if folder.is_dir() else 'empty'}")
 
 
 def _size(folder: Path) -> str:

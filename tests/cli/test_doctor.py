@@ -65,7 +65,7 @@ def test_a_gpu_that_jax_does_not_use(report, monkeypatch: pytest.MonkeyPatch, dr
 def test_a_cache_that_cannot_be_written_is_named(report, monkeypatch: pytest.MonkeyPatch):
   monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", f"{__file__}/xla")
   code, text = report()
-  assert code == 0 and "test_doctor.py is no folder to write to" in row(text, "XLA cache")
+  assert code == 0 and "test_doctor.py is not a folder that you may write to" in row(text, "XLA cache")
   assert "set JAX_COMPILATION_CACHE_DIR to one" in row(text, "XLA cache")
 
 

@@ -113,10 +113,13 @@ def program(path: Path, script: str) -> None:
   [
     (
       "echo a word >&2; echo sbatch: error: No such partition >&2; exit 1",
-      "refused job 0.* \\(error: No such partition\\)",
+      "refused job 000_seed=0 \\(error: No such partition\\)",
     ),
-    ("exit 1", "refused job 0.* \\(without a reason\\)"),
-    ("echo queued as foo", "names no number of job 0.* \\(Could not .*foo.*\\): if squeue shows the job, cancel it"),
+    ("exit 1", "refused job 000_seed=0 \\(without a reason\\)"),
+    (
+      "echo queued as foo",
+      "names no number of job 000_seed=0 \\(Could not .*foo.*\\): if squeue shows the job, cancel it",
+    ),
   ],
 )
 def test_what_sbatch_refuses_is_one_sentence(
