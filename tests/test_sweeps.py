@@ -91,12 +91,14 @@ def test_the_command_line_replaces_what_the_file_says(folder: Path):
 
 def test_a_list_in_a_file_is_its_values_one_by_one(folder: Path):
   (folder / "sizes.yaml").write_text(
-    "params: {agent.network.value_hidden_layer_sizes: [[8], [8, 8]], agent.max_grad_norm: [null, 1.0]}\n"
+    "params: {agent.network.value_hidden_layer_sizes: [[8], [8, 8]], agent.max_grad_norm: [null, 1.0],\n"
+    "  tracking.wandb.project: [\"'a,b'\", c]}\n"
   )
   assert expand(["sweep=sizes"]) == [
     *("agent.network.value_hidden_layer_sizes=[8],[8, 8]", "agent.max_grad_norm=null,1.0"),
+    "tracking.wandb.project='a,b',c",
   ]
-  assert len(jobs(expand(["sweep=sizes"]))) == 4
+  assert len(jobs(expand(["sweep=sizes"]))) == 8
 
 
 @pytest.mark.parametrize(
@@ -128,6 +130,7 @@ def test_globs(glob: str, names: list[str]):
     "env=CartpoleBalance,CartpoleSwngup": "env=CartpoleSwngup does not exist",
     "env=[1": "'env=[1' is not an override",
     "seed=range(0,2,0)": "seed=range(0,2,0) has no values: range() arg 3 must not be zero.",
+    "seed=range(2),5": "seed=range(2),5: a range stands alone, so list its values among the others.",
     "seed=1,2 seed=3,4": "seed=1,2 seed=3,4: give all values of seed in one list.",
     "seed=0,1 seed=2": "seed=0,1 seed=2: give all values of seed in one list.",
   }.items(),
@@ -156,6 +159,8 @@ def test_what_is_refused(folder: Path, line: str, message: str):
     "jobs: ['seed=1 run_dir=x']": "run_dir=x cannot be given with -m",
     "params: {seed: []}": "sweep=bad: params.seed=[] must be a value or a list of values.",
     "params: {agent: {num_envs: 1}}": "sweep=bad: params.agent={num_envs: 1} must be a value or a list of values.",
+    "params: {run_dir: ['a,b', c]}": "sweep=bad: 'a,b' in params.run_dir is not one value: write \"'a,b'\".",
+    "params: {tracking.wandb.project: ['a=b']}": "sweep=bad: 'a=b' in params.tracking.wandb.project is not one value",
     "params: {env: CartpoleBalanc}": "env=CartpoleBalanc does not exist",
     "jobs: ['seed=\"1']": "sweep=bad: its job 'seed=\"1' cannot be read: No closing quotation.",
     "params: &a {seed: *a}": "sweep=bad: its file cannot be read: ",
@@ -249,6 +254,8 @@ def test_too_many_jobs(lines: list[str], count: str):
     "resume=x": "resume=x cannot be given with -m",
     "hydra.sweep.dir=x": "hydra.sweep.dir=x: -m does not use Hydra's",
     "hydra/launcher=joblib": "hydra/launcher=joblib: -m does not use Hydra's",
+    "on_error=stop,continue": "on_error=stop,continue: give one value, which applies to all jobs of the sweep.",
+    "launcher=local,slurm": "launcher=local,slurm: give one value,",
   }.items(),
 )
 def test_keys_that_jobs_cannot_have(line: str, message: str):

@@ -96,7 +96,13 @@ class VecEnv(rsl_rl_env.VecEnv):
     return TensorDict({group: to_torch(entries[entry]) for group, entry in self.groups.items()}, [self.num_envs])
 
   def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Extra]]:
-    """Applies actions, [num_envs, num_actions], clipped to [-1, 1]; see RSL-RL's `VecEnv.step` for what it returns."""
+    """Applies actions, [num_envs, num_actions], clipped to [-1, 1]; see RSL-RL's `VecEnv.step` for what it returns.
+
+    Raises:
+      ConfigError: actions of another shape, which JAX may broadcast.
+    """
+    if actions.shape != (shape := (self.num_envs, self.num_actions)):
+      raise ConfigError(f"actions have the shape {list(actions.shape)}, and must have {list(shape)}.")
     state = self.state = self._step(self.state, to_jax(actions.clamp(-1.0, 1.0)))
     extras: dict[str, Extra] = {"time_outs": to_torch(state.info["truncation"])}
     if FINAL_OBS in state.info:
@@ -128,9 +134,11 @@ def vec_env(
     groups: see `VecEnv`.
 
   Raises:
-    ConfigError: the task has images.
+    ConfigError: the task has images, or `num_envs` is below 1.
     UnknownNameError: the task has no such observation group.
   """
+  if num_envs < 1:
+    raise ConfigError(f"num_envs={num_envs} must be at least 1.")
   batch = AutoReset(wrap_for_evaluation(env), keep_final_obs=True)
   groups = group_entries(env, groups)
   reset_key, model_key = jax.random.split(jax.random.PRNGKey(seed))

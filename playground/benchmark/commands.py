@@ -197,7 +197,7 @@ class Chain(Measuring):
 
   def check(self) -> None:
     super().check()
-    need_folder(Path(self.runs), f"runs={self.runs}")
+    need_folder(Path(self.runs).expanduser(), f"runs={self.runs}")
     if not compose([f"experiment={self.experiment}", *self.overrides]).stages:
       raise ConfigError(f"experiment={self.experiment} is no chain: choose one that ends in _chain.")
 

@@ -14,7 +14,8 @@ from typing import Annotated, Any
 from playground.benchmark.schema import Table, commit_of
 from playground.benchmark.worker import ROW
 from playground.config.sweep_options import LocalConfig
-from playground.errors import HardwareError
+from playground.errors import ConfigError, HardwareError
+from playground.hardware.gpus import query_gpus
 from playground.interpreter import PYTHON
 from playground.limits import count, counts, positive
 from playground.runs.provenance import git_state
@@ -139,8 +140,12 @@ def probe(overrides: Sequence[str], gpus: Sequence[int]) -> tuple[int, dict[str,
   A child process queries the devices, so that this process holds none.
 
   Raises:
+    ConfigError: the machine has no such GPU.
     HardwareError: the device does not work.
   """
+  known = query_gpus("index") if gpus else []
+  if any(str(gpu) not in known for gpu in gpus):
+    raise ConfigError(f"gpus={list(gpus)}: this machine has {'the GPUs ' * bool(known)}{', '.join(known) or 'no GPU'}.")
   found: list[Row] = []
   columns: dict[str, str] = dict.fromkeys(("task", "agent", "who", "setting"), "")
   machine = Measurement("machine", {"overrides": list(overrides)}, columns, {})

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from playground.errors import ConfigError
-from playground.files import csv_text
+from playground.files import csv_text, need_folder
 
 COLUMNS = {
   "benchmark": "the command, such as throughput, together, startup, topology, chain, compare, learning or golden",
@@ -63,6 +63,7 @@ class Table:
     Raises:
       ConfigError: the file holds something else, or is not writable.
     """
+    need_folder(path.parent, f"out={path}")
     self.path = path
     self._rows: list[dict[str, str]] = []
     with self._to_itself() as file:

@@ -1,6 +1,7 @@
 """Sweeps, `playground-run -m`: expands sweep files and globs into jobs.
 
-A sweep file, ours in sweeps/ or your own, holds overrides as on the command line; a list is one job for each value:
+A sweep file, ours in sweeps/ or your own, holds overrides as on the command line; a list is one job for each value.
+Text with a comma, or another sign of the command line, needs its quotes, too: `"'a,b'"`.
 
 ```yaml
 params:
@@ -20,13 +21,14 @@ jobs:
 ```
 """
 
+import contextlib
 import itertools
 import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from hydra.core.override_parser.types import ChoiceSweep, Glob
+from hydra.core.override_parser.types import ChoiceSweep, Glob, RangeSweep
 from hydra.core.override_parser.types import Override as HydraOverride
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -36,9 +38,10 @@ from playground.config.files import config_roots, groups, listed_options, shippe
 from playground.config.overrides import SHORT_KEYS, is_hydras, is_of_command, is_of_sweep, parse, parse_with_hydra
 from playground.errors import ConfigError, UnknownNameError, nearest
 from playground.files import check_aliases
-from playground.text import first_line, format_value
+from playground.text import first_line, format_value, quoted
 
 MAX_JOBS = 10_000  # of a sweep; 1,000 take 10 s to compose
+_ONE_VALUE = "give one value, which applies to all jobs of the sweep"
 _HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper")
 
 
@@ -119,6 +122,8 @@ def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
       raise ConfigError(f"{line} cannot be given with -m, whose jobs lie in the sweep's folder: {instead}.")
     if line.lstrip("+~").startswith(_HYDRAS_OWN):
       raise ConfigError(f"{line}: -m does not use Hydra's launchers and sweepers, launcher=<name> is ours.")
+    if is_of_sweep(key) and parse_with_hydra(line).is_sweep_override():
+      raise ConfigError(f"{line}: {_ONE_VALUE}.")
     (settings if is_of_sweep(key) else ours).append(line)
   return settings, ours
 
@@ -132,7 +137,7 @@ def command_lines(overrides: Sequence[str]) -> list[str]:
   lines = [line for line in expand(overrides) if is_of_command(line)]
   for line in lines:
     if parse_with_hydra(line).is_sweep_override():
-      raise ConfigError(f"{line}: give one value, which applies to all jobs of the sweep.")
+      raise ConfigError(f"{line}: {_ONE_VALUE}.")
   return lines
 
 
@@ -186,6 +191,9 @@ def _values(text: str) -> list[str]:
     return [text]
   if not override.is_discrete_sweep():  # an interval: a search draws from it
     return []
+  value = override.value()
+  if isinstance(value, ChoiceSweep) and any(isinstance(entry, RangeSweep) for entry in value.list):
+    raise ConfigError(f"{text}: a range stands alone, so list its values among the others.")
   try:
     return [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
   except ValueError as error:
@@ -247,4 +255,16 @@ def _override(name: str, key: str, value: object) -> str:
   values = value if isinstance(value, list) else [value]
   if not values or any(isinstance(entry, Mapping) for entry in values):
     raise ConfigError(f"sweep={name}: params.{key}={format_value(value)} must be a value or a list of values.")
+  for entry in values if isinstance(value, list) else []:
+    _check_entry(name, key, entry)
   return f"{key}={','.join(map(format_value, values))}"
+
+
+def _check_entry(name: str, key: str, entry: object) -> None:
+  """Raises ConfigError for text in a list that the command line would read as several values, or not at all."""
+  if not isinstance(entry, str):
+    return
+  with contextlib.suppress(ConfigError):
+    if not isinstance(parse_with_hydra(f"{key}={entry}").value(), ChoiceSweep):
+      return
+  raise ConfigError(f'sweep={name}: {entry!r} in params.{key} is not one value: write "{quoted(entry)}".')

@@ -39,8 +39,8 @@ def _svg(size: tuple[float, float], draw: "Callable[[Figure], None]") -> str:
 
 
 def _wrapped(name: str) -> str:
-  """A name on lines that leave room for the drawing: a setting may be long."""
-  return textwrap.fill(name, 44)
+  """A name on lines that leave room for the drawing: a setting may be long, and hold a $, which begins a formula."""
+  return textwrap.fill(name, 44).replace("$", r"\$")
 
 
 def _height(names: Collection[str], least: float) -> float:
@@ -120,7 +120,7 @@ def stacked(title: str, bars: Mapping[str, Mapping[str, float]], x: str) -> str:
     left = dict.fromkeys(bars, 0.0)
     for i, name in enumerate(names):
       widths = [parts.get(name, 0.0) for parts in bars.values()]
-      axes.barh(list(map(_wrapped, bars)), widths, left=list(left.values()), label=name, color=COLOURS[i % 6])
+      axes.barh(list(map(_wrapped, bars)), widths, left=list(left.values()), label=_wrapped(name), color=COLOURS[i % 6])
       left = {bar: left[bar] + width for bar, width in zip(left, widths, strict=True)}
     axes.invert_yaxis()
     axes.set(title=title, xlabel=x)

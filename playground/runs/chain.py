@@ -10,6 +10,7 @@ start JAX and the device again for every stage, and would have to forward signal
 
 import contextlib
 import gc
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
@@ -152,7 +153,11 @@ def _laid_out(config: RunConfig) -> Iterator[tuple[RunDirectory, list[RunConfig]
     for stage, folder in zip(config.stages, stage_folders(config.curriculum).values(), strict=True):
       path = str(chain.path / folder)
       tracking = stage.resolved["tracking"]
-      wandb = {**tracking["wandb"], "group": tracking["wandb"]["group"] or chain.path.resolve().name}
+      wandb, sweep = dict(tracking["wandb"]), os.environ.get("WANDB_RUN_GROUP")
+      if sweep:  # whose group W&B takes where none is given
+        wandb["name"] = wandb["name"] or f"{chain.path.name}/{folder}"
+      else:
+        wandb["group"] = wandb["group"] or chain.path.resolve().name
       resolved = {**stage.resolved, "tracking": {**tracking, "wandb": wandb}, "run_dir": path, "init_from": before}
       if is_main():
         RunDirectory(path).write_config(resolved, stage.overrides)

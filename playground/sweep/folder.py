@@ -49,7 +49,7 @@ class Job:
     varies: the values in which the sweep's jobs differ, by key.
     needs: number of GPUs; None is one if there is any.
     steps: budget of environment steps.
-    task: name of the task; "" in the files of earlier versions.
+    task: name of the task, of a chain's last; "" in the files of earlier versions.
   """
 
   name: str
@@ -84,11 +84,18 @@ class Job:
     stages = [stage.agent.num_timesteps for stage in config.stages]
     steps = sum(stages) if stages else config.agent.num_timesteps
     kept = [text for text in overrides if not is_of_command(text)]
-    return cls(f"{number:03d}_{text}", kept, varies, needs, int(steps), str(config.choices["env"]))
+    return cls(f"{number:03d}_{text}", kept, varies, needs, int(steps), _task(config))
+
+
+def _task(config: RunConfig) -> str:
+  """Returns the task of a run, of a chain that of its last stage, whose return is the chain's."""
+  return str((config.stages or [config])[-1].choices["env"])
 
 
 def _value(config: RunConfig, key: str) -> Plain:
   """Returns a job's value of a key or group."""
+  if key == "env":
+    return _task(config)
   if key in config.choices:
     return config.choices[key]
   value = select(config.resolved, SHORT_KEYS.get(key, key))

@@ -1,5 +1,6 @@
 """Plans a sweep from a command line: composes and checks its jobs, and writes or finds its folder."""
 
+import json
 import os
 import re
 import sys
@@ -25,7 +26,16 @@ def compose_jobs(overrides: Sequence[str]) -> list[RunConfig]:
     from playground.sweep.search import first_values
 
     return configs.compose_all([first_values(sets[0])])
-  return configs.compose_all(configs.combinations(*sets))
+  return [config for _, config in _composed(sets)]
+
+
+def _composed(sets: Sequence[Sequence[str]]) -> list[tuple[list[str], RunConfig]]:
+  """Composes the jobs of a grid, and leaves out one that is another in other words, such as 1e6 and 1000000 steps."""
+  combinations = configs.combinations(*sets)
+  different: dict[str, tuple[list[str], RunConfig]] = {}
+  for job, config in zip(combinations, configs.compose_all(combinations), strict=True):
+    different.setdefault(json.dumps([config.choices, config.resolved], sort_keys=True), (job, config))
+  return list(different.values())
 
 
 def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
@@ -48,15 +58,11 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
     (config, _), jobs = configs.compose_all([first_values(lines), first_values(lines, inside=True)]), []
     name = _name(overrides, [config])
   else:
-    combinations = configs.combinations(*sets)
-    composed = configs.compose_all(combinations)
-    name = _name(overrides, composed)
+    composed = _composed(sets)
+    name = _name(overrides, [config for _, config in composed])
     varying = configs.varying(*sets)
-    jobs = [
-      Job.of_run(number, job, varying, config)
-      for number, (job, config) in enumerate(zip(combinations, composed, strict=True))
-    ]
-    for job, config in zip(combinations, composed, strict=True):
+    jobs = [Job.of_run(number, job, varying, config) for number, (job, config) in enumerate(composed)]
+    for job, config in composed:
       _check_task(job, config)
   lines = [line for line in lines if not configs.is_of_command(line)]
   found = _find(chosen.sweep_dir, name, settings, lines, jobs)
@@ -99,8 +105,9 @@ def _lines(overrides: Sequence[str]) -> tuple[list[str], SweepSettings, list[lis
 def _name(overrides: Sequence[str], composed: Sequence[RunConfig]) -> str:
   """Returns the sweep file's name, or the names of the jobs' runs."""
   for text in overrides:
-    if text.startswith("sweep="):
-      return Path(text.partition("=")[2]).stem
+    override = configs.parse_with_hydra(text)
+    if override.key_or_group == "sweep":
+      return Path(str(override.value())).stem
   names = list(dict.fromkeys(config.name for config in composed))
   return "_".join(names[:2]) + (f"_and_{len(names) - 2}_more" if len(names) > 2 else "")
 

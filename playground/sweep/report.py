@@ -22,7 +22,7 @@ from playground.reporting.page import (
   t_factor,
   to_html,
 )
-from playground.runs.csv_tracker import RETURN, read_metrics
+from playground.runs.csv_tracker import RETURN, STAGE, read_metrics
 from playground.sweep.folder import FAILED, SweepDirectory
 
 if TYPE_CHECKING:
@@ -131,6 +131,7 @@ def mean_curve(curves: "Sequence[tuple[np.ndarray, np.ndarray]]") -> "tuple[np.n
 def _write_curves(sweep: SweepDirectory) -> list[Path]:
   """Draws mean evaluation returns with their 95 % confidence bands over seeds; returns the files written.
 
+  The curve of a chain is that of the stages that train its last task.
   The curve of a group is that of its finished jobs, if there are any: one that failed early would cut it off.
   """
   from playground.reporting.figures import Curve, curves
@@ -140,6 +141,9 @@ def _write_curves(sweep: SweepDirectory) -> list[Path]:
   for job in sweep.jobs:
     folder = sweep.folder(job)
     table = read_metrics(folder.path / "metrics.csv")
+    if STAGE in table and job.task:
+      of_task = [stage["name"] for stage in folder.run.summary.get("stages", []) if stage["env"] == job.task]
+      table = table.loc[table[STAGE].isin(of_task)]
     if RETURN in table and len(table := table.dropna(subset=[RETURN])):
       name = ", ".join(f"{key.split('.')[-1]}={_label(job.varies.get(key))}" for key in keys)
       task = job.task or str(job.varies.get(PANEL, sweep.name))

@@ -56,7 +56,7 @@ class SlurmJob:
   def checkpoint(self) -> submitit.helpers.DelayedSubmission:
     """Saves the job and requeues it; submitit calls this during `__call__`, on preemption and near the time limit."""
     if self._worker is not None:
-      self._worker.interrupt("Slurm wants its place; it is queued again")
+      self._worker.interrupt("stopped by Slurm, which queues it again unless launcher.requeues are used up")
     return submitit.helpers.DelayedSubmission(dataclasses.replace(self))
 
   def _taken(self) -> bool:

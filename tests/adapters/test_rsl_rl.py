@@ -127,6 +127,13 @@ def test_groups_of_go1() -> None:
   assert {name: tuple(group.shape) for name, group in obs.items()} == {"policy": (2, 48), "critic": (2, 123)}
 
 
+def test_shapes_and_numbers_are_checked(env: VecEnv) -> None:
+  with pytest.raises(ConfigError, match=rf"^actions have the shape \[{NUM_ENVS}, 3\], and must have \[{NUM_ENVS}, 1\]"):
+    env.step(torch.zeros(NUM_ENVS, 3))
+  with pytest.raises(ConfigError, match=r"^num_envs=0 must be at least 1"):
+    vec_env(Point(episode_length=LENGTH), 0)
+
+
 def test_a_group_that_the_task_lacks_is_named() -> None:
   with pytest.raises(UnknownNameError, match=r"groups\['policy'\]: 'stat' is unknown; .* Did you mean 'state'"):
     vec_env(Point(episode_length=LENGTH), NUM_ENVS, groups={"policy": "stat"})

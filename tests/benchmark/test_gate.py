@@ -46,6 +46,8 @@ def test_mistakes(tmp_path: Path):
     run(Options(checks=("ppo_updat",)))
   with pytest.raises(ConfigError, match="cannot be read"):
     run(Options(table=str(tmp_path / "none.csv")))
+  with pytest.raises(UnknownNameError, match="Did you mean 'ppo_update'"):
+    run(Options(checks=("ppo_updat",), update=True, table=str(tmp_path / "none.csv")))  # may be new
   with pytest.raises(ConfigError, match="no committed ratio"):
     judge({"old": pytest.fail, "new": pytest.fail}, {"old": Limit(1.0, 1.5)}, 1)
 

@@ -15,7 +15,7 @@ from playground.benchmark.commands import Topology
 from playground.benchmark.jobs import Measurement, Plan, probe, run_jobs
 from playground.benchmark.schema import Table
 from playground.benchmark.worker import CACHES
-from playground.errors import HardwareError
+from playground.errors import ConfigError, HardwareError
 
 FACTS = {"device": "a device", "versions": "1.0"}
 PLAN = Plan(cache=True, commit="abc", note="a\n note")
@@ -182,6 +182,14 @@ def test_the_machine_is_asked_in_a_process_of_its_own(monkeypatch: pytest.Monkey
   monkeypatch.setattr(jobs, "Measurement", lambda _, *rest: Measurement("user", *rest))
   with pytest.raises(HardwareError, match="that cannot be"):
     probe([], ())
+
+
+def test_a_gpu_that_the_machine_lacks_is_named(monkeypatch: pytest.MonkeyPatch):
+  with pytest.raises(ConfigError, match=r"^gpus=\[0\]: this machine has no GPU\.$"):
+    probe([], (0,))
+  monkeypatch.setattr(jobs, "query_gpus", lambda fields: ["0", "1"])
+  with pytest.raises(ConfigError, match=r"^gpus=\[1, 2\]: this machine has the GPUs 0, 1\.$"):
+    probe([], (1, 2))
 
 
 def test_what_was_started_ends_with_us(tmp_path: Path):

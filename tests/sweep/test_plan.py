@@ -12,7 +12,7 @@ from playground.config.sweep_options import LocalConfig, SlurmConfig
 from playground.errors import CheckpointError, ConfigError, PlaygroundError
 from playground.sweep import local
 from playground.sweep.folder import Job, SweepDirectory
-from playground.sweep.plan import plan, settings_of
+from playground.sweep.plan import compose_jobs, plan, settings_of
 
 LINE = ["env=CartpoleBalance,PointMass", "seed=1,2", "agent.max_grad_norm=null,1.0", "debug=fast"]
 
@@ -54,6 +54,22 @@ def test_a_listed_job_is_named_after_what_it_says_itself(here: Path) -> None:
   assert plan([line])[0].path == sweep.path  # the same command goes on with it
   with pytest.raises(ConfigError, match="its sweep file cannot list jobs"):
     plan([line, "search=optuna", "agent.learning_rate=interval(1e-4,1e-2)"])
+
+
+def test_a_run_in_other_words_is_no_second_job(here: Path) -> None:
+  line = ["env=CartpoleBalance", "agent.num_timesteps=1e6,1000000,2e6", "seed=1,2"]
+  sweep, _ = plan(line)
+  assert [job.varies["agent.num_timesteps"] for job in sweep.jobs] == [1_000_000, 1_000_000, 2_000_000, 2_000_000]
+  assert [job.varies["seed"] for job in sweep.jobs] == [1, 2, 1, 2]
+  assert len(compose_jobs(line)) == 4
+
+
+def test_a_chain_is_of_its_last_task(here: Path) -> None:
+  sweep, _ = plan(["experiment=cartpole_sparse_chain,cartpole_balance", "debug=fast"])
+  assert [job.task for job in sweep.jobs] == ["CartpoleSwingupSparse", "CartpoleBalance"]
+  stage = "curriculum.stages.sparse.overrides=['env=CartpoleSwingupSparse']"
+  line = ["env=CartpoleSwingup,CartpoleBalance", "curriculum=sparse_chain", stage, "agent=fast_sac", "debug=fast"]
+  assert {job.varies["env"] for job in plan(line)[0].jobs} == {"CartpoleSwingupSparse"}
 
 
 def test_the_same_command_finds_its_sweep_again(here: Path) -> None:

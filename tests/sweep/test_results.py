@@ -127,6 +127,31 @@ def test_a_task_has_a_panel_of_its_own(tmp_path: Path, monkeypatch: pytest.Monke
   }
 
 
+def test_a_chains_curve_is_of_its_last_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+  sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], [Job("chain", [], {}, task="Sparse")])
+  folder = sweep.folder(sweep.jobs[0])
+  folder.write(status="finished", attempt=1)
+  tasks = {"dense": "Dense", "sparse": "Sparse", "slow": "Sparse"}
+  stages = [{"name": name, "env": task} for name, task in tasks.items()]
+  write_json(folder.path / "summary.json", {"status": "finished", "env": "Sparse", "stages": stages})
+  rows = [f"{step}000000,{name},{step}" for step, name in enumerate(tasks)]
+  (folder.path / "metrics.csv").write_text("\n".join(["step,stage,eval/episode_reward", *rows]) + "\n")
+  drawn: list[Any] = []
+  monkeypatch.setattr(figures, "curves", lambda panels, *_: drawn.append(panels) or b"")
+  write_result(sweep, lambda text: None)
+  curve = drawn[0]["Sparse"]["mean"]
+  assert (curve.x[0], curve.x[-1], curve.y[0], curve.y[-1]) == (1.0, 2.0, 1.0, 2.0)
+
+
+def test_a_dollar_is_no_formula(tmp_path: Path) -> None:
+  jobs = [Job(name, [], {"project": name}) for name in ("$a_{$", "b")]
+  sweep = SweepDirectory.create(tmp_path, "mine", [], [], [], jobs)
+  for job in jobs:
+    sweep.folder(job).path.mkdir(parents=True)
+    (sweep.folder(job).path / "metrics.csv").write_text("step,eval/episode_reward\n0,1\n")
+  assert tmp_path / "report.html" in write_result(sweep, lambda text: None)
+
+
 def test_a_job_that_failed_early_leaves_its_groups_curve_whole(
   sweep: SweepDirectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:

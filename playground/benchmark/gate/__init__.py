@@ -52,8 +52,8 @@ TOLERANCE = 1.5  # two busy cores and other processors move a ratio by up to a t
 
 def run(options: Options) -> int:
   """Measures ratios and compares them, or writes them to the table; returns the exit code."""
-  path = Path(options.table) if options.table else shipped("benchmarks") / "gate.csv"
-  limits = _read(path)
+  path = Path(options.table).expanduser() if options.table else shipped("benchmarks") / "gate.csv"
+  limits = {} if options.update and not path.exists() else _read(path)
   check_limits(options)
   if not (limits or options.update):
     raise ConfigError(f"table={path} holds no check: `playground-bench gate update=true table={path}` adds them.")

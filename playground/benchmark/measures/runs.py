@@ -82,7 +82,7 @@ def chain(
   another machine may have trained them; `again` starts a new run instead.
   """
   (seed,) = seeds
-  run = _chain_run(Path(runs), experiment, overrides, devices, seed, again)
+  run = _chain_run(Path(runs).expanduser(), experiment, overrides, devices, seed, again)
   finished = {path.name for path in run.path.glob("*/") if _finished(RunDirectory(path))}
   if not _finished(run):
     begun = run.config_path.is_file()

@@ -45,9 +45,9 @@ def run(options: Options) -> int:
   out = Path(options.out).expanduser()
   need_folder(out, f"out={options.out}")
   for folder in options.rows:
-    if folder not in ROWS and not Path(folder).is_dir():
+    if folder not in ROWS and not Path(folder).expanduser().is_dir():
       raise ConfigError(f"rows={folder} is not a folder: name folders of CSVs.")
-  folders = [Path(folder) for folder in options.rows if Path(folder).is_dir()]
+  folders = [path for folder in options.rows if (path := Path(folder).expanduser()).is_dir()]
   evidence = Evidence(folders)
   if not evidence.rows:
     raise ConfigError(f"rows={','.join(options.rows)}: there is no measured row in these folders.")
