@@ -34,7 +34,7 @@ def _composed(sets: Sequence[Sequence[str]]) -> list[tuple[list[str], RunConfig]
   combinations = configs.combinations(*sets)
   different: dict[str, tuple[list[str], RunConfig]] = {}
   for job, config in zip(combinations, configs.compose_all(combinations), strict=True):
-    different.setdefault(json.dumps([config.choices, config.resolved], sort_keys=True), (job, config))
+    different.setdefault(json.dumps([config.choices, config.resolved]), (job, config))
   return list(different.values())
 
 
