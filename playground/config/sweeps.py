@@ -24,6 +24,7 @@ jobs:
 import contextlib
 import itertools
 import math
+import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -42,6 +43,7 @@ from playground.text import first_line, format_value, quoted
 
 MAX_JOBS = 10_000  # of a sweep; 1,000 take 10 s to compose
 _ONE_VALUE = "give one value, which applies to all jobs of the sweep"
+_RESOLVER = re.compile(r"(?<!\\)(\\\\)*\$\{.*:", re.DOTALL)  # ${oc.env:HOME}, but not escaped, nor ${agent.num_envs}
 _HYDRAS_OWN = ("hydra.sweep", "hydra.launcher", "hydra/launcher", "hydra/sweeper")
 
 
@@ -145,9 +147,12 @@ def check_saved_job(name: str, overrides: Iterable[str]) -> None:
   """Checks a job read from a sweep's folder, which another user may have written, before it runs.
 
   Raises:
-    ConfigError: an override of the folder that the job writes, or one that only a command line may set.
+    ConfigError: an override of the folder that the job writes, one that only a command line may set, or one that calls
+      a resolver, which may read environment variables.
   """
   for text in overrides:
+    if _RESOLVER.search(text):
+      raise ConfigError(f"Job {name} in sweep.yaml says {text}: a job calls no resolver, write the value itself.")
     if is_of_command(text) or split([text])[0]:
       raise ConfigError(f"Job {name} in sweep.yaml says {text}, which only a command line can: start a new sweep.")
 

@@ -15,7 +15,7 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from playground.envs.base import Env, Observation
-from playground.errors import lookup
+from playground.errors import ConfigError, lookup
 from playground.hardware.mesh import AXIS
 from playground.learning.hyperparameters import AgentConfig
 from playground.learning.networks import Actor, Normalizer
@@ -126,8 +126,19 @@ def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None
   """
   check(config, "agent")
   module, _, name = config.algorithm.partition(":")
-  found = vars(importlib.import_module(module))
-  make: Callable[..., AnyAlgorithm] = lookup(found, name, f"{type(config).__name__}.algorithm={config.algorithm}")
+  what = f"{type(config).__name__}.algorithm={config.algorithm}"
+  try:
+    found = vars(importlib.import_module(module))
+  except ModuleNotFoundError as error:
+    if error.name is None or not f"{module}.".startswith(f"{error.name}."):  # of a module that ours imports
+      raise
+    raise ConfigError(f"{what}: there is no module {error.name}.") from None
+  make: Callable[..., AnyAlgorithm] = lookup(found, name, what)
+  if lacking := sorted(getattr(make, "__abstractmethods__", ())):
+    raise ConfigError(f"{what} lacks the method {' and '.join(lacking)}.")
+  fields = [field.name for field in dataclasses.fields(config)]
+  for setting in config.traced:
+    lookup(dict.fromkeys(fields), setting, f"{type(config).__name__}.traced")
   # A number that the constructor reads would be a constant, the same for all agents of the program.
   unknown = dict.fromkeys(config.traced, TracedSetting())
   algorithm = make(env, dataclasses.replace(config, **unknown), network_precision)

@@ -307,9 +307,12 @@ class Trainer:
     key, shared = jax.random.split(state.key)
     env = self.env.with_settings(below("env", state.settings))
     envs = Environments(state.env_state, state.capture, model, {}, env)
-    algorithm, envs, metrics = with_settings(self.algorithm, below("agent", state.settings)).train_step(
+    done = with_settings(self.algorithm, below("agent", state.settings)).train_step(
       state.algorithm.replace(replay=state.replay), envs, jax.random.fold_in(shared, jax.lax.axis_index(AXIS))
     )
+    if not (isinstance(done, tuple) and len(done) == 3):
+      raise ConfigError(f"{type(self.algorithm).__name__}.train_step must return state, environments and metrics.")
+    algorithm, envs, metrics = done
     if wrong := {name: jnp.shape(value) for name, value in metrics.items() if jnp.ndim(value)}:
       raise ConfigError(f"{type(self.algorithm).__name__}.train_step: a metric is one number, not of shape {wrong}.")
     metrics = {"learned": jnp.ones(())} | metrics | jax.lax.psum(envs.sums, AXIS)

@@ -14,6 +14,8 @@ from playground.mdp.context import Robot, StepContext
 from playground.mdp.options import mirrors_as
 from playground.physics.backend import PhysicsData, mjx
 
+_VECTORS = ("linvel", "gyro", "accelerometer", "upvector", "global_linvel", "global_angvel")  # sensors of 3 numbers
+
 
 class LeggedRobot(Robot):
   """A robot on legs, whose YAML (`configs/robot/`) names the parts of its model.
@@ -70,6 +72,11 @@ class LeggedRobot(Robot):
       key: np.array([self.rows(name, f"env.robot.{key}") for name in config.get(key, ())])
       for key in ("foot_linvel", "foot_pos", "foot_force")
     }
+    vectors = {f"sensors.{name}": [sensor] for name, sensor in config.sensors.items() if name in _VECTORS}
+    for key, sensors in (vectors | {name: config.get(name, ()) for name in self._foot_rows}).items():
+      for sensor in sensors:
+        if (size := len(self.rows(sensor))) != 3:
+          raise ConfigError(f"env.robot.{key}: the sensor {sensor} has {size} numbers, and must have 3.")
     self._subtree = [self.root]  # a child's id is always above its parent's
     for body in range(self.root + 1, mj_model.nbody):
       if mj_model.body_parentid[body] in self._subtree:
@@ -164,6 +171,8 @@ def _check_lengths(config: Any) -> None:
     for key, entries in lists.items():
       if entries is not None and len(entries) != (needed := len(names)):
         raise ConfigError(f"env.robot.{key} has {len(entries)} entries: it must have {needed}, one for each {what}.")
+  if len(set(config.feet)) < len(config.feet) or not all(config.foot_contact or ()):
+    raise ConfigError("env.robot.feet must name each foot once, and env.robot.foot_contact a sensor or more for each.")
 
 
 class LeggedContext(StepContext):

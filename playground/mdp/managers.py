@@ -125,7 +125,7 @@ class ObservationManager(_Manager):
     `delay` = (lowest, highest) delays the whole group `state` by a number of steps that is drawn in each step, both
     ends included. The buffer starts filled with the episode's first observation.
     """
-    section, order = config.observations, config.observation_order or {}
+    section, order = getattr(config, "observations", None) or {}, config.observation_order or {}
     self._delay = delay
     self._level: float = config.noise_level
     self._frames: int = config.observation_frames

@@ -151,7 +151,7 @@ def build_scene(
 
 
 def _check_qpos(spec: mujoco.MjSpec, mjcf: str) -> None:
-  """Raises ConfigError where the first joint is not free, or where a keyframe has another length than `qpos`."""
+  """Raises ConfigError where the first joint is not free, or where a keyframe is not one of the model."""
   if not spec.joints or spec.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
     body = spec.worldbody.first_body().name
     raise ConfigError(f"env.robot.mjcf={mjcf} needs <freejoint/> as its first joint, in the body {body}.")
@@ -160,6 +160,10 @@ def _check_qpos(spec: mujoco.MjSpec, mjcf: str) -> None:
     if len(key.qpos) not in (0, size):  # MuJoCo fills a short one with zeros
       needed = f"qpos must have {size} numbers, 7 for the free joint and 1 for each hinge or slide"
       raise ConfigError(f"env.robot.mjcf={mjcf}: {needed}, but the keyframe {key.name} has {len(key.qpos)}.")
+    if not np.isfinite(key.qpos).all():
+      raise ConfigError(f"env.robot.mjcf={mjcf}: the keyframe {key.name} has a qpos that is not finite.")
+    if spec.key(base := key.name.removesuffix("_rough")) is None:
+      raise ConfigError(f"env.robot.mjcf={mjcf}: the keyframe {key.name} is {base} on rough ground: add {base}.")
 
 
 def _feet(spec: mujoco.MjSpec) -> None:

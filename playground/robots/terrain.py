@@ -99,11 +99,12 @@ def _add_height_field(spec: mujoco.MjSpec, heights: np.ndarray) -> float:
 
 
 def ground_peak(mj_model: mujoco.MjModel) -> float:
-  """Returns the height of the highest ground where robots start, m; the ground is geom 0."""
-  if mj_model.geom_type[0] != mujoco.mjtGeom.mjGEOM_HFIELD:
+  """Returns the height of the highest ground where robots start, m; the ground is the geom `floor`."""
+  floor = mj_model.geom("floor")
+  if floor.type[0] != mujoco.mjtGeom.mjGEOM_HFIELD:
     return 0.0
-  field = mj_model.hfield(mj_model.geom_dataid[0])
-  return float(mj_model.geom_pos[0, 2] + field.size[2] * field.data[_distance() <= START].max())
+  field = mj_model.hfield(floor.dataid[0])
+  return float(floor.pos[2] + field.size[2] * field.data[_distance() <= START].max())
 
 
 def _distance() -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playground.errors import CheckpointError, ConfigError
-from playground.runs.wandb_tracker import TYPE, logged_in
+from playground.runs.wandb_tracker import TYPE, logged_in, set_up
 from playground.text import first_line
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def local_path(name: str) -> str:
   import wandb
 
   try:
+    set_up()
     api = wandb.Api()
     artifact = api.artifact(path, type=TYPE) if ":" in path else _newest(api, path)
     folder = _DOWNLOADS / path.rpartition("/")[0] / artifact.name.replace(":", "-")

@@ -48,6 +48,18 @@ def resolve_mode(mode: str) -> str:
   return "offline" if mode == "online" and not logged_in() else mode
 
 
+def set_up() -> None:
+  """Starts W&B without the settings of the current folder, which may be a stranger's.
+
+  They name the machine that gets the user's key, and with `save_code` W&B runs git there, which runs what that folder
+  names. The user's own settings, and the environment variables, hold.
+  """
+  import wandb
+
+  with contextlib.chdir(os.sep):
+    wandb.setup()
+
+
 class WandbTracker:
   """Logs a run directory to one W&B run, the same one after every resume (the file `wandb_run_id` holds its id).
 
@@ -88,11 +100,12 @@ class WandbTracker:
       "name": options["name"] or folder.resolve().name,
       "id": id_file.read_text().strip(),
       "config": dict(config),
-      "dir": str(folder),
+      "dir": str(folder.resolve()),
       # The progress bar is ours; W&B neither prints nor wraps the terminal.
       "settings": wandb.Settings(silent=True, console="off", init_timeout=30),
     }
     mode = resolve_mode(options["mode"])
+    set_up()
     try:
       # Offline, the id alone decides, and `resume` would only warn.
       self._run = wandb.init(**start, mode=mode, resume="allow" if mode == "online" else None)  # pyright: ignore[reportArgumentType]
@@ -101,6 +114,7 @@ class WandbTracker:
         raise
       self._notify(f"W&B cannot be reached ({first_line(error)}): this run is recorded offline.")
       wandb.teardown()  # its service still holds the id
+      set_up()
       self._run = wandb.init(**start, mode="offline")
     if recorded := sorted(folder.glob("wandb/offline-run-*")):  # the names begin with the time
       self._notify(f"W&B records this run offline; to upload it: wandb sync {recorded[-1]}")

@@ -125,6 +125,11 @@ class JobState:
       return None
 
 
+def _printable(value: Plain) -> Plain:
+  """Returns a value of a job's record, text without the characters that steer a terminal."""
+  return "".join(filter(str.isprintable, value)) if isinstance(value, str) else value
+
+
 class JobFolder:
   """Reads and writes a job's run directory and the worker's record in it."""
 
@@ -162,13 +167,13 @@ class JobFolder:
   def state(self) -> JobState:
     """Returns the job's state, even if its worker was killed before it recorded the end."""
     record = self.record
-    fields = {f.name: record[f.name] for f in dataclasses.fields(JobState) if f.name in record}
+    fields = {f.name: _printable(record[f.name]) for f in dataclasses.fields(JobState) if f.name in record}
     state = JobState(**fields)
     if state.status != "running" or self.locked():
       return state
     run = self.run.status
     if run.get("status") in ENDED and run.get("updated", "") >= (record.get("started") or ""):  # it outlived its worker
-      return dataclasses.replace(state, status=run["status"], reason=run["reason"])
+      return dataclasses.replace(state, status=run["status"], reason=_printable(run["reason"]))
     return dataclasses.replace(state, status="killed", reason="its process is gone without a word")
 
   @contextlib.contextmanager

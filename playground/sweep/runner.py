@@ -91,6 +91,8 @@ def run_sweep(
   """
   for job in sweep.jobs:
     check_saved_job(job.name, job.overrides)
+  if isinstance(settings.search, OptunaConfig):
+    check_saved_job("of the search", sweep.lines)
   with sweep.controlled():
     view, search = View(sweep, console), None
     if isinstance(settings.search, OptunaConfig):

@@ -16,6 +16,7 @@ import pytest
 
 from playground.envs.base import State
 from playground.envs.wrappers import PRESERVE_INFO
+from playground.errors import ConfigError
 from playground.hardware.mesh import make_mesh
 from playground.learning import loop as loop_module
 from playground.learning.algorithm import Algorithm, other_acts
@@ -244,6 +245,34 @@ class ConstantConfig(PPOConfig):
 def test_a_constructor_cannot_read_an_argument_of_the_program() -> None:
   with pytest.raises(TypeError, match="TracedSetting"):
     point_trainer(ConstantConfig())
+
+
+class Halves(PPO):
+  """Returns too little."""
+
+  def train_step(self, *args: Any) -> Any:
+    return super().train_step(*args)[:2]
+
+
+class Unfinished(Algorithm):
+  """Lacks what an algorithm must have."""
+
+
+@pytest.mark.parametrize(
+  ("algorithm", "traced", "message"),
+  [
+    ("tests.learning.test_trainr:Halves", (), r"algorithm=.*: there is no module tests\.learning\.test_trainr\.$"),
+    ("tests.learning.test_trainer:Halve", (), r"Did you mean 'Halves'"),
+    ("tests.learning.test_trainer:Unfinished", (), r"Unfinished lacks the method init and train_step\."),
+    ("tests.learning.test_trainer:Halves", ("learning_rat",), r"\.traced.*Did you mean 'learning_rate'"),
+    ("tests.learning.test_trainer:Halves", (), r"^Halves\.train_step must return state, environments and metrics"),
+  ],
+)
+def test_a_mistake_in_an_algorithm_is_one_sentence(algorithm: str, traced: tuple[str, ...], message: str) -> None:
+  config = type("MistakenConfig", (PPOConfig,), {"algorithm": algorithm, "traced": traced})()
+  with pytest.raises(ConfigError, match=message):
+    trainer = point_trainer(config)
+    jax.eval_shape(trainer.train, trainer.template({}), {}, 1)
 
 
 @algorithms("ppo")

@@ -127,6 +127,8 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
       'qpos="0.278',
       "qpos must have 19 numbers, 7 for the free joint and 1 for each hinge or slide, but",
     ),
+    ('qpos="0 0 0.278', 'qpos="0 0 nan', "the keyframe home has a qpos that is not finite."),
+    ('name="footstand"', 'name="pronk_rough"', "the keyframe pronk_rough is pronk on rough ground: add pronk."),
     ("<sensor>", '<asset><material name="studio/groundplane"/></asset><sensor>', "repeated name 'studio/groundplane'"),
     (
       "<sensor>",
@@ -156,6 +158,12 @@ def test_a_model_without_a_body(tmp_path: Path) -> None:
   (tmp_path / "empty.xml").write_text("<mujoco/>")
   with pytest.raises(ConfigError, match=r"empty\.xml has no body: the robot must be the first body of its <worldbody>"):
     build_scene(str(tmp_path / "empty.xml"))
+
+
+def test_the_ground_is_found_beside_other_geoms_of_the_world(tmp_path: Path) -> None:
+  file, text = tmp_path / "mine.xml", find_mjcf("go1").read_text()
+  file.write_text(text.replace("<worldbody>", '<worldbody><geom name="rock" size="0.1" pos="2 0 0"/>', 1))
+  assert ground_peak(build_scene(str(file), terrain="rough").compile()) > 0
 
 
 @pytest.mark.parametrize("terrain", ["flat", "rough", "slope"])

@@ -1,5 +1,7 @@
 import copy
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -228,6 +230,16 @@ def test_unreachable_wandb_is_recorded_offline(tmp_path: Path, monkeypatch: pyte
   complaints: list[str] = []
   WandbTracker(WANDB, tmp_path, CONFIG, complaints.append)
   assert modes == ["online", "offline"] and len(complaints) == 1 and "deadline exceeded" in complaints[0]
+
+
+@pytest.mark.parametrize(("begin", "read"), [("wandb.setup()", True), ("wandb_tracker.set_up()", False)])
+def test_wandb_reads_no_settings_of_the_current_folder(tmp_path: Path, begin: str, read: bool):
+  (tmp_path / "wandb").mkdir()
+  (tmp_path / "wandb/settings").write_text("[default]\nbase_url = http://127.0.0.1:9\nsave_code = true\n")
+  code = f"import os, wandb; from playground.runs import wandb_tracker; {begin}; s = wandb.setup().settings"
+  code += "; print(s.base_url == 'http://127.0.0.1:9', s.save_code is True, os.getcwd())"
+  done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+  assert done.stdout.splitlines()[-1] == f"{read} {read} {tmp_path.resolve()}"
 
 
 @pytest.mark.parametrize("host", ["api.wandb.ai", "api.forge.coreweave.com"])

@@ -8,9 +8,10 @@ import ray
 import yaml
 
 from playground.cli import sweep as commands
+from playground.config import check_saved_job
 from playground.config.sweep_options import SlurmConfig, TogetherConfig
 from playground.errors import CheckpointError, ConfigError
-from playground.sweep.folder import SweepDirectory
+from playground.sweep.folder import JobFolder, SweepDirectory
 from playground.sweep.plan import settings_of
 from playground.sweep.slurm import SlurmLauncher
 from playground.sweep.worker import COMMAND, job_command
@@ -121,6 +122,28 @@ def test_a_job_says_nothing_that_only_a_command_line_can(tmp_path: Path, overrid
   with pytest.raises(ConfigError, match=r"which only a command line can|cannot be given with -m|is not an override"):
     run(sweep)
   assert statuses(sweep) == {0: "queued"}
+
+
+@pytest.mark.parametrize(
+  "value",
+  [*("${oc.env:HOME}", "'${oc.env:HOME}'", "${${tracking.wandb.name}:HOME}"), r"'\\${oc.env:HOME}'", "{a: ${x:b}}"],
+)
+def test_a_job_calls_no_resolver(tmp_path: Path, value: str) -> None:
+  override = f"tracking.wandb.project={value}"
+  sweep = make_sweep(tmp_path / "sweep", 0)
+  sweep = change(sweep, jobs=[{"name": "0", "overrides": [override], "varies": {"seed": 0}}], lines=[override])
+  with pytest.raises(ConfigError, match=r"a job calls no resolver, write the value itself\.$"):
+    run(sweep)
+  with pytest.raises(ConfigError, match=r"a job calls no resolver"):
+    run(change(sweep, jobs=[]), "search=optuna", "launcher.cores_per_job=1")
+  for harmless in (r"tracking.wandb.project=\${oc.env:HOME}", "agent.batch_size=${agent.num_envs}"):
+    check_saved_job("0", [harmless])
+
+
+def test_a_reason_does_not_steer_the_terminal(tmp_path: Path) -> None:
+  folder = JobFolder(tmp_path)
+  folder.write(status="failed", reason="it \x1b]0;evil\x07\nfailed")
+  assert folder.state().reason == "it ]0;evilfailed"
 
 
 @pytest.mark.parametrize(
