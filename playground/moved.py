@@ -1,4 +1,4 @@
-"""Keys of earlier versions, and what stands in their place."""
+"""Keys of earlier versions and of 0.2.0, and what stands in their place."""
 
 from playground.errors import UnknownNameError
 
@@ -69,13 +69,27 @@ _FUNCTIONS = {  # where they are not their terms' names
 }
 _PARAMS = {
   "env.command.duration": "resample_s",
+  "env.command.timer": "exponential",
   "env.pushes.duration": "duration_s",
   "env.pushes.interval": "interval_s",
+  "env.pushes.velocity_kick": "velocity",
+  "env.pushes.kick_durations": "duration_s",
+  "env.pushes.kick_wait_times": "interval_s",
+}
+_OF_020 = {  # sections of 0.2.0, and those of an earlier version with the same keys
+  "env.reward_config": "env.reward",
+  "env.noise_config": "env.noise",
+  "env.command_config": "env.command",
+  "env.pert_config": "env.pushes",
+  "env.push_config": "env.pushes",
 }
 _PREFIXES = {
   "env.reward.scales": "env.rewards.<term>.weight",
   "env.reward.total": "env.reward_total",
   "env.reward.clip": "env.reward_clip",
+  "env.reward.functions": "env.rewards.<term>.func",
+  "env.reward.when_moving": "env.rewards.<term>.when: {command_above: x}",
+  "env.reward.when_still": "env.rewards.<term>.when: {command_below: x}",
   "env.reward": "env.rewards.<term>.params",
   "env.noise.level": "env.noise_level",
   "env.noise.pose": "env.pose_noise",
@@ -89,6 +103,7 @@ _PREFIXES = {
   "env.gait": "env.commands.gait.params",
   "env.pushes.enable": "env.events.push.enabled",
   "env.pushes": "env.events.push.params",
+  "env.scene.rough": "env.scene.terrain_params",
   "env.reset": "env.events.<term>.params",
   "env.parity": "env=v020/<TaskName>",
   "env.parity_obs": "env=v020/<TaskName>",
@@ -101,16 +116,18 @@ _PREFIXES = {
 
 
 def check_not_moved(key: str) -> None:
-  """Raises UnknownNameError, with the key to write instead, for a key of an earlier version."""
-  prefix = next((p for p in _PREFIXES if key == p or key.startswith(f"{p}.")), None)
+  """Raises UnknownNameError, with the key to write instead, for a key of an earlier version or of 0.2.0."""
+  section = ".".join(key.split(".")[:2])
+  moved = _OF_020.get(section, section) + key[len(section) :]
+  prefix = next((p for p in _PREFIXES if moved == p or moved.startswith(f"{p}.")), None)
   if prefix is None:
     return
-  new, name = _PREFIXES[prefix], key[len(prefix) + 1 :]
+  new, name = _PREFIXES[prefix], moved[len(prefix) + 1 :]
   if prefix == "env.reward.scales" and name:
     new = " or ".join(new.replace("<term>", term) for term in _REWARDS.get(name, name).split())
     new += f" (func: {_FUNCTIONS[name]})" if name in _FUNCTIONS else ""
-  elif prefix in ("env.command", "env.gait", "env.pushes", "env.hand", "env.noise.pose") and name:
-    new = f"{new}.{_PARAMS.get(key, name)}"
+  elif prefix in ("env.command", "env.gait", "env.pushes", "env.hand", "env.noise.pose", "env.scene.rough") and name:
+    new = f"{new}.{_PARAMS.get(moved, name)}"
   raise UnknownNameError(f"{key} is of an earlier version: write {new} (docs/migrate.md has all names).")
 
 

@@ -178,5 +178,11 @@ def _check_options(term: Term, whole: np.ndarray) -> None:
 
 
 def _repeated(matrix: np.ndarray, size: int) -> np.ndarray:
-  """Returns the matrix for a vector of `size` that repeats the vector of `matrix`."""
+  """Returns the matrix for a vector of `size` that repeats the vector of `matrix`.
+
+  Raises:
+    ConfigError: it does not fit a whole number of times.
+  """
+  if size % len(matrix):
+    raise ConfigError(f"an observation of {size} numbers cannot be mirrored as vectors of {len(matrix)}.")
   return np.kron(np.eye(size // len(matrix)), matrix)

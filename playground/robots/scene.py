@@ -10,6 +10,7 @@ the solver's options. A few conventions let this file work for all of them:
 - a keyframe `<name>_rough` takes the place of `<name>` where bumps of 0.05 m may lie under the feet.
 """
 
+import difflib
 import importlib.util
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -88,11 +89,20 @@ def added_to(mjcf: str) -> Iterator[None]:
     ) from None
 
 
-def check_keys(robot: Mapping[str, Any], keys: Sequence[str], what: str) -> None:
-  """Raises ConfigError where `env.robot` lacks a key that robots of a kind (`what`) have."""
+def check_keys(robot: Mapping[str, Any], keys: Sequence[str], what: str, optional: Sequence[str] = ()) -> None:
+  """Checks the keys of `env.robot`; it may have others of its own.
+
+  Raises:
+    ConfigError: it lacks one of `keys`, which robots of a kind (`what`) have.
+    UnknownNameError: a key is nearly one of them or of `optional`, and is taken for a slip.
+  """
   if missing := [key for key in keys if key not in robot]:
     name = robot.get("name")
     raise ConfigError(f"env.robot.{missing[0]} is missing: robot={name} is no {what}, or its YAML is not complete.")
+  known = (*keys, *optional)
+  for key in robot:
+    if key not in known and (like := difflib.get_close_matches(key, known, n=1, cutoff=0.85)):
+      raise UnknownNameError(f"env.robot.{key} does not exist. Did you mean {like[0]!r}?")
 
 
 def build_scene(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from playground.errors import ConfigError, UnknownNameError
-from playground.robots.scene import COLLISIONS, build_scene, find_mjcf
+from playground.robots.scene import COLLISIONS, build_scene, check_keys, find_mjcf
 from playground.robots.terrain import add_terrain, ground_peak
 
 LEG_GEOMS = ("hip", "thigh1", "thigh2", "thigh3", "calf1", "calf2")
@@ -152,6 +152,14 @@ def test_a_model_that_is_no_robot_or_has_names_of_the_scene(
   with pytest.raises(ConfigError, match=r"^env.robot.mjcf=.*mine\.xml") as caught:
     build_scene(str(file), terrain="rough", floor_contacts=["FR"])
   assert message in str(caught.value)
+
+
+def test_a_misspelt_key_of_a_robot_is_named() -> None:
+  check_keys({"mjcf": "go1", "payload": 3}, ("mjcf",), "robot", ("pose_weights",))
+  with pytest.raises(
+    UnknownNameError, match=r"^env\.robot\.pose_weight does not exist\. Did you mean 'pose_weights'\?$"
+  ):
+    check_keys({"mjcf": "go1", "pose_weight": [1]}, ("mjcf",), "robot", ("pose_weights",))
 
 
 def test_a_model_without_a_body(tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ _ACTION_BASES: dict[str, Callable[[LeggedRobot, PhysicsData], jax.Array]] = {
 # Keys that the YAML of every robot on legs has (docs/add-a-robot.md).
 _KEYS = ("mjcf", "root", "base_site", "feet", "keyframe", "joints", "pd", "sensors")
 _KEYS += ("foot_linvel", "foot_contact", "floor_contacts")
+_OPTIONAL = ("name", "mirror", "gaits", "pose_weights", "target_range", "restricted_range", "hips", "hip_rolls")
+_OPTIONAL += ("knees", "foot_pos", "foot_force", "self_contact", "fatal_contact")
 
 
 class LeggedTask(Task):
@@ -53,7 +55,7 @@ class LeggedTask(Task):
   def scene(self, config: Any) -> mujoco.MjSpec:
     """Returns the scene to compile; called before everything else."""
     scene, robot = config.scene, config.robot
-    check_keys(robot, _KEYS, "robot on legs")
+    check_keys(robot, _KEYS, "robot on legs", _OPTIONAL)
     ground = {"terrain": scene.terrain, "parameters": dict(scene.terrain_params or {})}
     spec = build_scene(robot.mjcf, **ground, collision=scene.collision, floor_contacts=tuple(robot.floor_contacts))
     if config.restricted_joint_range:
