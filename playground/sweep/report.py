@@ -140,10 +140,9 @@ def _write_curves(sweep: SweepDirectory) -> list[Path]:
   tables: dict[str, dict[str, list[tuple[bool, pd.DataFrame]]]] = defaultdict(lambda: defaultdict(list))
   for job in sweep.jobs:
     folder = sweep.folder(job)
-    table = read_metrics(folder.path / "metrics.csv")
-    if STAGE in table and job.task:
-      of_task = [stage["name"] for stage in folder.run.summary.get("stages", []) if stage["env"] == job.task]
-      table = table.loc[table[STAGE].isin(of_task)]
+    table, summary = read_metrics(folder.path / "metrics.csv"), folder.run.summary
+    if STAGE in table and (stages := summary.get("stages")):
+      table = table.loc[table[STAGE].isin([s["name"] for s in stages if s.get("env") == summary.get("env")])]
     if RETURN in table and len(table := table.dropna(subset=[RETURN])):
       name = ", ".join(f"{key.split('.')[-1]}={_label(job.varies.get(key))}" for key in keys)
       task = job.task or str(job.varies.get(PANEL, sweep.name))
