@@ -11,6 +11,7 @@ from jax.sharding import Mesh
 
 from playground.errors import HardwareError
 from playground.hardware.distributed import init_distributed
+from playground.hardware.gpus import MEMORY_VARIABLES
 from playground.hardware.mesh import make_mesh
 from playground.hardware.options import HardwareConfig, Platform
 from playground.text import first_line
@@ -90,8 +91,8 @@ def cache_dir(config: HardwareConfig) -> Path:
 def _environment(config: HardwareConfig) -> None:
   """Sets variables that the GPU runtime reads at its start; exported ones win."""
   os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", str(bool(config.preallocate)).lower())
-  if config.memory_fraction is not None:
-    os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", str(config.memory_fraction))
+  if config.memory_fraction is not None and not any(name in os.environ for name in MEMORY_VARIABLES):
+    os.environ[MEMORY_VARIABLES[0]] = str(config.memory_fraction)
   known = lambda flag: jax.__version_info__ < _REMOVED_FLAGS.get(flag.partition("=")[0], (math.inf,))
   exported = os.environ.get("XLA_FLAGS", "").split()
   names = {flag.partition("=")[0] for flag in exported}

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from playground.config.sweep_options import LocalConfig
 from playground.errors import ConfigError, HardwareError
-from playground.hardware.gpus import visible_gpus
+from playground.hardware.gpus import limit_memory, visible_gpus
 from playground.interpreter import PYTHON
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.mps import MultiProcessService, control_program
@@ -156,5 +156,5 @@ class LocalLauncher:
     env = dict(os.environ) if ALL in gpus else os.environ | {"CUDA_VISIBLE_DEVICES": ",".join(gpus)}
     shared = self._config.slots_per_gpu
     if gpus and shared > 1:
-      env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION / shared:.3f}"
+      limit_memory(env, MEMORY_FRACTION / shared)
     return env | (self._mps.environment if self._mps else {})

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 from playground.config.sweep_options import RayConfig
 from playground.errors import ConfigError, HardwareError
 from playground.extras import install_command
+from playground.hardware.gpus import limit_memory
 from playground.sweep.folder import Job, SweepDirectory
 from playground.sweep.local import MEMORY_FRACTION
 from playground.sweep.worker import COMMAND, Worker
@@ -111,7 +112,7 @@ def _cores(config: RayConfig) -> float:
 def _run(folder: str, command: tuple[str, ...], timeout: float | None, grace: float, gpus: float) -> int:
   """Runs a worker as a task, on the GPUs that Ray assigned."""
   if 0 < gpus < 1:
-    os.environ["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY_FRACTION * gpus:.3f}"
+    limit_memory(os.environ, MEMORY_FRACTION * gpus)
   given = ",".join(map(str, ray.get_gpu_ids()))
   where = socket.gethostname() + (f" GPU {given}" if given else "")
   return Worker([Path(folder)], command, timeout, grace).run(where)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from playground.hardware.gpus import visible_gpus
+from playground.hardware.gpus import limit_memory, visible_gpus
 
 
 def test_visible_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -16,3 +16,10 @@ def test_visible_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   smi.chmod(0o755)
   monkeypatch.setenv("PATH", str(tmp_path))
   assert visible_gpus({}) == ["0", "1"]
+
+
+@pytest.mark.parametrize("name", ["XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION"])
+def test_the_share_of_memory_replaces_what_is_exported(name: str) -> None:
+  env = {name: "0.9", "HOME": "/"}
+  limit_memory(env, 0.45)
+  assert env == {"XLA_CLIENT_MEM_FRACTION": "0.450", "HOME": "/"}  # JAX refuses both names

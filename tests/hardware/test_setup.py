@@ -14,6 +14,7 @@ import yaml
 
 from playground.config import compose, config_roots, options
 from playground.errors import HardwareError
+from playground.hardware.gpus import MEMORY_VARIABLES
 from playground.hardware.options import HardwareConfig
 from playground.hardware.setup import setup
 from tests.processes import ROOT, WITHOUT_WARP
@@ -123,6 +124,18 @@ def test_flags_that_this_jax_has_no_more_are_left_out(monkeypatch: pytest.Monkey
     with pytest.raises(HardwareError), warnings.catch_warnings(action="error"):
       setup(config)
     assert os.environ["XLA_FLAGS"].split() == ["--xla_exported=1", "--xla_given=2", *flags]
+
+
+@pytest.mark.parametrize("exported", [None, *MEMORY_VARIABLES])
+def test_an_exported_share_of_memory_wins(exported: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+  for name in MEMORY_VARIABLES:
+    monkeypatch.setenv(name, "0.5")  # so that it is put back, whatever `setup` sets
+    if name != exported:
+      monkeypatch.delenv(name)
+  with pytest.raises(HardwareError):
+    setup(hardware(memory_fraction=0.25, devices=99))
+  there = {name: os.environ[name] for name in MEMORY_VARIABLES if name in os.environ}
+  assert there == ({exported: "0.5"} if exported else {"XLA_CLIENT_MEM_FRACTION": "0.25"})
 
 
 @pytest.mark.parametrize("preset", [name for name in options("hardware") if "_x" in name])

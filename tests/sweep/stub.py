@@ -19,7 +19,7 @@ again = "resume" in given
 seed = int((run / "config.yaml").read_text()) if again else int(given["seed"])
 (run / "config.yaml").write_text(str(seed))
 facts = {"pid": os.getpid(), "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"), "cores": sorted(os.sched_getaffinity(0))}
-PLACE = ("XLA_PYTHON_CLIENT_MEM_FRACTION", "WANDB_RUN_GROUP", "CUDA_MPS_PIPE_DIRECTORY")
+PLACE = ("XLA_CLIENT_MEM_FRACTION", "WANDB_RUN_GROUP", "CUDA_MPS_PIPE_DIRECTORY")
 facts |= {name: os.environ.get(name) for name in PLACE}
 
 

@@ -39,11 +39,11 @@ def test_each_job_sees_its_own_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPat
   assert run(sweep, "launcher.slots_per_gpu=2") == 0
   places = [found[0] for found in starts(sweep).values()]
   assert [place["gpus"] for place in places] == ["5", "6"]
-  assert {place["XLA_PYTHON_CLIENT_MEM_FRACTION"] for place in places} == {"0.450"}
+  assert {place["XLA_CLIENT_MEM_FRACTION"] for place in places} == {"0.450"}
   both = make_sweep(tmp_path / "both", 0, needs=2)
   assert run(both) == 0
   assert starts(both)[0][0]["gpus"] == "5,6"
-  assert starts(both)[0][0]["XLA_PYTHON_CLIENT_MEM_FRACTION"] is None
+  assert starts(both)[0][0]["XLA_CLIENT_MEM_FRACTION"] is None
   cpu = make_sweep(tmp_path / "cpu", 0, needs=0)
   assert run(cpu) == 0
   assert starts(cpu)[0][0]["gpus"] == ""
