@@ -94,7 +94,7 @@ def check_keys(robot: Mapping[str, Any], keys: Sequence[str], what: str, optiona
 
   Raises:
     ConfigError: it lacks one of `keys`, which robots of a kind (`what`) have.
-    UnknownNameError: a key is nearly one of them or of `optional`, and is taken for a slip.
+    UnknownNameError: a key is nearly one of them or of `optional`.
   """
   if missing := [key for key in keys if key not in robot]:
     name = robot.get("name")
