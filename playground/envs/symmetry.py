@@ -184,5 +184,5 @@ def _repeated(matrix: np.ndarray, size: int) -> np.ndarray:
     ConfigError: it does not fit a whole number of times.
   """
   if size % len(matrix):
-    raise ConfigError(f"an observation of {size} numbers cannot be mirrored as vectors of {len(matrix)}.")
+    raise ConfigError(f"an observation has {size} numbers, and its mirror image is of vectors of {len(matrix)}.")
   return np.kron(np.eye(size // len(matrix)), matrix)
