@@ -8,6 +8,7 @@ points of the group `playground.tasks`), and packages that the user names on thi
 
 import importlib
 import importlib.metadata
+from types import ModuleType
 
 from playground.errors import ConfigError, nearest
 
@@ -47,12 +48,7 @@ def trusted_object(key: str, spec: object) -> object:
     raise ConfigError(f"{key}={spec} is not of the form module:name.")
   if not _is_trusted(module_name):
     raise _untrusted(key, spec, module_name)
-  try:
-    module = importlib.import_module(module_name)
-  except ModuleNotFoundError as error:
-    if not f"{module_name}.".startswith(f"{error.name}."):  # the module is there, something that it needs is not
-      raise
-    raise ConfigError(f"{key}={spec}: there is no module {error.name} (installed, or on PYTHONPATH).") from None
+  module = named_module(key, spec, module_name)
   own = [n for n, value in vars(module).items() if getattr(value, "__module__", None) == module_name]
   if name not in vars(module):
     raise ConfigError(f"{key}={spec}: {module_name} has no {name}.{nearest(name, own)}")
@@ -61,6 +57,16 @@ def trusted_object(key: str, spec: object) -> object:
   if not isinstance(home, str) or not _is_trusted(home):  # what a trusted module imports is not its own
     raise _untrusted(key, spec, home or name)
   return found
+
+
+def named_module(key: str, spec: object, name: str) -> ModuleType:
+  """Imports the module `name` of `<key>=<spec>`; raises ConfigError if there is none."""
+  try:
+    return importlib.import_module(name)
+  except ModuleNotFoundError as error:
+    if not f"{name}.".startswith(f"{error.name}."):  # the module is there, something that it needs is not
+      raise
+    raise ConfigError(f"{key}={spec}: there is no module {error.name} (installed, or on PYTHONPATH).") from None
 
 
 def _untrusted(key: str, spec: object, module: str) -> ConfigError:

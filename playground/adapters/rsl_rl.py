@@ -16,6 +16,7 @@ import torch
 from rsl_rl import env as rsl_rl_env
 from tensordict import TensorDict
 
+from playground.adapters.episodes import need_shape
 from playground.envs.base import PIXELS, Env, Observation, State, observation_groups
 from playground.envs.wrappers import FINAL_OBS, AutoReset, wrap_for_evaluation
 from playground.errors import ConfigError, lookup
@@ -101,8 +102,7 @@ class VecEnv(rsl_rl_env.VecEnv):
     Raises:
       ConfigError: actions of another shape, which JAX may broadcast.
     """
-    if actions.shape != (shape := (self.num_envs, self.num_actions)):
-      raise ConfigError(f"actions have the shape {list(actions.shape)}, and must have {list(shape)}.")
+    need_shape("actions", actions, (self.num_envs, self.num_actions))
     state = self.state = self._step(self.state, to_jax(actions.clamp(-1.0, 1.0)))
     extras: dict[str, Extra] = {"time_outs": to_torch(state.info["truncation"])}
     if FINAL_OBS in state.info:

@@ -114,18 +114,22 @@ def split(lines: Iterable[str]) -> tuple[list[str], list[str]]:
   """Divides expanded overrides into those of the sweep itself and those of its jobs.
 
   Raises:
-    ConfigError: a key that jobs of a sweep must not set.
+    ConfigError: a key that jobs of a sweep must not set, several values of a setting, or a job's value that calls a
+      resolver, which another user's sweep.yaml may have read environment variables.
   """
   settings, ours = [], []
   for line in lines:
-    key = parse_with_hydra(line).key_or_group
+    override = parse_with_hydra(line)
+    key = override.key_or_group
     if key in ("run_dir", "resume"):
       instead = "sweep_dir=<path> says where a sweep lies, the same command again continues it"
       raise ConfigError(f"{line} cannot be given with -m, whose jobs lie in the sweep's folder: {instead}.")
     if line.lstrip("+~").startswith(_HYDRAS_OWN):
       raise ConfigError(f"{line}: -m does not use Hydra's launchers and sweepers, launcher=<name> is ours.")
-    if is_of_sweep(key) and parse_with_hydra(line).is_sweep_override():
+    if is_of_sweep(key) and override.is_sweep_override():
       raise ConfigError(f"{line}: {_ONE_VALUE}.")
+    if not (is_of_sweep(key) or is_of_command(line)) and _RESOLVER.search(line):
+      raise ConfigError(f"{line}: a job calls no resolver, write the value itself.")
     (settings if is_of_sweep(key) else ours).append(line)
   return settings, ours
 
@@ -147,12 +151,9 @@ def check_saved_job(name: str, overrides: Iterable[str]) -> None:
   """Checks a job read from a sweep's folder, which another user may have written, before it runs.
 
   Raises:
-    ConfigError: an override of the folder that the job writes, one that only a command line may set, or one that calls
-      a resolver, which may read environment variables.
+    ConfigError: as `split`, or an override that only a command line may set.
   """
   for text in overrides:
-    if _RESOLVER.search(text):
-      raise ConfigError(f"Job {name} in sweep.yaml says {text}: a job calls no resolver, write the value itself.")
     if is_of_command(text) or split([text])[0]:
       raise ConfigError(f"Job {name} in sweep.yaml says {text}, which only a command line can: start a new sweep.")
 

@@ -129,12 +129,16 @@ class Env(abc.ABC):
   def step(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> State:
     """Advances one control step of `dt` seconds."""
     state = self.pre_step(state)
-    ctrl = self.action_to_ctrl(state, action)
-    if jnp.shape(ctrl) != (self.mj_model.nu,):
-      returned = f"action_to_ctrl returns shape {list(jnp.shape(ctrl))}"
-      raise ConfigError(f"{type(self).__name__}.{returned}, and the model has {self.mj_model.nu} actuators.")
+    ctrl = self.checked_ctrl("action_to_ctrl", self.action_to_ctrl(state, action))
     data = self.physics.step(self.model_of(state.info, model), state.data, ctrl, self.n_substeps)
     return self.post_step(data, state.info, action)
+
+  def checked_ctrl(self, method: str, ctrl: jax.Array) -> jax.Array:
+    """Returns the `ctrl` that a method of the task returned; raises ConfigError if its shape is not [nu]."""
+    if (shape := jnp.shape(ctrl)) != (self.mj_model.nu,):
+      returned = f"{type(self).__name__}.{method} returns shape {list(shape)}"
+      raise ConfigError(f"{returned}, and the model has {self.mj_model.nu} actuators.")
+    return ctrl
 
   def model_of(self, info: Mapping[str, Any], model: mjx.Model | None) -> mjx.Model:
     """Returns the model that a step simulates: `model` if given (a randomised one), else the task's own."""

@@ -140,10 +140,7 @@ class Task(Env):
   def start_physics(self, model: mjx.Model, initial: InitialState) -> PhysicsData:
     """Returns the physics of a start state, after a forward pass; actuators with a time constant have settled."""
     given = {name: value for name, value in vars(initial).items() if value is not None}
-    start = {"ctrl": self.rest_ctrl(initial), **given}
-    if (shape := jnp.shape(start["ctrl"])) != (self.mj_model.nu,):
-      who = f"{type(self).__name__}.rest_ctrl"
-      raise ConfigError(f"{who} returns the shape {list(shape)}, and the model has {self.mj_model.nu} actuators.")
+    start = {"ctrl": self.checked_ctrl("rest_ctrl", self.rest_ctrl(initial)), **given}
     lags = np.isin(self.mj_model.actuator_dyntype, _LAGS)
     if lags.any():
       start["act"] = jnp.zeros(self.mj_model.na).at[self.mj_model.actuator_actadr[lags]].set(start["ctrl"][lags])

@@ -4,7 +4,6 @@ import abc
 import copy
 import dataclasses
 import functools
-import importlib
 from collections.abc import Callable, Mapping
 from typing import ClassVar, Generic, TypeVar
 
@@ -23,6 +22,7 @@ from playground.learning.replay import Replay, ReplayBuffer
 from playground.learning.rollout import Environments
 from playground.pytree import PyTree
 from playground.settings import check
+from playground.trust import named_module
 
 Metrics = dict[str, jax.Array]
 
@@ -126,16 +126,11 @@ def build_algorithm(env: Env, config: AgentConfig, network_precision: str | None
   """
   check(config, "agent")
   module, _, name = config.algorithm.partition(":")
-  what = f"{type(config).__name__}.algorithm={config.algorithm}"
-  try:
-    found = vars(importlib.import_module(module))
-  except ModuleNotFoundError as error:
-    if error.name is None or not f"{module}.".startswith(f"{error.name}."):  # of a module that ours imports
-      raise
-    raise ConfigError(f"{what}: there is no module {error.name}.") from None
-  make: Callable[..., AnyAlgorithm] = lookup(found, name, what)
+  key = f"{type(config).__name__}.algorithm"
+  found = vars(named_module(key, config.algorithm, module))
+  make: Callable[..., AnyAlgorithm] = lookup(found, name, f"{key}={config.algorithm}")
   if lacking := sorted(getattr(make, "__abstractmethods__", ())):
-    raise ConfigError(f"{what} lacks the method {' and '.join(lacking)}.")
+    raise ConfigError(f"{key}={config.algorithm} lacks the method {' and '.join(lacking)}.")
   fields = [field.name for field in dataclasses.fields(config)]
   for setting in config.traced:
     lookup(dict.fromkeys(fields), setting, f"{type(config).__name__}.traced")

@@ -62,12 +62,9 @@ def plan(overrides: Sequence[str]) -> tuple[SweepDirectory, SweepSettings]:
     name = _name(overrides, [config for _, config in composed])
     varying = configs.varying(*sets)
     jobs = [Job.of_run(number, job, varying, config) for number, (job, config) in enumerate(composed)]
-    for job in jobs:
-      configs.check_saved_job(job.name, job.overrides)
     for job, config in composed:
       _check_task(job, config)
   lines = [line for line in lines if not configs.is_of_command(line)]
-  configs.check_saved_job("of the search", [] if jobs else lines)
   found = _find(chosen.sweep_dir, name, settings, lines, jobs)
   command = ["playground-run", "-m", *overrides]
   settings = [line for line in settings if not line.startswith("sweep_dir=")]

@@ -140,8 +140,8 @@ def _write_curves(sweep: SweepDirectory) -> list[Path]:
   tables: dict[str, dict[str, list[tuple[bool, pd.DataFrame]]]] = defaultdict(lambda: defaultdict(list))
   for job in sweep.jobs:
     folder = sweep.folder(job)
-    table, summary = read_metrics(folder.path / "metrics.csv"), folder.run.summary
-    if STAGE in table and (stages := summary.get("stages")):
+    table = read_metrics(folder.path / "metrics.csv")
+    if STAGE in table and (stages := (summary := folder.run.summary).get("stages")):
       table = table.loc[table[STAGE].isin([s["name"] for s in stages if s.get("env") == summary.get("env")])]
     if RETURN in table and len(table := table.dropna(subset=[RETURN])):
       name = ", ".join(f"{key.split('.')[-1]}={_label(job.varies.get(key))}" for key in keys)

@@ -128,7 +128,7 @@ def test_groups_of_go1() -> None:
 
 
 def test_shapes_and_numbers_are_checked(env: VecEnv) -> None:
-  with pytest.raises(ConfigError, match=rf"^actions have the shape \[{NUM_ENVS}, 3\], and must have \[{NUM_ENVS}, 1\]"):
+  with pytest.raises(ConfigError, match=rf"^actions has the shape \[{NUM_ENVS}, 3\], and must have \[{NUM_ENVS}, 1\]"):
     env.step(torch.zeros(NUM_ENVS, 3))
   with pytest.raises(ConfigError, match=r"^num_envs=0 must be at least 1"):
     vec_env(Point(episode_length=LENGTH), 0)

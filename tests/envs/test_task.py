@@ -42,7 +42,7 @@ def test_wrong_results_of_its_methods(
 def test_a_wrong_rest_ctrl(task: Any, monkeypatch: pytest.MonkeyPatch) -> None:
   env, _ = task
   monkeypatch.setattr(env, "rest_ctrl", lambda initial: jnp.zeros(2))
-  with pytest.raises(ConfigError, match=r"\.rest_ctrl returns the shape \[2\], .* has 8 actuators"):
+  with pytest.raises(ConfigError, match=r"\.rest_ctrl returns shape \[2\], .* has 8 actuators"):
     jax.eval_shape(env.reset, KEY)
 
 

@@ -261,7 +261,11 @@ class Unfinished(Algorithm):
 @pytest.mark.parametrize(
   ("algorithm", "traced", "message"),
   [
-    ("tests.learning.test_trainr:Halves", (), r"algorithm=.*: there is no module tests\.learning\.test_trainr\.$"),
+    (
+      "tests.learning.test_trainr:Halves",
+      (),
+      r"algorithm=.*: there is no module tests\.learning\.test_trainr \(installed, or on PYTHONPATH\)\.$",
+    ),
     ("tests.learning.test_trainer:Halve", (), r"Did you mean 'Halves'"),
     ("tests.learning.test_trainer:Unfinished", (), r"Unfinished lacks the method init and train_step\."),
     ("tests.learning.test_trainer:Halves", ("learning_rat",), r"\.traced.*Did you mean 'learning_rate'"),

@@ -126,7 +126,7 @@ def test_a_job_says_nothing_that_only_a_command_line_can(tmp_path: Path, overrid
 
 @pytest.mark.parametrize(
   "value",
-  [*("${oc.env:HOME}", "'${oc.env:HOME}'", "${${tracking.wandb.name}:HOME}"), r"'\\${oc.env:HOME}'", "{a: ${x:b}}"],
+  [*("${oc.env:HOME}", "'${oc.env:HOME}'", "'${${tracking.wandb.name}:HOME}'"), r"'\\${oc.env:HOME}'", "{a: ${x:b}}"],
 )
 def test_a_job_calls_no_resolver(tmp_path: Path, value: str) -> None:
   override = f"tracking.wandb.project={value}"
