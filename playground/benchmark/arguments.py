@@ -69,7 +69,7 @@ def _read(setting: Setting, text: str) -> object:
     return None
   if setting.text_depth == 0:
     return text
-  parts = [part.strip() for part in text.strip("[]()").split(",") if part.strip()]
+  parts = [part.strip(" '\"") for part in text.strip("[]()").split(",") if part.strip()]
   if setting.text_depth == 1:
     return tuple(dict.fromkeys(parts))  # none is measured twice
   if setting.limit is None:

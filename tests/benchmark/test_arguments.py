@@ -37,6 +37,7 @@ def test_types_and_lists():
   )
   assert parse("some", Some, ["out=null"]).out is None and parse("some", Some, ["rerun=True"]).rerun
   assert parse("some", Some, ["tasks=A,B,A", "sizes=2,2.0"]) == Some(("A", "B"), (2,)), "each once"
+  assert parse("some", Some, ["tasks=['A', \"B\"]"]).tasks == ("A", "B"), "as Hydra reads quotes"
   assert parse("some", Some, []) == Some()
 
 
