@@ -89,6 +89,8 @@ class CPhysics(Physics):
         self._c_model.dof_M0[self._slides] = self._inertia_of_slides()
         if num_substeps:
           mujoco.mj_step(self._c_model, self._c_data, num_substeps)
+          if not np.isfinite(state["ctrl"][i]).all():  # C MuJoCo has taken all of it as 0
+            self._c_data.qpos[:] = self._c_data.qvel[:] = np.nan
         else:
           mujoco.mj_forward(self._c_model, self._c_data)
         for name, values in out.items():

@@ -165,13 +165,17 @@ def _check_qpos(spec: mujoco.MjSpec, mjcf: str) -> None:
   if not spec.joints or spec.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
     body = spec.worldbody.first_body().name
     raise ConfigError(f"env.robot.mjcf={mjcf} needs <freejoint/> as its first joint, in the body {body}.")
-  size = sum(_POSITIONS.get(joint.type, 1) for joint in spec.joints)
+  sizes = [_POSITIONS.get(joint.type, 1) for joint in spec.joints]
   for key in spec.keys:
-    if len(key.qpos) not in (0, size):  # MuJoCo fills a short one with zeros
-      needed = f"qpos must have {size} numbers, 7 for the free joint and 1 for each hinge or slide"
+    if len(key.qpos) not in (0, sum(sizes)):  # MuJoCo fills a short one with zeros
+      needed = f"qpos must have {sum(sizes)} numbers, 7 for the free joint and 1 for each hinge or slide"
       raise ConfigError(f"env.robot.mjcf={mjcf}: {needed}, but the keyframe {key.name} has {len(key.qpos)}.")
     if not np.isfinite(key.qpos).all():
       raise ConfigError(f"env.robot.mjcf={mjcf}: the keyframe {key.name} has a qpos that is not finite.")
+    for joint, position in zip(spec.joints, np.split(key.qpos, np.cumsum(sizes)[:-1]), strict=True):
+      if joint.type == mujoco.mjtJoint.mjJNT_HINGE and np.abs(position).max(initial=0.0) > 2 * np.pi:
+        turned = f"the keyframe {key.name} turns the joint {joint.name} to {position[0]:g} rad"
+        raise ConfigError(f"env.robot.mjcf={mjcf}: {turned}: write positions in rad, not in degrees.")
     if spec.key(base := key.name.removesuffix("_rough")) is None:
       raise ConfigError(f"env.robot.mjcf={mjcf}: the keyframe {key.name} is {base} on rough ground: add {base}.")
 

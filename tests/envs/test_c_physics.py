@@ -49,6 +49,14 @@ def test_one_control_step_is_that_of_mjx(name: str) -> None:
     np.testing.assert_allclose(actual, expected, atol=atol, rtol=0, err_msg=field)
 
 
+def test_an_action_that_is_not_finite_shows_as_in_mjx() -> None:
+  env, action = on_c("CartpoleBalance"), jnp.full(1, jnp.nan)
+  state = rolled(env, 1)
+  for qvel in (rolled_on(env, state, action), compiled_task("CartpoleBalance").step(state, action).data.qvel):
+    assert jnp.isnan(qvel).all()
+  assert jnp.isfinite(rolled_on(env, state, jnp.zeros(1))).all()
+
+
 def test_a_batch_is_its_environments_one_after_another() -> None:
   env = on_c("CartpoleBalance")
   keys, actions = jax.random.split(jax.random.PRNGKey(1), 4), jnp.linspace(-1, 1, 4)[:, None]

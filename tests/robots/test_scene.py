@@ -128,6 +128,11 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
       "qpos must have 19 numbers, 7 for the free joint and 1 for each hinge or slide, but",
     ),
     ('qpos="0 0 0.278', 'qpos="0 0 nan', "the keyframe home has a qpos that is not finite."),
+    (
+      'qpos="0 0 0.278 1 0 0 0 0.1',
+      'qpos="0 0 0.278 1 0 0 0 45',
+      "the keyframe home turns the joint FR_hip_joint to 45 rad: write positions in rad, not in degrees.",
+    ),
     ('name="footstand"', 'name="pronk_rough"', "the keyframe pronk_rough is pronk on rough ground: add pronk."),
     ("<sensor>", '<asset><material name="studio/groundplane"/></asset><sensor>', "repeated name 'studio/groundplane'"),
     (
