@@ -141,7 +141,7 @@ def locking(path: Path, patience_s: float = 0.0) -> Iterator[int | None]:
 def is_locked(path: Path) -> bool:
   """Whether a process holds a lock, on this machine or another that shares the file system."""
   try:
-    handle = os.open(path, os.O_RDONLY)  # the folder may be another user's
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # the folder may be another user's, the file even a pipe
   except FileNotFoundError:
     return False
   try:

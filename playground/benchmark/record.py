@@ -206,7 +206,7 @@ def _played(entry: Entry, episodes: int) -> Row:
 
 def _key(row: Mapping[str, object]) -> tuple[str, ...]:
   """Returns what two records of the same run have in common; older rows do not say whether files had changes."""
-  commits = re.findall(r"\bcommit ([0-9a-f]{7,})", str(row["conditions"]))
+  commits = re.findall(r"\bcommit ([0-9a-f]{7,})", str(row.get("conditions")))
   columns = ("who", "task", "agent", "experiment", "setting", "seed", "steps")
   return (*(str(row.get(column) or "") for column in columns), *commits[-1:])
 
@@ -215,7 +215,7 @@ def _add_curves(entry: Entry) -> str:
   """Appends the evaluations, unless an interrupted call has already, and returns the run's name in the table."""
   present: dict[str, list[str]] = {}
   for row in read_csv(entry.curves):
-    present.setdefault(row["run"], []).append(f"{row['step']} {row[RETURN]}")
+    present.setdefault(row.get("run", ""), []).append(f"{row.get('step')} {row.get(RETURN)}")
   name, number = entry.name, 1
   own = [f"{row['step']} {row[RETURN]}" for row in entry.evaluations]
   while name in present and present[name] != own:

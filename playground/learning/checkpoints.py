@@ -27,6 +27,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from types import NoneType
 from typing import TypeVar
 
 import jax
@@ -50,6 +51,9 @@ _META_TYPES: dict[str, type | tuple[type, ...]] = {
   "config": dict,
   "leaves": dict,
   "sha256": dict,
+  "return": (int, float, NoneType),
+  "columns": (list, NoneType),  # earlier versions wrote none of these
+  "settings": (dict, NoneType),
 }
 _ABOUT_FILES = (None, errno.ENOENT, errno.ENOTDIR, errno.EISDIR)  # errors about the files; others may be temporary
 _TRANSIENT = ("RESOURCE_EXHAUSTED", "UNAVAILABLE", "PERMISSION_DENIED", "DEADLINE_EXCEEDED", "ABORTED", "CANCELLED")
@@ -552,8 +556,11 @@ def _meta_damage(meta: Plain) -> str:
   for key, kind in _META_TYPES.items():
     if not isinstance(meta.get(key), kind):
       return f"have no valid {key!r}"
-  if not isinstance(meta.get("return"), int | float | None):
-    return "have no valid 'return'"
+  for key in ("agent", "env"):
+    if not isinstance(meta["config"].get(key, {}), dict):
+      return f"have no valid {'config.' + key!r}"
+  if meta["update"] < 0:
+    return "have no valid 'update'"
   described = [leaf for leaves in meta["leaves"].values() for leaf in (leaves if isinstance(leaves, list) else [None])]
   if not all(isinstance(leaf, list) and list(map(type, leaf)) == [str, list, str] for leaf in described):
     return "have no valid 'leaves'"

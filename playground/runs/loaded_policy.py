@@ -18,7 +18,7 @@ from playground.learning.algorithm import Policy
 from playground.learning.checkpoints import Checkpoint
 from playground.learning.trainer import Trainer
 from playground.pretrained import other_meaning
-from playground.runs.restore_plan import weights_of
+from playground.runs.restore_plan import check_origin, weights_of
 from playground.runs.run_dir import RunDirectory
 
 
@@ -86,6 +86,7 @@ def load_policy(
   checkpoint = weights_of(path)
   run_dir = RunDirectory.open(checkpoint.path.parents[1])
   config = configs.from_saved(run_dir.config)
+  check_origin(checkpoint, config)
   if overrides:
     env = configs.override_task(config.resolved["env"], overrides)
     config = configs.from_dict({**config.resolved, "env": env}, config.overrides)

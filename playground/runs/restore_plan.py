@@ -93,14 +93,14 @@ class RestorePlan:
 
     Raises:
       CheckpointError: no usable checkpoint, `run_dir` holds a run already, or a run to train longer has a damaged
-        overrides.yaml.
+        overrides.yaml or manifest.json.
     """
     if config.resume is not None:
       run_dir = RunDirectory.open(config.resume)
       now = config.agent.num_timesteps
       longer = run_dir.config["agent"].get("num_timesteps", now) < now  # a key that is not there has its default
       if longer:
-        _ = run_dir.overrides  # damaged ones could not be written again, and raise before anything is changed
+        _ = run_dir.overrides, run_dir.manifest  # damaged ones raise before anything is changed
       plan = cls(run_dir=run_dir, began_s=began_s, longer=longer)
       try:
         plan.checkpoints = find_checkpoints(config.resume)
@@ -180,13 +180,7 @@ class RestorePlan:
         raise CheckpointError(
           f"{self.weights.path} was trained by {theirs.get('name')}: agent={name} cannot start from it."
         )
-      there, here = networks_of(theirs), networks_of(dataclasses.asdict(trainer.config))
-      for key in there:
-        if there[key] != here.get(key, there[key]):  # an earlier version had fewer keys
-          raise CheckpointError(
-            f"{self.weights.path} was trained with {key}={there[key]}: "
-            f"a run with {key}={here[key]} cannot start from it."
-          )
+      _check_networks(self.weights, dataclasses.asdict(trainer.config), "start from it")
       template = trainer.policy_shape()
       there, here = _observations(self.weights.meta["leaves"].get("policy", [])), _observations(describe(template))
       if there and there != here:
@@ -216,6 +210,7 @@ class RestorePlan:
           f"{error} It is moved to checkpoints/damaged_{path.name}. Falling back to the checkpoint before it."
         )
         continue
+      check_origin(checkpoint, config)
       self.update, self.step = checkpoint.meta["update"], checkpoint.step
       self.wall_clock_s = checkpoint.meta["wall_clock_s"]
       self.columns = checkpoint.meta.get("columns", [])  # checkpoints of earlier versions have none
@@ -229,6 +224,23 @@ def networks_of(agent: Section) -> dict[str, str]:
   found = {f"network.{name}": value for name, value in agent.get("network", {}).items() if name not in _ONLY_AT_FIRST}
   found |= {name: agent[name] for name in _OF_NETWORKS if name in agent}
   return {f"agent.{key}": format_value(value) for key, value in found.items()}
+
+
+def check_origin(checkpoint: Checkpoint, config: RunConfig) -> None:
+  """Raises CheckpointError if a run's configuration has another task or other networks than its checkpoint."""
+  task, here = checkpoint.meta["env"], config.choices["env"]
+  if task != here:
+    raise CheckpointError(f"{checkpoint.path} was trained on {task}, but its run is one of {here}.")
+  _check_networks(checkpoint, config.resolved["agent"], "use it")
+
+
+def _check_networks(checkpoint: Checkpoint, agent: Section, cannot: str) -> None:
+  """Raises CheckpointError if the networks of an agent section would compute something else with its weights."""
+  there, here = networks_of(checkpoint.meta["config"].get("agent", {})), networks_of(agent)
+  for key, value in there.items():
+    if value != here.get(key, value):  # an earlier version had fewer keys
+      trained = f"{checkpoint.path} was trained with {key}={value}"
+      raise CheckpointError(f"{trained}: a run with {key}={here[key]} cannot {cannot}.")
 
 
 def _observations(policy: list[Leaf]) -> str:

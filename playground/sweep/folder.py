@@ -173,7 +173,7 @@ class JobFolder:
       return state
     run = self.run.status
     if run.get("status") in ENDED and run.get("updated", "") >= (record.get("started") or ""):  # it outlived its worker
-      return dataclasses.replace(state, status=run["status"], reason=_printable(run["reason"]))
+      return dataclasses.replace(state, status=run["status"], reason=_printable(run.get("reason", "")))
     return dataclasses.replace(state, status="killed", reason="its process is gone without a word")
 
   @contextlib.contextmanager
@@ -192,8 +192,10 @@ class JobFolder:
 
   def progress(self) -> tuple[int | None, float | None]:
     """Returns trained steps and the last evaluation's return, from metrics.csv."""
+    if not (path := self.path / "metrics.csv").is_file():
+      return None, None
     try:
-      with (self.path / "metrics.csv").open("rb") as file:
+      with path.open("rb") as file:
         columns = file.readline().decode().strip().split(",")
         file.seek(max(file.tell(), file.seek(0, os.SEEK_END) - 16384))
         rows = [line.split(",") for line in file.read().decode(errors="replace").split("\n")[:-1]]

@@ -432,6 +432,25 @@ def test_changed_meta_data_are_damage(
     one_sentence(error, str(checkpoint), "is damaged: its meta data")
 
 
+@pytest.mark.parametrize(
+  ("change", "key"),
+  [
+    ({"columns": 5}, "columns"),
+    ({"settings": [1]}, "settings"),
+    ({"update": -5}, "update"),
+    ({"config": {"agent": [1]}}, "config.agent"),
+    ({"config": {"env": 3}}, "config.env"),
+  ],
+)
+def test_meta_data_that_no_run_writes_are_damage(
+  original: Path, tmp_path: Path, change: dict[str, Any], key: str
+) -> None:
+  checkpoint = shutil.copytree(original, tmp_path / "checkpoints" / "000000000010")
+  edit(checkpoint, lambda meta: (meta.pop("meta_sha256"), meta.update(change)))
+  with pytest.raises(DamagedCheckpointError, match=f"its meta data have no valid '{key}'"):
+    Checkpoint(checkpoint)
+
+
 def test_a_step_is_its_folders(tmp_path: Path) -> None:
   newest, _ = save(tmp_path, 10, 20)
   renamed = newest.rename(newest.with_name("000000000030"))

@@ -126,6 +126,16 @@ def test_damaged_overrides_do_not_change_a_run_that_is_to_train_longer(
   assert RunDirectory(run).status["status"] == "finished"
 
 
+def test_a_damaged_manifest_does_not_change_a_run_that_is_to_train_longer(
+  run: Path, refused: Callable[..., str]
+) -> None:
+  RunDirectory(run).set_status("finished")
+  (run / "manifest.json").write_text("{")
+  before = {path: path.read_bytes() for path in run.glob("*.*") if path.name != "run.lock"}
+  assert f"{run / 'manifest.json'} is damaged" in refused(f"resume={run}", "agent.num_timesteps=640")
+  assert {path: path.read_bytes() for path in before} == before
+
+
 VALUES: tuple[Any, ...] = (None, [], {}, "text", -1, True, {"a": [None]}, "missing")
 
 

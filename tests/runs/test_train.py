@@ -6,6 +6,7 @@ import functools
 import math
 import os
 import pty
+import re
 import resource
 import shutil
 import signal
@@ -31,6 +32,7 @@ from playground.learning.checkpoints import Checkpoint, checksum, find_checkpoin
 from playground.learning.loop import Loop, schedule
 from playground.runs import train as train_module
 from playground.runs.callbacks import MAX_WAITING, RunCallbacks
+from playground.runs.loaded_policy import load_policy
 from playground.runs.restore_plan import RestorePlan, networks_of
 from playground.runs.run_dir import RunDirectory
 from playground.runs.train import cut_short, open_run, say_where, train
@@ -273,6 +275,29 @@ def test_a_checkpoint_that_is_not_damaged_is_never_passed_over(
   assert expected in refused(f"resume={copy}")
   assert sorted(os.listdir(copy / "checkpoints")) == before
   assert last_row(copy) == int(newest.name)
+
+
+@pytest.mark.parametrize(
+  ("was", "now", "sentence"),
+  [
+    (
+      "    activation: swish",
+      "    activation: relu",
+      "was trained with agent.network.activation=swish: a run with agent.network.activation=relu cannot",
+    ),
+    ("  env: CartpoleBalance\n", "  env: CartpoleSwingup\n", "was trained on CartpoleBalance, but its run is one of"),
+  ],
+)
+def test_a_checkpoint_of_another_task_or_network_neither_plays_nor_goes_on(
+  was: str, now: str, sentence: str, copy: Path, refused: Callable[..., str]
+) -> None:
+  """Of the same shapes, it would compute something else."""
+  (newest, *_), text = find_checkpoints(copy), (copy / "config.yaml").read_text()
+  assert was in text
+  (copy / "config.yaml").write_text(text.replace(was, now))
+  with pytest.raises(CheckpointError, match=re.escape(f"{newest} {sentence}")):
+    load_policy(copy)
+  assert f"{newest} {sentence}" in refused(f"resume={copy}")
 
 
 def test_a_run_killed_after_its_last_checkpoint_ends_with_the_same_result(whole: Path, copy: Path) -> None:

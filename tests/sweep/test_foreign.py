@@ -1,5 +1,6 @@
 """Sweeps that lie in somebody else's folder, or are started in one: neither runs code of theirs."""
 
+import os
 import re
 from pathlib import Path
 
@@ -138,6 +139,19 @@ def test_a_job_calls_no_resolver(tmp_path: Path, value: str) -> None:
     run(change(sweep, jobs=[]), "search=optuna", "launcher.cores_per_job=1")
   for harmless in (r"tracking.wandb.project=\${oc.env:HOME}", "agent.batch_size=${agent.num_envs}"):
     check_saved_job("0", [harmless])
+
+
+def test_a_damaged_job_hides_no_other(tmp_path: Path) -> None:
+  """Nor does a pipe in place of a file, which nobody writes, stop the reader."""
+  folder = JobFolder(tmp_path)
+  folder.write(status="running", attempt=1, started="2026-11-29T21:08:01.553+00:00")
+  (tmp_path / "status.json").write_text('{"status": "finished", "updated": "2026-11-30"}')
+  os.mkfifo(tmp_path / "job.lock")
+  os.mkfifo(tmp_path / "metrics.csv")
+  assert (folder.state().status, folder.state().reason, folder.progress()) == ("finished", "", (None, None))
+  (tmp_path / "metrics.csv").unlink()
+  (tmp_path / "metrics.csv").mkdir()
+  assert folder.progress() == (None, None)
 
 
 def test_a_reason_does_not_steer_the_terminal(tmp_path: Path) -> None:
