@@ -30,6 +30,7 @@ _VALUES = {
   "depth": "255 * min(1, distance / {farthest} m) along the optical axis, 0 where no geom is",
   "segmentation": "1 + id of the visible geom in the model, 0 where no geom is",
 }
+_FILTERS = (mujoco.mjtDyn.mjDYN_FILTER.value, mujoco.mjtDyn.mjDYN_FILTEREXACT.value)
 _CONSTANT_BASES = ("default_pose", "home", "zero")
 _FAR = 1e6  # an action beyond all limits
 
@@ -272,7 +273,8 @@ def _home(env: Env, config: Contract) -> tuple[str, np.ndarray]:
 def _actuators(mj_model: mujoco.MjModel, home: tuple[str, np.ndarray]) -> list[dict[str, object]]:
   """Returns each actuator in the order of the actions, with its joint if it has one.
 
-  A position servo's force is kp * (ctrl - q) - kv * qd; the joint's own damping is added.
+  A position servo's force is kp * (ctrl - q) - kv * qd; the joint's own damping is added. An actuator with a
+  `time_constant`, s, filters `ctrl`: its first-order activation acts in place of it.
   """
   rows = []
   for i in range(mj_model.nu):
@@ -288,6 +290,8 @@ def _actuators(mj_model: mujoco.MjModel, home: tuple[str, np.ndarray]) -> list[d
       row |= {"kp": gain[0], "kv": abs(bias[2])}
     else:
       row["gain"] = gain[0]
+    if mj_model.actuator_dyntype[i] in _FILTERS:
+      row["time_constant"] = mj_model.actuator_dynprm[i, 0]
     row["gear"] = mj_model.actuator_gear[i, 0]
     row["force_limit"] = min((limit[1] for limit in limits), default=None)
     row["ctrl_range"] = mj_model.actuator_ctrlrange[i] if mj_model.actuator_ctrllimited[i] else None

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
+import mujoco
 import pytest
 import yaml
 
@@ -73,6 +74,15 @@ def test_a_joystick_policy() -> None:
   assert [row["joint"] for row in said["actuators"]] == said["joints"][1:]
   assert said["command"]["max"] == [1.5, 0.8, 1.2] and "gait" not in said
   check_contract(said | {"origin": {"steps": 1, "evaluation": {}}})
+
+
+def test_a_filtered_actuator_has_its_time_constant() -> None:
+  env = registry.load("Go1JoystickFlatTerrain")
+  env.mj_model.actuator_dyntype[1], env.mj_model.actuator_dynprm[1, 0] = mujoco.mjtDyn.mjDYN_FILTEREXACT, 0.05
+  zero = jnp.zeros(())
+  state = State(env.physics.make(), {}, zero, zero, {}, {})
+  plain_one, filtered, *_ = describe_policy(env, plain(env.config), "T", {}, {"state": (48,)}, state)["actuators"]
+  assert filtered["time_constant"] == 0.05 and "time_constant" not in plain_one
 
 
 def test_a_command_may_leave_an_axis_out() -> None:
