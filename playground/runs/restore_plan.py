@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Self
 
@@ -29,7 +29,7 @@ from playground.learning.trainer import Settings, Trainer, TrainState
 from playground.pretrained import PREFIX, check_task, is_pretrained, locate, other_meaning
 from playground.pytree import PyTree
 from playground.runs.run_dir import RunDirectory
-from playground.settings import Plain, Section
+from playground.settings import Plain, Section, nodes
 from playground.text import format_value
 
 _ONLY_AT_FIRST = ("value_dtype", "policy_output_scale", "init_std")  # keys of networks that given weights leave open
@@ -221,7 +221,8 @@ class RestorePlan:
 
 def networks_of(agent: Section) -> dict[str, str]:
   """Returns the keys of an agent section, with their values, that say what its networks compute with given weights."""
-  found = {f"network.{name}": value for name, value in agent.get("network", {}).items() if name not in _ONLY_AT_FIRST}
+  network = {name: value for name, value in nodes(agent.get("network", {})) if not isinstance(value, Mapping)}
+  found = {f"network.{name}": value for name, value in network.items() if name not in _ONLY_AT_FIRST}
   found |= {name: agent[name] for name in _OF_NETWORKS if name in agent}
   return {f"agent.{key}": format_value(value) for key, value in found.items()}
 
