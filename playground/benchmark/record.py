@@ -35,6 +35,7 @@ _MEASURED = {  # column -> its column of metrics.csv, the mode's where it was ev
   "goals_reached": ("eval/episode_goals_reached", 2),
 }
 _IN_C_MUJOCO = {"return": "episode_reward", "falls_per_episode": "episode_fall", "success": "episode_success"}
+_IDENTITY = ("who", "task", "agent", "experiment", "setting", "seed", "steps")  # columns that tell runs apart
 _OF_MANIFEST = ("impl", "platform", "device", "num_devices", "matmul_precision", "network_precision", "versions")
 _OF_CONFIG = ("choices.env", "choices.agent", "agent.num_timesteps", "agent.num_eval_envs", "env", "seed")
 
@@ -134,7 +135,7 @@ def _entry(run: RunDirectory, folder: Path, options: Options) -> Entry:
   table, curves = folder / f"{suite}.csv", folder / f"{suite}_curves.csv"
   if select(config, "env.vision.enable"):
     table = folder / "vision.csv"
-  columns, _ = _header(table), _header(curves)
+  columns, _ = _header(table, (*_IDENTITY, "conditions")), _header(curves, ("run", "step", RETURN))
   if options.c_mujoco and "c_mujoco_return" not in columns:
     raise ConfigError(f"{table} has no columns c_mujoco_*: leave c_mujoco=true away for {run.path}.")
   metrics = read_table(run.metrics_csv).rows
@@ -206,16 +207,15 @@ def _played(entry: Entry, episodes: int) -> Row:
 
 def _key(row: Mapping[str, object]) -> tuple[str, ...]:
   """Returns what two records of the same run have in common; older rows do not say whether files had changes."""
-  commits = re.findall(r"\bcommit ([0-9a-f]{7,})", str(row.get("conditions")))
-  columns = ("who", "task", "agent", "experiment", "setting", "seed", "steps")
-  return (*(str(row.get(column) or "") for column in columns), *commits[-1:])
+  commits = re.findall(r"\bcommit ([0-9a-f]{7,})", str(row["conditions"]))
+  return (*(str(row.get(column) or "") for column in _IDENTITY), *commits[-1:])
 
 
 def _add_curves(entry: Entry) -> str:
   """Appends the evaluations, unless an interrupted call has already, and returns the run's name in the table."""
   present: dict[str, list[str]] = {}
   for row in read_csv(entry.curves):
-    present.setdefault(row.get("run", ""), []).append(f"{row.get('step')} {row.get(RETURN)}")
+    present.setdefault(row["run"], []).append(f"{row['step']} {row[RETURN]}")
   name, number = entry.name, 1
   own = [f"{row['step']} {row[RETURN]}" for row in entry.evaluations]
   while name in present and present[name] != own:
@@ -226,12 +226,15 @@ def _add_curves(entry: Entry) -> str:
   return name
 
 
-def _header(path: Path) -> list[str]:
-  """Returns the columns of a table; raises ConfigError if there is none."""
+def _header(path: Path, needed: Sequence[str] = ()) -> list[str]:
+  """Returns the columns of a table; raises ConfigError if there is none, or if it lacks a column of `needed`."""
   try:
-    return next(csv.reader([path.read_text(encoding="utf-8").partition("\n")[0]]), [])
+    columns = next(csv.reader([path.read_text(encoding="utf-8").partition("\n")[0]]), [])
   except OSError as error:
     raise ConfigError(f"reference={path.parent}: {path} cannot be read: {error.strerror}.") from None
+  if missing := [column for column in needed if column not in columns]:
+    raise ConfigError(f"reference={path.parent}: {path} lacks the column {missing[0]}.")
+  return columns
 
 
 def _append(path: Path, rows: Sequence[Row]) -> None:

@@ -185,5 +185,10 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_written(reference
   refused(untrained, ConfigError, "manifest.json is missing: only a whole run")
   with locking(good / "run.lock"):
     refused(good, ConfigError, "is being written by process")
+  run = make("env=CheetahRun", metrics=METRICS, name="c")
+  for name, column in (("dm_control_curves.csv", "step"), ("dm_control.csv", "conditions")):
+    header = (reference / name).read_text()
+    (reference / name).write_text(header.replace(column, "other", 1))
+    refused(run, ConfigError, f"{name} lacks the column {column}")
   (reference / "dm_control.csv").unlink()
-  refused(make("env=CheetahRun", metrics=METRICS, name="c"), ConfigError, "dm_control.csv cannot be read")
+  refused(run, ConfigError, "dm_control.csv cannot be read")
