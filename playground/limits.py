@@ -85,17 +85,17 @@ def span(low: float = 0) -> Limit:
   return Limit(low, form="list", length=2, rising=True)
 
 
-# Types of parameters of terms.
-Positive = Annotated[float, positive()]
-AtLeast0 = Annotated[float, at_least_0()]
-Share = Annotated[float, Limit(0, 1)]
-Span = Annotated[Sequence[float], span()]
-Vector = Annotated[Sequence[float], Limit(form="list", length=3)]
-
 SHARE = Limit(0, 1)
 SEED = count(0, 2**32 - 1)
 VECTOR = Limit(form="list", length=3)
 SIZES = Limit(1, 65536, whole=True, form="list")  # of layers
+
+# Types of parameters of terms.
+Positive = Annotated[float, positive()]
+AtLeast0 = Annotated[float, at_least_0()]
+Share = Annotated[float, SHARE]
+Span = Annotated[Sequence[float], span()]
+Vector = Annotated[Sequence[float], VECTOR]
 
 
 def _short(number: float) -> str:

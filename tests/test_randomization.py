@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mujoco import mjx
+from omegaconf import OmegaConf
 
 from playground.config import config_dict
 from playground.errors import ConfigError, PlaygroundError, UnknownNameError
@@ -25,8 +26,10 @@ CONFIGS = Path(__file__).parents[1] / "configs/randomization"
 
 
 def shipped(name: str) -> dict[str, Any]:
-  """The events of a file of configs/randomization."""
-  return yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())
+  """The events of a file of configs/randomization, over those of the file that it starts from."""
+  own = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())
+  base, _ = own.pop("defaults", [None, "_self_"])
+  return cast(dict[str, Any], OmegaConf.to_object(OmegaConf.merge(shipped(base), own))) if base else own
 
 
 def events(*terms: Any, mode: str = "startup") -> dict[str, Any]:
@@ -128,12 +131,12 @@ DRAWN = {
   "g1": [1, 29, 29, 31, 1, 29],
   "t1": [1, 23, 23, 25, 1, 23, 23, 4],
 }
-# The same, wider, with the joints' damping (after armature), the centre of mass (before the masses) and gains (last).
+# The same, wider, then the joints' damping, the centre of mass and gains that these do not draw.
 DRAWN |= {
-  "go1_strong": [1, 12, 12, 12, 3, 14, 1, 12, 12],
-  "berkeley_humanoid_strong": [1, 12, 12, 12, 3, 14, 1, 12, 12],
-  "g1_strong": [1, 29, 29, 29, 3, 31, 1, 29, 29],
-  "t1_strong": [1, 23, 23, 23, 3, 25, 1, 23, 23, 4],
+  "go1_strong": [*DRAWN["go1"], 12, 12],
+  "berkeley_humanoid_strong": [*DRAWN["berkeley_humanoid"], 12, 3, 12],
+  "g1_strong": [*DRAWN["g1"], 29, 3, 29],
+  "t1_strong": [*DRAWN["t1"], 23, 3],
 }
 # Hands: their terms are 0.2.0's, but each has a key of its own.
 DRAWN |= {

@@ -53,25 +53,16 @@ class VecEnv(rsl_rl_env.VecEnv):
     max_episode_length: control steps; `episode_length_buf` counts those of the current episodes.
   """
 
-  def __init__(
-    self,
-    env: Env,
-    state: State,
-    step: Callable[[State, jax.Array], State],
-    groups: Mapping[str, str] | None = None,
-    log: bool = True,
-  ):
+  def __init__(self, env: Env, state: State, step: Callable[[State, jax.Array], State], groups: Mapping[str, str]):
     """Takes a batch of environments; `vec_env` makes one.
 
     Args:
       env: the task.
       state: the batch of states to start from.
       step: advances the state by actions [N, action_size].
-      groups: the task's observation group for each RSL-RL group; the default is those of actor and critic.
-      log: whether there is an `extras["log"]`, which waits for the device.
+      groups: the task's observation group for each RSL-RL group.
     """
-    self.state, self._step, self._log = state, step, log
-    self.groups = dict(groups or group_entries(env))
+    self.state, self._step, self.groups = state, step, groups
     self.num_envs, self.num_actions = state.done.shape[0], env.action_size
     self.max_episode_length = env.episode_length
     self.device = to_torch(state.done).device
@@ -107,12 +98,11 @@ class VecEnv(rsl_rl_env.VecEnv):
     extras: dict[str, Extra] = {"time_outs": to_torch(state.info["truncation"])}
     if FINAL_OBS in state.info:
       extras[FINAL_OBS] = self._grouped(state.info[FINAL_OBS])
-    if self._log:
-      sums = self._sums(state)
-      if ended := float(sums["episodes"]):
-        means = {name: float(sums[f"episode_{name}"]) / ended for name in state.info["episode_metrics"]}
-        means["reward"] = means.pop("sum_reward")
-        extras["log"] = {f"Episode/{name}": mean for name, mean in means.items()}
+    sums = self._sums(state)
+    if ended := float(sums["episodes"]):
+      means = {name: float(sums[f"episode_{name}"]) / ended for name in state.info["episode_metrics"]}
+      means["reward"] = means.pop("sum_reward")
+      extras["log"] = {f"Episode/{name}": mean for name, mean in means.items()}
     return self.get_observations(), to_torch(state.reward), to_torch(state.done), extras
 
 
@@ -131,7 +121,7 @@ def vec_env(
     num_envs: number of environments.
     seed: of the episodes and the models.
     events: domain randomisation, drawn once for each environment (`compose(["env=..."]).env.events`).
-    groups: see `VecEnv`.
+    groups: the task's observation group for each RSL-RL group; the default is those of actor and critic.
 
   Raises:
     ConfigError: the task has images, or `num_envs` is below 1.

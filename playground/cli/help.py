@@ -10,6 +10,7 @@ from rich.text import Text
 from playground.config import config_roots
 from playground.config.definitions import RunSettings
 from playground.config.files import listed_options
+from playground.config.run_config import SCALARS
 from playground.settings import settings
 
 _USAGE = "playground-run [-m] [group=option ...] [key=value ...] [--cfg job] [--verbose]"
@@ -36,7 +37,6 @@ _GROUPS = {
   "search": "how a sweep chooses values",
 }
 _MANY = 20  # groups of which only the number of options is shown
-_RUN_KEYS = ("seed", "run_dir", "resume", "init_from")
 _FLAGS = {
   "-m, --multirun": "run a sweep: `key=a,b`, `seed=range(3)`, sweep=<name or file.yaml>",
   "--cfg job": "print the configuration and do not train; --package KEY prints a part of it",
@@ -66,7 +66,7 @@ def print_help() -> None:
 
 def _parts() -> Iterator[tuple[str, list[tuple[str, ...]]]]:
   yield "Groups", [(group, f"{what}: {_options(group)}") for group, what in _GROUPS.items()]
-  fields = [setting for setting in settings(RunSettings).values() if setting.name in _RUN_KEYS]
+  fields = [setting for setting in settings(RunSettings).values() if setting.name in SCALARS]
   yield "Keys of a run", [(setting.name, setting.help) for setting in fields]
   yield "Flags", list(_FLAGS.items())
 

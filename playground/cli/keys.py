@@ -14,7 +14,7 @@ from playground.config.comments import keys_and_comments, meaning
 from playground.config.definitions import chosen_names, definition
 from playground.config.files import find_file, groups, lineage, listed_options
 from playground.config.overrides import SHORT_KEYS
-from playground.config.schema import check_key
+from playground.config.schema import check_key, is_of_terms
 from playground.console import wide_console
 from playground.errors import UnknownNameError, nearest
 from playground.mdp.options import OPTIONS
@@ -118,15 +118,9 @@ def _parameters(prefix: str, values: Section) -> dict[str, tuple[str, str]]:
 
 
 def _is_term(key: str, value: Plain) -> bool:
-  section, kind, *names = [*key.split("."), "", ""]
-  names = [name for name in names if name]
-  return (
-    isinstance(value, Mapping)
-    and section == "env"
-    and kind in OPTIONS
-    and len(names) == (2 if kind == "observations" else 1)
-    and names[-1] != "state"  # of an observation group: the group state as a whole
-  )
+  """Whether this is a term, not a group of observations, nor the group `state` as an entry of another one."""
+  depth = 3 if key.startswith("env.observations.") else 2
+  return isinstance(value, Mapping) and is_of_terms(key) and key.count(".") == depth and not key.endswith(".state")
 
 
 def _term(key: str, entry: Section) -> tuple[str, str]:

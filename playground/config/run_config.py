@@ -29,8 +29,6 @@ from playground.text import dump_yaml, first_line, format_value
 if TYPE_CHECKING:
   from rich.tree import Tree
 
-if TYPE_CHECKING:
-
   class TaskConfig(EnvConfig, Mapping[str, Plain], ConfigDict):  # pyright: ignore[reportIncompatibleMethodOverride]
     """The section of a task: the settings of every task (`EnvConfig`), and those of its own class."""
 

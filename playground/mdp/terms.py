@@ -186,18 +186,15 @@ def _reader(getter: Callable[..., Any], is_method: bool) -> Callable[..., Any]:
   return read
 
 
-def bind(kind: str, section: Mapping[str, Any] | None, group: str = "") -> list[Term]:
+def bind(kind: str, section: Mapping[str, Any] | None) -> list[Term]:
   """Binds the terms of `env.<kind>`, in their order; null entries and events that draw model fields are left out.
-
-  `group` is that of observations, whose section is `env.observations.<group>`.
 
   Raises:
     ConfigError: an unknown or missing key, function or parameter, or a value of the wrong type.
   """
   entries = {name: entry for name, entry in (section or {}).items() if entry is not None}
-  prefix = f"env.{kind}.{group}." if group else f"env.{kind}."
   own = [name for name, entry in entries.items() if kind != "events" or not is_model_field(name, entry)]
-  return [bind_one(kind, prefix + name, name, entries[name], entries) for name in own]
+  return [bind_one(kind, f"env.{kind}.{name}", name, entries[name], entries) for name in own]
 
 
 def bind_one(kind: str, key: str, name: str, entry: Any, others: Iterable[str] = ()) -> Term:

@@ -35,7 +35,6 @@ class View:
     kinds: any of `rgb`, `depth` and `segmentation`.
     shadows: whether lights with `castshadow` cast shadows.
     textures: whether materials show textures or only colours.
-    geom_groups: groups of the visible geoms.
   """
 
   cameras: tuple[str, ...]
@@ -44,7 +43,6 @@ class View:
   kinds: tuple[str, ...] = ("rgb",)
   shadows: bool = False
   textures: bool = False
-  geom_groups: tuple[int, ...] = (0, 1, 2)
 
 
 class BatchRenderer:
@@ -172,7 +170,6 @@ class BatchRenderer:
         use_shadows=view.shadows,
         use_textures=view.textures,
         use_precomputed_rays=not lenses,
-        enabled_geom_groups=list(view.geom_groups),
       )
       apart = [[device] for device in devices] if "cpu" in devices else [devices]
       self._contexts[key] = [make(devices=together) for together in apart]
