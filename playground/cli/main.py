@@ -231,8 +231,9 @@ def _run_path(name: str) -> str:
 
 def _play(args: argparse.Namespace) -> int:
   from playground.cli.play import play
+  from playground.config import options
 
-  if args.agent and args.policy not in registry.names():
+  if args.agent and args.policy.removeprefix("env=") not in options("env"):
     near = nearest(args.policy, registry.names())
     raise UnknownNameError(f"--agent={args.agent} acts on a task, and {args.policy} is none.{near}")
   if args.episodes is not None and (args.web or args.viewer):

@@ -98,9 +98,10 @@ def play(
       console.print(f"{drawn[-1]}: {what}", soft_wrap=True, markup=False, highlight=False)
   else:
     _set_up_cpu()
-    section = configs.compose([f"env={path}", *overrides]).env
-    env = load_on_c_physics(path, section, interval_events=interval_events, model_seed=model_seed)
-    opened = Opened(ScriptedPolicy(agent, path, env, seed), env)
+    config = configs.compose(configs.of_task(path, overrides))
+    task = config.choices["env"]
+    env = load_on_c_physics(task, config.env, interval_events=interval_events, model_seed=model_seed)
+    opened = Opened(ScriptedPolicy(agent, task, env, seed), env)
   exported, env = opened.exported, opened.env
   better = of_a_better_one(path, opened.trained.checkpoint) if opened.trained else ()
   events = env.config.get("events")

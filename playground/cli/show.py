@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from playground import registry
-from playground.config import RunConfig, compose, format_value
+from playground.config import RunConfig, compose, format_value, of_task
 from playground.console import wide_console
 from playground.errors import ConfigError
 from playground.mdp.options import MODEL_FIELD, is_model_field
@@ -49,7 +49,7 @@ def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_v
     config = compose([task])
     console.print(_table(task.replace("=", ": "), list(_events(config.env.get("events")))))
     return 0
-  config = compose([task if "=" in task else f"env={task}", *overrides])
+  config = compose(of_task(task, overrides))
   env = registry.build(config.env)
   if views:
     from playground.rendering.views import save_views

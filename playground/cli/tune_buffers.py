@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from playground import registry
-from playground.config import compose, config_dict, format_value
+from playground.config import compose, config_dict, format_value, of_task
 from playground.envs.wrappers import wrap_for_training
 from playground.errors import ConfigError
 from playground.physics.warp_buffer_sizes import ROOM, Act, BufferSizes, measure_buffers
@@ -38,7 +38,7 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   Raises:
     PlaygroundError: no such task or run, or one that does not fit; Warp is not installed.
   """
-  config = compose([f"env={task}", *overrides]).env
+  config = compose(of_task(task, overrides)).env
   policies: dict[str, Act | None] = {"random": None}
   if run is not None:
     trained = load_policy(run)

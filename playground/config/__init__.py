@@ -34,6 +34,7 @@ from playground.config.overrides import (
   is_hydras,
   is_of_command,
   is_of_sweep,
+  of_task,
   parse_with_hydra,
   with_default_experiment,
 )

@@ -68,6 +68,17 @@ def is_of_command(text: str) -> bool:
   return is_hydras(text) or any(f"{key}.".startswith(f"{own}.") for own in _OF_COMMANDS)
 
 
+def of_task(task: str, overrides: Sequence[str]) -> list[str]:
+  """Returns the overrides of a command that names its task first, as `CartpoleBalance` or `env=CartpoleBalance`.
+
+  Raises:
+    ConfigError: an override names a task, too.
+  """
+  if others := [text for text in overrides if text.startswith("env=")]:
+    raise ConfigError(f"{others[-1]} is a second task: the command is about {task.removeprefix('env=')}.")
+  return [task if "=" in task else f"env={task}", *overrides]
+
+
 def parse_with_hydra(text: str) -> HydraOverride:
   """Reads one override as Hydra does; raises ConfigError if it is none.
 

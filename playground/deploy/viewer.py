@@ -31,11 +31,12 @@ def need_display() -> None:
   """Raises HardwareError if no window can be opened here."""
   if not sys.platform.startswith("linux"):
     return
+  remedy = "use --video FILE, or the page in the browser"
   display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
   if not display:
-    raise HardwareError("--viewer needs a display, and there is none here: use --video FILE or --web.")
+    raise HardwareError(f"--viewer needs a display, and there is none here: {remedy}.")
   if not _opens_a_window():  # MuJoCo's viewer would wait forever
-    raise HardwareError(f"--viewer cannot open a window on the display {display}: use --video FILE or --web.")
+    raise HardwareError(f"--viewer cannot open a window on the display {display}: {remedy}.")
 
 
 def _opens_a_window() -> bool:

@@ -324,7 +324,7 @@ class EventManager(_Manager):
       model = env.mj_model
       shapes = {"ctrl": (model.nu,), "mocap_pos": (model.nmocap, 3), "mocap_quat": (model.nmocap, 4)}  # may be None
       for name, value in vars(initial).items():
-        old, new = shapes.get(name, jnp.shape(value)), jnp.shape(vars(changed)[name])
+        old, new = shapes.get(name, np.shape(value)), np.shape(vars(changed)[name])
         if new != old and (value is not None or vars(changed)[name] is not None):
           raise ConfigError(f"{term.key} returns {name} of shape {list(new)}, and this task's is {list(old)}.")
       initial = changed

@@ -56,7 +56,7 @@ def watch(run: Path) -> Iterator[Watch]:
 @pytest.fixture(scope="module")
 def open_gate() -> Iterator[Gate]:
   """Of a server that other machines can reach."""
-  gate = Gate("0.0.0.0", free_port())
+  gate = Gate("0.0.0.0", 0)
   yield gate
   gate.close()
 
@@ -126,6 +126,7 @@ def test_a_server_that_others_can_reach_asks_for_its_token(open_gate: Gate) -> N
   status, answer = get(port, f"/?token={token[1]}", host="my-machine:80")
   assert status == 200
   cookie = str(answer.headers["Set-Cookie"])
+  assert cookie.startswith(f"playground-{port}="), "a browser sends a host's cookies to each of its ports"
   assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
   assert get(port, "/", cookie=cookie.partition(";")[0])[0] == 200
   with client(port, cookie=f"other=1; {cookie.partition(';')[0]}") as connection:
@@ -154,6 +155,15 @@ def test_a_host_that_is_empty(
 ) -> None:
   assert caller(monkeypatch, "playground", main)("play", str(run), "--web", "--host", host) == 2
   assert "is empty: name an address of this machine" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "nope.invalid"])
+def test_a_host_that_is_of_another_machine(
+  run: Path, host: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  assert caller(monkeypatch, "playground", main)("play", str(run), "--web", "--host", host) == 2
+  error = capsys.readouterr().err
+  assert error.count(host) == 1 and error.endswith("--host must be an address of this machine, or 0.0.0.0 for all.\n")
 
 
 def bad_messages(watch: Watch) -> list[Any]:

@@ -56,3 +56,25 @@ def test_view_shows_it_in_the_browser(command: Command, monkeypatch: pytest.Monk
   section = compose(["env=Go1JoystickFlatTerrain", "terrain=rough"]).env
   drawn = load_on_c_physics("Go1JoystickFlatTerrain", section, model_seed=1)
   assert (session.player.env.mj_model.body_mass != drawn.mj_model.body_mass).any()
+
+
+def test_a_robot_of_ones_own_is_viewed_as_it_is_trained(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+  sessions: list[Session] = []
+  monkeypatch.setattr("playground.deploy.web.server.watch", lambda session, *_: sessions.append(session))
+  assert command("view", "env=joystick", "robot=spot", "--port", "0") == 0
+  (session,) = sessions
+  assert session.player.exported.contract["task"] == "joystick" and session.player.env.config.robot.name == "spot"
+
+
+@pytest.mark.parametrize(
+  "line",
+  [
+    ["view", "CartpoleBalance", "env=CheetahRun", "--port", "0"],
+    ["play", "CartpoleBalance", "env=CheetahRun", "--agent", "zero"],
+    ["show", "env=CartpoleBalance", "env=CheetahRun"],
+    ["tune-buffers", "CartpoleBalance", "env=CheetahRun"],
+  ],
+)
+def test_a_second_task_is_refused(command: Command, capsys: pytest.CaptureFixture[str], line: list[str]) -> None:
+  assert command(*line) == 2
+  assert "env=CheetahRun is a second task: the command is about CartpoleBalance." in capsys.readouterr().err

@@ -7,6 +7,7 @@ the hooks that `websockets` has for this purpose.
 
 import asyncio
 import contextlib
+import errno
 import gzip
 import hmac
 import html
@@ -92,9 +93,11 @@ class Gate:
       title: title of the page.
     """
     self._title = title
-    self._host, self._cookie = host, f"playground-{port}"
+    self._host = host
     self._token = None if _is_loopback(host, port) else secrets.token_urlsafe(24)
-    self.server = self._start(host, port)
+    server = self._start(host, port)
+    self._cookie = f"playground-{server.get_port()}"  # a browser sends a host's cookies to each of its ports
+    self.server = server
     name = f"[{host}]" if ":" in host else socket.gethostname() if host in ("0.0.0.0", "::") else host
     self.url = f"http://{name}:{self.server.get_port()}/" + (f"?token={self._token}" if self._token else "")
 
@@ -206,8 +209,10 @@ def need_port(host: str, port: int) -> None:
   try:
     socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
   except (OSError, OverflowError, UnicodeError) as error:
-    reason = getattr(error, "strerror", None) or str(error)
-    raise ConfigError(f"--web cannot listen on --host={host} --port={port}: {reason}; try another port.") from None
+    of_port = isinstance(error, OverflowError) or getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES)
+    remedy = "try another port" if of_port else "--host must be an address of this machine, or 0.0.0.0 for all"
+    reason, *_ = (getattr(error, "strerror", None) or str(error)).split(" (while attempting")  # it repeats the address
+    raise ConfigError(f"The page cannot be served on --host={host} --port={port}: {reason}; {remedy}.") from None
 
 
 def _set_title(response: Response, title: str) -> None:
