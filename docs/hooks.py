@@ -225,24 +225,25 @@ class _File(NamedTuple):
       return "removes the term"
     if kind == "observations" and name == "state":
       return "all terms of the group state"
-    comment = " ".join(text for at, text in self.comments.items() if at == key or at.startswith(f"{key}."))
-    entry = {"func": self._func(key) or name, **(entry if isinstance(entry, dict) else {})}
+    comments = [text for at, text in self.comments.items() if text and (at == key or at.startswith(f"{key}."))]
+    entry = {"func": name, **self._whole(key)}
     if is_model_field(name, entry):
       field = bind_one(kind, key, name, entry)().describe()
       said = f"{field['operation']} {field['field']} of {field['target']}: {field['draw']}"
     else:
       said = _summary(find(kind, entry["func"], key))
-    return " ".join(filter(None, [said, comment and f"({comment})"]))
+    return " ".join([said, *([f"({' '.join(comments)})"] if comments else [])])
 
-  def _func(self, key: str) -> str | None:
-    """The function that the file, or the nearest one that it is built on, gives a term."""
-    for base in lineage(self.group, self.path.stem, [ROOT / "configs"]):
+  def _whole(self, key: str) -> dict[str, Any]:
+    """A term with what the files that this one is built on say of it."""
+    whole: dict[str, Any] = {}
+    for base in reversed(lineage(self.group, self.path.stem, [ROOT / "configs"])):
       node: object = _content(self.path.with_stem(base))
       for part in key.split("."):
         node = node.get(part) if isinstance(node, dict) else None
-      if isinstance(node, dict) and "func" in node:
-        return node["func"]
-    return None
+      if isinstance(node, dict):
+        whole |= node | {"params": whole.get("params", {}) | node.get("params", {})}
+    return whole
 
 
 def _agent(group: str, path: Path) -> str:
