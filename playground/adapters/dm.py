@@ -2,14 +2,20 @@
 
 from collections.abc import Mapping
 
-import dm_env
 import numpy as np
-from dm_env import specs
 
 from playground.adapters.episodes import Episodes, Moment
 from playground.envs.base import PIXELS
+from playground.errors import ConfigError
+from playground.extras import install_command
 from playground.pytree import PyTree
 from playground.settings import Section
+
+try:
+  import dm_env
+  from dm_env import specs
+except ImportError:
+  raise ConfigError(f"playground.adapters.dm needs dm-env: {install_command('gym')}.") from None
 
 
 class DmEnv(dm_env.Environment):

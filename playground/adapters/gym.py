@@ -10,24 +10,29 @@ import weakref
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
 import jax
 import mujoco
 import numpy as np
-from gymnasium.spaces import Box, Dict, Space
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
 from playground import registry
 from playground.adapters.episodes import Arrays, Episodes, load_task, need_shape
 from playground.envs.base import PIXELS, Env, State
 from playground.envs.wrappers import PRESERVE_INFO, where_done, wrap_for_evaluation
 from playground.errors import ConfigError, PlaygroundError, lookup
+from playground.extras import install_command
 from playground.mdp.managers import ACTOR
 from playground.pytree import PyTree
 from playground.rendering.gl import NO_GL_REMEDY, find_gl
 from playground.rendering.video import choose_camera
 from playground.settings import Section
+
+try:
+  import gymnasium
+  from gymnasium.spaces import Box, Dict, Space
+  from gymnasium.vector import AutoresetMode
+  from gymnasium.vector.utils import batch_space
+except ImportError:
+  raise ConfigError(f"playground.adapters.gym needs gymnasium: {install_command('gym')}.") from None
 
 Info = dict[str, Any]  # gymnasium's type
 

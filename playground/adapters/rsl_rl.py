@@ -12,17 +12,22 @@ from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
-import torch
-from rsl_rl import env as rsl_rl_env
-from tensordict import TensorDict
 
 from playground.adapters.episodes import need_shape
 from playground.envs.base import PIXELS, Env, Observation, State, observation_groups
 from playground.envs.wrappers import FINAL_OBS, AutoReset, wrap_for_evaluation
 from playground.errors import ConfigError, lookup
+from playground.extras import install_command
 from playground.learning.rollout import episode_sums
 from playground.randomization import Randomizer
-from playground.settings import Section, plain
+from playground.settings import Section
+
+try:
+  import torch
+  from rsl_rl import env as rsl_rl_env
+  from tensordict import TensorDict
+except ImportError:
+  raise ConfigError(f"playground.adapters.rsl_rl needs RSL-RL and torch: {install_command('rsl-rl')}.") from None
 
 Extra = torch.Tensor | TensorDict | dict[str, float]
 PRIVILEGED = "privileged_state"
@@ -46,11 +51,14 @@ class VecEnv(rsl_rl_env.VecEnv):
   the task, so that RSL-RL bootstraps the value; `extras["final_obs"]` are the observations that the
   step itself made, in the same groups: where an episode ended, its last (RSL-RL 5 does not look at them and takes the
   value of the observation before instead; an algorithm of yours may). `extras["log"]` has the means of reward, length
-  and the task's metrics over the episodes that ended in the step, if any did.
+  and the task's metrics over the episodes that ended in the step, if any did, and the share of them that a non-finite
+  number ended.
 
   Attributes:
     state: the current batch of states.
     max_episode_length: control steps; `episode_length_buf` counts those of the current episodes.
+    step_dt: s between two actions, by which RSL-RL scales rewards of its own.
+    cfg: the task's configuration, which RSL-RL's loggers save.
   """
 
   def __init__(self, env: Env, state: State, step: Callable[[State, jax.Array], State], groups: Mapping[str, str]):
@@ -66,8 +74,13 @@ class VecEnv(rsl_rl_env.VecEnv):
     self.num_envs, self.num_actions = state.done.shape[0], env.action_size
     self.max_episode_length = env.episode_length
     self.device = to_torch(state.done).device
-    self.cfg = plain(env.config) or {}
+    self.step_dt = env.dt * env.action_repeat
+    self.cfg = env.config
     self._sums = jax.jit(episode_sums)
+
+  @property
+  def unwrapped(self) -> "VecEnv":
+    return self
 
   @property
   def episode_length_buf(self) -> torch.Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -75,6 +88,7 @@ class VecEnv(rsl_rl_env.VecEnv):
 
   @episode_length_buf.setter
   def episode_length_buf(self, steps: torch.Tensor) -> None:
+    need_shape("episode_length_buf", steps, (self.num_envs,))
     state = self.state
     placed = jax.device_put(to_jax(steps.to(torch.float32, copy=True)), state.info["steps"].sharding)
     self.state = state.replace(done=jnp.zeros_like(state.done), info=state.info | {"steps": placed})
@@ -101,7 +115,7 @@ class VecEnv(rsl_rl_env.VecEnv):
     sums = self._sums(state)
     if ended := float(sums["episodes"]):
       means = {name: float(sums[f"episode_{name}"]) / ended for name in state.info["episode_metrics"]}
-      means["reward"] = means.pop("sum_reward")
+      means |= {"reward": means.pop("sum_reward"), "nonfinite": float(sums["nonfinite"]) / ended}
       extras["log"] = {f"Episode/{name}": mean for name, mean in means.items()}
     return self.get_observations(), to_torch(state.reward), to_torch(state.done), extras
 
@@ -119,12 +133,12 @@ def vec_env(
   Args:
     env: the task, from `registry.load`.
     num_envs: number of environments.
-    seed: of the episodes and the models.
+    seed: of the episodes and the randomised models; torch has a seed of its own.
     events: domain randomisation, drawn once for each environment (`compose(["env=..."]).env.events`).
     groups: the task's observation group for each RSL-RL group; the default is those of actor and critic.
 
   Raises:
-    ConfigError: the task has images, or `num_envs` is below 1.
+    ConfigError: a group has images, `groups` is none such, or `num_envs` is below 1.
     UnknownNameError: the task has no such observation group.
   """
   if num_envs < 1:
@@ -143,14 +157,17 @@ def group_entries(env: Env, groups: Mapping[str, str] | None = None) -> dict[str
   """Returns the task's observation group for each RSL-RL group; the default is those of the policy and of the critic.
 
   Raises:
-    ConfigError: the task has images, which the adapter does not pass on.
+    ConfigError: a group has images, which the adapter does not pass on, or `groups` maps no names to names.
     UnknownNameError: the task has no such observation group.
   """
   entries = observation_groups(env.observation_size)
+  default = {"policy": "state", "critic": PRIVILEGED if PRIVILEGED in entries else "state"}
+  if groups is not None and not (
+    isinstance(groups, Mapping) and groups and all(isinstance(entry, str) for entry in groups.values())
+  ):
+    raise ConfigError(f"groups={groups!r} must name a group of the task for each of RSL-RL's, such as {default}.")
   for group, entry in (groups or {}).items():
     lookup(entries, entry, f"groups[{group!r}]")
-  if groups:
-    return dict(groups)
-  if any(entry.startswith(PIXELS) for entry in entries):
-    raise ConfigError("RSL-RL gets no images from here: leave env.vision.enable=false.")
-  return {"policy": "state", "critic": PRIVILEGED if PRIVILEGED in entries else "state"}
+  if any(entry.startswith(PIXELS) for entry in (groups.values() if groups else entries)):
+    raise ConfigError("RSL-RL gets no images from here: leave env.vision.enable=false, or name `groups` without them.")
+  return dict(groups or default)

@@ -82,7 +82,8 @@ def test_time_outs_are_no_terminations(env: VecEnv) -> None:
   assert (ends.sum(0)[2:] > 0).all() and not timed_out[:, 2:].any()
   assert [log is not None for log in logs] == ends.any(1).tolist()
   first = int(ends.any(1).int().argmax())
-  assert set(logs[first]) == {"Episode/reward", "Episode/length", "Episode/distance"}
+  assert set(logs[first]) == {"Episode/reward", "Episode/length", "Episode/distance", "Episode/nonfinite"}
+  assert logs[first]["Episode/nonfinite"] == 0
   assert logs[first]["Episode/length"] == first + 1 < LENGTH
 
 
@@ -123,15 +124,33 @@ def test_the_script_of_the_page_trains(tmp_path: Path) -> None:
 
 
 def test_groups_of_go1() -> None:
-  obs = vec_env(on_c_physics(load("Go1JoystickFlatTerrain")), 2).get_observations()
+  env = vec_env(on_c_physics(load("Go1JoystickFlatTerrain")), 2)
+  obs = env.get_observations()
   assert {name: tuple(group.shape) for name, group in obs.items()} == {"policy": (2, 48), "critic": (2, 123)}
+  assert env.cfg.to_dict()["robot"]["name"] == "go1", "RSL-RL's logger of W&B calls it"
+  assert env.unwrapped.step_dt == pytest.approx(0.02), "RSL-RL's curiosity reads it"
 
 
 def test_shapes_and_numbers_are_checked(env: VecEnv) -> None:
-  with pytest.raises(ConfigError, match=rf"^actions has the shape \[{NUM_ENVS}, 3\], and must have \[{NUM_ENVS}, 1\]"):
+  with pytest.raises(ConfigError, match=rf"^actions has the shape \[{NUM_ENVS}, 3\], and must have \[{NUM_ENVS}, 2\]"):
     env.step(torch.zeros(NUM_ENVS, 3))
+  with pytest.raises(ConfigError, match=r"^episode_length_buf has the shape .*, and must have"):
+    env.episode_length_buf = torch.zeros(NUM_ENVS, 1)
   with pytest.raises(ConfigError, match=r"^num_envs=0 must be at least 1"):
     vec_env(Point(episode_length=LENGTH), 0)
+
+
+def test_the_log_has_the_share_of_non_finite_ends(env: VecEnv) -> None:
+  """Beside one that time ends."""
+  env.episode_length_buf = torch.tensor([0, 0, LENGTH - 1, 0])
+  *_, extras = env.step(torch.tensor([[0.0, 0.0], [torch.nan, 0.0], [0.0, 0.0], [0.0, 0.0]]))
+  assert extras["log"]["Episode/nonfinite"] == 0.5
+
+
+@pytest.mark.parametrize("groups", [OBS_GROUPS, ["state"], "state", {}])
+def test_groups_are_names_by_name(groups: Any) -> None:
+  with pytest.raises(ConfigError, match=r"^groups=.* must name a group of the task .*'policy': 'state'"):
+    vec_env(Point(episode_length=LENGTH), NUM_ENVS, groups=groups)
 
 
 def test_a_group_that_the_task_lacks_is_named() -> None:
@@ -157,5 +176,7 @@ def test_images_are_refused() -> None:
     def observation_size(self) -> dict[str, tuple[int, ...]]:
       return {"state": (2,), "pixels/view": (8, 8, 3)}
 
-  with pytest.raises(ConfigError, match="RSL-RL gets no images from here"):
-    group_entries(Camera())
+  for groups in (None, {"policy": "pixels/view"}):
+    with pytest.raises(ConfigError, match="RSL-RL gets no images from here"):
+      group_entries(Camera(), groups)
+  assert group_entries(Camera(), {"policy": "state"}) == {"policy": "state"}
