@@ -2,18 +2,21 @@
 
 import contextlib
 import os
+import signal
 import socket
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any, cast
 from urllib.parse import urlsplit
 
 from playground.config.sweep_options import RayConfig
 from playground.errors import ConfigError, HardwareError
 from playground.extras import install_command
 from playground.hardware.gpus import limit_memory
-from playground.sweep.folder import Job, SweepDirectory
+from playground.sweep.folder import Job, JobFolder, SweepDirectory
 from playground.sweep.local import MEMORY_FRACTION
-from playground.sweep.worker import COMMAND, Worker
+from playground.sweep.worker import COMMAND, POLL_S, Worker
 from playground.text import first_line
 
 try:
@@ -23,6 +26,7 @@ except ImportError:
 
 
 _CORES = 4  # of a job, unless launcher.cores_per_job is set
+_PATIENCE_S = 5.0  # after a stop: a job that began just before it says so meanwhile
 
 # Ray puts the working directory first on its workers' path, where a stray yaml.py would be imported: start it here.
 _PACKAGES = Path(__file__).parents[2]
@@ -40,6 +44,7 @@ class RayLauncher:
     self._config = config
     self._command = tuple(command)
     self._tasks: dict[str, ray.ObjectRef] = {}
+    self._stopped_at: float | None = None
     self._run = ray.remote(max_calls=1)(_run)  # a process for each job, as with the other launchers
 
   @staticmethod
@@ -49,18 +54,19 @@ class RayLauncher:
       address = config.address or os.environ.get("RAY_ADDRESS")
       try:
         _knock(address)
-        with contextlib.chdir(_PACKAGES):
+        with contextlib.chdir(_PACKAGES), _ignoring(signal.SIGHUP):  # a closed terminal sends it to Ray's processes
           ray.init(address=address, log_to_driver=False, include_dashboard=False)
       except (OSError, RuntimeError, ValueError) as error:
         raise HardwareError(f"launcher=ray: no cluster at {address}: {first_line(error)}") from None
       RayLauncher._owned = True
-    has = ray.cluster_resources()
+    nodes = [(node["Resources"].get("GPU", 0), node["Resources"].get("CPU", 0)) for node in _nodes()]
     for job in jobs:
       gpus, cores = _gpus(config, job), _cores(config)
-      if gpus > has.get("GPU", 0) or cores > has.get("CPU", 0):
+      if not any(gpus <= has_gpus and cores <= has_cores for has_gpus, has_cores in nodes):
+        takes, has = f"{gpus:g} GPUs and {cores:g} cores", "{:g} and {:g}".format(*max(nodes))
         raise HardwareError(
-          f"Job {job.name} takes {gpus:g} GPUs and {cores:g} cores, but Ray's cluster has {has.get('GPU', 0):g} and "
-          f"{has.get('CPU', 0):g}: set launcher.gpus_per_job and launcher.cores_per_job."
+          f"Job {job.name} takes {takes}, but the largest node of Ray's cluster has {has}: set launcher.gpus_per_job "
+          "and launcher.cores_per_job."
         )
 
   def start(self, job: Job) -> bool:
@@ -70,12 +76,26 @@ class RayLauncher:
       num_cpus=_cores(self._config), num_gpus=gpus, max_retries=self._config.retries, name=job.name
     )
     limits = (self._config.timeout, self._config.grace)
-    self._tasks[job.name] = task.remote(str(folder.path.absolute()), self._command, *limits, gpus)
+    with _cluster_there():
+      self._tasks[job.name] = task.remote(str(folder.path.absolute()), self._command, *limits, gpus)
     return True
 
   def busy(self, job: Job) -> bool:
     task = self._tasks.get(job.name)
-    return task is not None and not ray.wait([task], timeout=0)[0]
+    if task is None:
+      return False
+    with _cluster_there():
+      if self._never_begins(job):
+        ray.cancel(task)
+      return not ray.wait([task], timeout=0)[0]
+
+  def _never_begins(self, job: Job) -> bool:
+    """Whether the sweep is stopped while the job still waits for its turn."""
+    if not self._sweep.stop_file.exists():
+      return False
+    self._stopped_at = self._stopped_at or time.monotonic()
+    waited = time.monotonic() - self._stopped_at > _PATIENCE_S
+    return waited and self._sweep.folder(job).state().status == "submitted"
 
   def kill(self) -> None:
     for job in self._sweep.jobs:
@@ -88,9 +108,34 @@ class RayLauncher:
       ray.shutdown()
 
 
+@contextlib.contextmanager
+def _ignoring(signum: signal.Signals) -> Iterator[None]:
+  """Ignores a signal in the block, and in the processes that start there."""
+  before = signal.signal(signum, signal.SIG_IGN)
+  try:
+    yield
+  finally:
+    signal.signal(signum, before)
+
+
+@contextlib.contextmanager
+def _cluster_there() -> Iterator[None]:
+  """Turns an error of the connection in the block into a sentence."""
+  try:
+    yield
+  except (ConnectionError, ray.exceptions.RayError) as error:
+    what = f"the cluster is gone ({first_line(error)})"
+    raise HardwareError(f"launcher=ray: {what}; the same command runs what is missing.") from None
+
+
 def _knock(address: str | None) -> None:
-  """Raises OSError if nothing listens at an address of host and port; Ray itself retries for most of a minute."""
+  """Raises OSError if nothing listens at an address of host and port; Ray itself retries for most of a minute.
+
+  Raises ValueError for an address of another kind.
+  """
   place = urlsplit(address if address and "//" in address else f"//{address or ''}")
+  if place.scheme not in ("", "ray"):
+    raise ValueError("write auto, local, host:port or ray://host:port")
   if place.hostname and place.port:
     socket.create_connection((place.hostname, place.port), timeout=10.0).close()
 
@@ -106,13 +151,36 @@ def _cores(config: RayConfig) -> float:
   """Returns the number of cores that a job takes."""
   if config.cores_per_job is not None:
     return config.cores_per_job
-  return min(_CORES, max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]))
+  return min(_CORES, max(node["Resources"].get("CPU", 0) for node in _nodes()))
+
+
+def _nodes() -> list[dict[str, Any]]:
+  return [node for node in ray.nodes() if node["Alive"]]
 
 
 def _run(folder: str, command: tuple[str, ...], timeout: float | None, grace: float, gpus: float) -> int:
   """Runs a worker as a task, on the GPUs that Ray assigned."""
+  _end_orphan(JobFolder(Path(folder)), grace)
   if 0 < gpus < 1:
     limit_memory(os.environ, MEMORY_FRACTION * gpus)
   given = ",".join(map(str, ray.get_gpu_ids()))
   where = socket.gethostname() + (f" GPU {given}" if given else "")
   return Worker([Path(folder)], command, timeout, grace).run(where)
+
+
+def _end_orphan(job: JobFolder, grace: float) -> None:
+  """Ends the process of a job whose worker was killed, such as by Ray for want of memory: this task resumes the job.
+
+  It is asked to save, and killed `grace` seconds later.
+  """
+  asked_at = None
+  while job.locked() and (record := job.record).get("host") == socket.gethostname():
+    if Path("/proc", str(record.get("pid"))).exists():  # another worker has it
+      return
+    with contextlib.suppress(ProcessLookupError):
+      if asked_at is None:
+        asked_at = time.monotonic()
+        os.kill(cast(int, record["job_pid"]), signal.SIGTERM)
+      elif time.monotonic() - asked_at > grace:
+        os.killpg(cast(int, record["job_pid"]), signal.SIGKILL)
+    time.sleep(POLL_S)

@@ -201,7 +201,8 @@ class Runner:
       busy = self._launcher.busy(job)  # before the state is read: a worker writes it last
       state = folder.state()
       if not busy and state.status not in ENDED and not folder.locked():
-        state = JobState("killed", "it never came to start", state.attempt)
+        never = ("preempted", "stopped before it began") if self._stopping else ("killed", "it never came to start")
+        state = JobState(*never, state.attempt)
         folder.write(status=state.status, reason=state.reason, attempt=state.attempt)
       self._states[job.name] = state
       if not busy and state.status in ENDED:
