@@ -7,7 +7,7 @@ import socket
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 from urllib.parse import urlsplit
 
 from playground.config.sweep_options import RayConfig
@@ -59,7 +59,7 @@ class RayLauncher:
       except (OSError, RuntimeError, ValueError) as error:
         raise HardwareError(f"launcher=ray: no cluster at {address}: {first_line(error)}") from None
       RayLauncher._owned = True
-    nodes = [(node["Resources"].get("GPU", 0), node["Resources"].get("CPU", 0)) for node in _nodes()]
+    nodes = _nodes()
     for job in jobs:
       gpus, cores = _gpus(config, job), _cores(config)
       if not any(gpus <= has_gpus and cores <= has_cores for has_gpus, has_cores in nodes):
@@ -151,11 +151,13 @@ def _cores(config: RayConfig) -> float:
   """Returns the number of cores that a job takes."""
   if config.cores_per_job is not None:
     return config.cores_per_job
-  return min(_CORES, max(node["Resources"].get("CPU", 0) for node in _nodes()))
+  return min(_CORES, max(cores for _, cores in _nodes()))
 
 
-def _nodes() -> list[dict[str, Any]]:
-  return [node for node in ray.nodes() if node["Alive"]]
+def _nodes() -> list[tuple[float, float]]:
+  """Returns the numbers of GPUs and of cores of each node that is there."""
+  alive = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+  return [(has.get("GPU", 0), has.get("CPU", 0)) for has in alive]
 
 
 def _run(folder: str, command: tuple[str, ...], timeout: float | None, grace: float, gpus: float) -> int:
