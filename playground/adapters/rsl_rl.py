@@ -138,7 +138,7 @@ def vec_env(
     groups: the task's observation group for each RSL-RL group; the default is those of actor and critic.
 
   Raises:
-    ConfigError: a group has images, `groups` is none such, or `num_envs` is below 1.
+    ConfigError: a group has images, `groups` maps no names to names, or `num_envs` is below 1.
     UnknownNameError: the task has no such observation group.
   """
   if num_envs < 1:

@@ -38,7 +38,8 @@ def tune_buffers(task: str, overrides: Sequence[str], *, run: str | None, envs: 
   Raises:
     PlaygroundError: no such task or run, or one that does not fit; Warp is not installed.
   """
-  config = compose(of_task(task, overrides)).env
+  composed = compose(of_task(task, overrides))
+  task, config = composed.choices["env"], composed.env
   policies: dict[str, Act | None] = {"random": None}
   if run is not None:
     trained = load_policy(run)
