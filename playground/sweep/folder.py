@@ -5,6 +5,7 @@ import dataclasses
 import datetime
 import os
 import re
+import socket
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -189,6 +190,14 @@ class JobFolder:
   def locked(self) -> bool:
     """Returns whether a process runs the job, on this machine or on another that shares the folder."""
     return is_locked(self.path / "job.lock")
+
+  def signal(self, signum: int, group: bool = False) -> None:
+    """Signals the job's process, with `group` its children, too; does nothing for a process of another machine."""
+    record = self.record
+    pid = record.get("job_pid", 0)
+    if record.get("host") == socket.gethostname() and pid > 1:  # else another process of this machine's
+      with contextlib.suppress(ProcessLookupError, PermissionError):
+        (os.killpg if group else os.kill)(pid, signum)
 
   def progress(self) -> tuple[int | None, float | None]:
     """Returns trained steps and the last evaluation's return, from metrics.csv."""

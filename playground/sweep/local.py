@@ -1,10 +1,8 @@
 """Runs jobs as processes on this machine, each on GPU slots and CPU cores of its own."""
 
-import contextlib
 import dataclasses
 import os
 import signal
-import socket
 import subprocess
 from collections.abc import Sequence
 
@@ -133,11 +131,7 @@ class LocalLauncher:
     for job in self._sweep.jobs:
       if self._at_work(job.name):
         # The worker sees its job end; a worker of an earlier start is no child process, but its job ends, too.
-        record = self._sweep.folder(job).record
-        pid = record.get("job_pid", 0)
-        if record.get("host") == socket.gethostname() and pid > 1:  # else another process of this machine's
-          with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(pid, signal.SIGKILL)
+        self._sweep.folder(job).signal(signal.SIGKILL, group=True)
 
   def close(self) -> None:
     for worker in self._workers.values():

@@ -7,7 +7,6 @@ import socket
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import cast
 from urllib.parse import urlsplit
 
 from playground.config.sweep_options import RayConfig
@@ -16,7 +15,7 @@ from playground.extras import install_command
 from playground.hardware.gpus import limit_memory
 from playground.sweep.folder import Job, JobFolder, SweepDirectory
 from playground.sweep.local import MEMORY_FRACTION
-from playground.sweep.worker import COMMAND, POLL_S, Worker
+from playground.sweep.worker import COMMAND, POLL_S, Worker, blocked
 from playground.text import first_line
 
 try:
@@ -54,7 +53,7 @@ class RayLauncher:
       address = config.address or os.environ.get("RAY_ADDRESS")
       try:
         _knock(address)
-        with contextlib.chdir(_PACKAGES), _ignoring(signal.SIGHUP):  # a closed terminal sends it to Ray's processes
+        with contextlib.chdir(_PACKAGES), blocked(signal.SIGHUP):  # a closed terminal sends it to Ray's processes
           ray.init(address=address, log_to_driver=False, include_dashboard=False)
       except (OSError, RuntimeError, ValueError) as error:
         raise HardwareError(f"launcher=ray: no cluster at {address}: {first_line(error)}") from None
@@ -70,13 +69,13 @@ class RayLauncher:
         )
 
   def start(self, job: Job) -> bool:
-    folder, gpus = self._sweep.folder(job), _gpus(self._config, job)
+    folder, limits = self._sweep.folder(job), (self._config.timeout, self._config.grace)
     folder.write_waiting("submitted")
-    task = self._run.options(
-      num_cpus=_cores(self._config), num_gpus=gpus, max_retries=self._config.retries, name=job.name
-    )
-    limits = (self._config.timeout, self._config.grace)
     with _cluster_there():
+      gpus = _gpus(self._config, job)
+      task = self._run.options(
+        num_cpus=_cores(self._config), num_gpus=gpus, max_retries=self._config.retries, name=job.name
+      )
       self._tasks[job.name] = task.remote(str(folder.path.absolute()), self._command, *limits, gpus)
     return True
 
@@ -106,16 +105,6 @@ class RayLauncher:
     if self._owned:
       RayLauncher._owned = False
       ray.shutdown()
-
-
-@contextlib.contextmanager
-def _ignoring(signum: signal.Signals) -> Iterator[None]:
-  """Ignores a signal in the block, and in the processes that start there."""
-  before = signal.signal(signum, signal.SIG_IGN)
-  try:
-    yield
-  finally:
-    signal.signal(signum, before)
 
 
 @contextlib.contextmanager
@@ -179,10 +168,9 @@ def _end_orphan(job: JobFolder, grace: float) -> None:
   while job.locked() and (record := job.record).get("host") == socket.gethostname():
     if Path("/proc", str(record.get("pid"))).exists():  # another worker has it
       return
-    with contextlib.suppress(ProcessLookupError):
-      if asked_at is None:
-        asked_at = time.monotonic()
-        os.kill(cast(int, record["job_pid"]), signal.SIGTERM)
-      elif time.monotonic() - asked_at > grace:
-        os.killpg(cast(int, record["job_pid"]), signal.SIGKILL)
+    if asked_at is None:
+      asked_at = time.monotonic()
+      job.signal(signal.SIGTERM)
+    elif time.monotonic() - asked_at > grace:
+      job.signal(signal.SIGKILL, group=True)
     time.sleep(POLL_S)

@@ -146,7 +146,7 @@ class Worker:
       with folder.log.open("a") as log:
         log.write(f"--- {now()}: trained together with {first.path.name}, which has the log\n")
     # Some Slurms send submitit's signal to all processes of a job, which would end them.
-    with first.log.open("ab") as log, _blocked(signal.SIGUSR2):
+    with first.log.open("ab") as log, blocked(signal.SIGUSR2):
       start = self._records[first]["attempt"]
       log.write(f"--- start {start}, {now()}, {socket.gethostname()}: {' '.join(args)}\n".encode())
       log.flush()
@@ -221,7 +221,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _blocked(signum: int) -> Iterator[None]:
+def blocked(signum: int) -> Iterator[None]:
   """Blocks a signal for processes started in the block; this process gets it when the block ends."""
   before = signal.pthread_sigmask(signal.SIG_BLOCK, {signum})
   try:
