@@ -37,7 +37,7 @@ _MEASURED = {  # column -> its column of metrics.csv, the mode's where it was ev
 _IN_C_MUJOCO = {"return": "episode_reward", "falls_per_episode": "episode_fall", "success": "episode_success"}
 _IDENTITY = ("who", "task", "agent", "experiment", "setting", "seed", "steps")  # columns that tell runs apart
 _OF_MANIFEST = ("impl", "platform", "device", "num_devices", "matmul_precision", "network_precision", "versions")
-_OF_CONFIG = ("choices.env", "choices.agent", "agent.num_timesteps", "agent.num_eval_envs", "env", "seed")
+_OF_CONFIG = ("choices.env", "choices.agent", "agent.num_timesteps", "agent.num_eval_envs", "env.impl", "seed")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -144,7 +144,8 @@ class RunDirectory:
   @property
   def manifest(self) -> dict[str, Plain]:
     """The content of manifest.json, see `write_manifest`; empty without one."""
-    return read_json(self.path / "manifest.json", earlier_starts=list, git=(dict, NoneType), timings=dict)
+    kinds = {"earlier_starts": list, "git": (dict, NoneType), "timings": dict, "versions": dict, "num_devices": int}
+    return read_json(self.path / "manifest.json", **kinds)
 
   @property
   def status(self) -> dict[str, Plain]:

@@ -1,5 +1,6 @@
 """`playground-bench record`: rows and curves of run directories, without training but for one."""
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -179,6 +180,12 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_written(reference
   refused(make("env=v020/CartpoleBalance", metrics=METRICS, name="a"), ConfigError, "only tasks that")
   untrained = make("env=CheetahRun", metrics="step,eval/episode_reward\n0,1.0\n5,\n", name="b")
   refused(untrained, ConfigError, "was not evaluated after training")
+  config = (untrained / "config.yaml").read_text()
+  (untrained / "config.yaml").write_text(re.sub(r"(?m)^env:\n( .*\n)+", "env: x\n", config))
+  refused(untrained, ConfigError, "lacks env.impl")
+  (untrained / "config.yaml").write_text(config)
+  (untrained / "manifest.json").write_text('{"versions": "x"}')
+  refused(untrained, CheckpointError, "its 'versions' has the wrong type")
   (untrained / "manifest.json").write_text("{}")
   refused(untrained, ConfigError, "manifest.json lacks impl")
   (untrained / "manifest.json").unlink()
