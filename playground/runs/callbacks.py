@@ -324,7 +324,8 @@ def check_updates(metrics: Metrics, allowed: float, step: int) -> int:
   if bad > allowed * taken:
     raise NonfiniteError(
       f"{bad:,} of {taken:,} gradient steps before step {step:,} were NaN or infinite and left out, more than "
-      f"on_nonfinite.max_fraction={allowed:g} allows."
+      f"on_nonfinite.max_fraction={allowed:g} allows: training has diverged. A lower agent.learning_rate, or for PPO "
+      "agent.max_grad_norm=1, may prevent it; what was saved stays."
     )
   return bad
 

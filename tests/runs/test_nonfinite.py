@@ -118,7 +118,8 @@ def test_too_many_rejected_gradient_steps_stop_the_run(
   run = tmp_path / "run"
   config = compose([*TASK, f"agent={agent}", f"run_dir={run}"])
   config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, reward_scaling=math.inf))  # pyright: ignore[reportCallIssue]
-  with pytest.raises(NonfiniteError, match=r"(\d+) of \1 gradient steps before step .* on_nonfinite.max_fraction=0.01"):
+  said = r"(\d+) of \1 gradient steps before step .* on_nonfinite.max_fraction=0.01 .* A lower agent.learning_rate"
+  with pytest.raises(NonfiniteError, match=said):
     train(config)
   assert RunDirectory(run).status["status"] == "failed"
 
