@@ -20,6 +20,7 @@ STATUSES: tuple[Status, ...] = get_args(Status)
 FILE = Path(__file__).parent / "catalog.json"
 _REFERENCE = FILE.parents[1] / "results/reference"
 _NO_PUSHES = re.compile(r"events\.push(\.enabled=false|=null)")  # in the setting of a run
+_SEEDS = 3  # that a mean needs to stand for a task
 _TABLES = ("dm_control", "locomotion", "manipulation", "vision")
 
 
@@ -138,17 +139,19 @@ def _stage_of(row: dict[str, str]) -> str:
 def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]:
   """Returns our runs of a task with the agent, setting, backend and steps of the highest mean of `reached_return`.
 
-  Of several within 2 % of the highest, those with the most seeds count. A chain counts by its last stage. Runs without
-  pushes count only if there are no others.
+  Runs of fewer than three seeds count only if there are no others. Of several within 2 % of the highest, those with the
+  most seeds count. A chain counts by its last stage. Runs without pushes count only if there are no others.
   """
   ours = our_runs(rows, task)
   groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
   for row in [row for row in ours if not _NO_PUSHES.search(row["setting"])] or ours:
     groups.setdefault((row["agent"], row["setting"], row["backend"], row["steps"]), []).append(row)
   mean = lambda runs: fmean(by_seed(runs, reached_return))
-  highest = max(map(mean, groups.values()), default=0.0)
-  close = [runs for runs in groups.values() if mean(runs) >= highest - 0.02 * abs(highest)]
-  return max(close, key=lambda runs: (len({row["seed"] for row in runs}), mean(runs)), default=[])
+  seeds = lambda runs: len({row["seed"] for row in runs})
+  found = [runs for runs in groups.values() if seeds(runs) >= _SEEDS] or list(groups.values())
+  highest = max(map(mean, found), default=0.0)
+  close = [runs for runs in found if mean(runs) >= highest - 0.02 * abs(highest)]
+  return max(close, key=lambda runs: (seeds(runs), mean(runs)), default=[])
 
 
 def reached_return(row: dict[str, str]) -> float:

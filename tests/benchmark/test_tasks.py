@@ -37,6 +37,12 @@ def test_of_runs_as_good_those_with_the_most_seeds_count():
   assert best_runs([run(900, agent="sac"), run(890), run(895)], TASK) == [run(900, agent="sac")]
 
 
+def test_runs_of_three_seeds_count_before_a_lucky_one():
+  rows = [run(900, agent="sac"), *[run(100, seed=seed) for seed in "123"]]
+  assert best_runs(rows, TASK) == rows[1:]
+  assert best_runs(rows[:3], TASK) == rows[:1]
+
+
 def test_a_chain_counts_by_its_last_stage():
   rows = [run(20, experiment="chain", setting="stage=a"), run(9, experiment="chain", setting="stage=b")]
   assert best_runs(rows, TASK) == rows[1:]
