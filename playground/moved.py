@@ -123,7 +123,9 @@ def check_not_moved(key: str) -> None:
   if prefix is None:
     return
   new, name = _PREFIXES[prefix], moved[len(prefix) + 1 :]
-  if prefix == "env.reward.scales" and name:
+  if moved == "env.hand":
+    new = "robot=<name>"
+  elif prefix == "env.reward.scales" and name:
     new = " or ".join(new.replace("<term>", term) for term in _REWARDS.get(name, name).split())
     new += f" (func: {_FUNCTIONS[name]})" if name in _FUNCTIONS else ""
   elif prefix in ("env.command", "env.gait", "env.pushes", "env.hand", "env.noise.pose", "env.scene.rough") and name:

@@ -603,6 +603,7 @@ MOVED = {
   "env.command_config.a=[1,1,1]": "env.commands.velocity.params.a",
   "env.pert_config.kick_durations=[1,2]": "env.events.push.params.duration_s",
   "env.push_config.enable=true": "env.events.push.enabled",
+  "env.hand=leap_hand": "robot=<name>",
   "env.hand.name=leap": "env.robot.name",
   "env.parity=true": "env=v020/<TaskName>",
   "randomization.terms=[]": "env.events.<term>, of mode startup",
