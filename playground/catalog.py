@@ -168,7 +168,7 @@ def by_seed(runs: Sequence[dict[str, str]], value: Callable[[dict[str, str]], fl
 
 
 def run_name(row: dict[str, str]) -> str:
-  """Returns a run's agent, with a chain's stage, its first policy's task, Warp, mirrored data, and absent pushes."""
+  """Returns a run's agent with what sets it apart: a chain's stage, its first policy's task, Warp, its set, the data."""
   setting = row["setting"]
   chain = f", {row['experiment']}'s {stage}" if (stage := _stage_of(row)) else ""
   start = re.search(r"init_from=<(\w+)>", setting)
@@ -177,6 +177,7 @@ def run_name(row: dict[str, str]) -> str:
     + chain
     + (f", from {start.group(1)}" if start else "")
     + ", on Warp" * ("env.impl=warp" in setting)
+    + (f", tuned={tuned.group(1)}" if (tuned := re.search(r"(?<!\S)tuned=(\S+)", setting)) else "")
     + ", mirrored data" * ("agent.mirror_augmentation=true" in setting)
     + ", without mirrored data" * ("agent.mirror_augmentation=false" in setting)
     + ", no pushes, nothing randomised" * bool(_NO_PUSHES.search(setting))

@@ -61,6 +61,7 @@ def test_runs_without_pushes_count_only_alone(setting: str):
 def test_a_run_is_named_by_what_it_starts_from():
   assert run_name(run(1, agent="reppo", setting="init_from=<WalkerWalk>")) == "reppo, from WalkerWalk"
   assert run_name(run(1, setting="agent.mirror_augmentation=true")) == "ppo, mirrored data"
+  assert run_name(run(1, setting="agent.num_envs=1 tuned=ppo/robust")) == "ppo, tuned=ppo/robust"
   assert run_name(run(1, experiment="go1_chain", setting="stage=rough")) == "ppo, go1_chain's rough"
 
 
