@@ -168,7 +168,7 @@ def by_seed(runs: Sequence[dict[str, str]], value: Callable[[dict[str, str]], fl
 
 
 def run_name(row: dict[str, str]) -> str:
-  """Returns a run's agent with what sets it apart: a chain's stage, its first policy's task, Warp, its set, the data."""
+  """Returns a run's agent with what sets it apart: a chain's stage, its first policy's task, Warp, set, data."""
   setting = row["setting"]
   chain = f", {row['experiment']}'s {stage}" if (stage := _stage_of(row)) else ""
   start = re.search(r"init_from=<(\w+)>", setting)

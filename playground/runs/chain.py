@@ -92,10 +92,9 @@ def train_chain(config: RunConfig, interrupts: Interrupts, train_run: TrainRun) 
     finally:
       if is_main():
         _write_result(chain, folders)
-  finished = is_main() and chain.summary["status"] == "finished"
   if is_main():
     _say_where(chain)
-  return interrupts.exit_code(finished)
+  return interrupts.exit_code(share(str(chain.summary["status"]) if is_main() else "") == "finished")
 
 
 def _check(config: RunConfig) -> None:

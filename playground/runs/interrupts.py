@@ -75,8 +75,8 @@ class Interrupts:
     self.saving = False
 
   def exit_code(self, completed: bool) -> int:
-    """Returns 0, or the signal's exit code if there was one before the work was completed."""
-    return 0 if self.signum is None or completed else exit_code(self.signum)
+    """Returns 0, or if the work was not completed the signal's exit code: SIGTERM's if another process got it."""
+    return 0 if completed else exit_code(self.signum or signal.SIGTERM)
 
   def _handle(self, signum: int, frame: FrameType | None) -> None:
     again, self.signum = self.signum is not None, signum
