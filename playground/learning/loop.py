@@ -20,7 +20,7 @@ from jax.stages import Compiled, Traced, Wrapped
 
 from playground.envs.wrappers import ModelFields
 from playground.gc_pause import gc_paused
-from playground.hardware.distributed import any_process, is_multiprocess
+from playground.hardware.distributed import any_process, is_multiprocess, share
 from playground.hardware.mesh import local_shard, put, shard
 from playground.learning.algorithm import Policy
 from playground.learning.evaluation import Evaluate, Recording
@@ -371,8 +371,7 @@ class Loop:
     done = 0
     while True:
       start = time.perf_counter()
-      # Several processes would have to agree on the numbers.
-      count = num_updates if is_multiprocess() else min(self._max_updates, num_updates - done)
+      count = int(share(str(min(self._max_updates, num_updates - done))))  # the same in every process
       state, trained = self.functions.train(state, self.functions.model, np.int32(count))
       sums, trained, done = trained.pop("sums"), jax.device_get(trained), done + count
       update_s = (time.perf_counter() - start) / count
@@ -380,7 +379,7 @@ class Loop:
         self.first_update_s, self.first_update_at = update_s, start + update_s
       self._max_updates = max(1, min(2 * self._max_updates, int(CALL_S / update_s)))
       left = num_updates - done
-      if not left or (left * update_s > CALL_S and self._should_stop()):
+      if not left or any_process(left * update_s > CALL_S and self._should_stop()):
         return state, trained, done
       state = state.replace(sums=sums)
 

@@ -75,8 +75,14 @@ class Interrupts:
     self.saving = False
 
   def exit_code(self, completed: bool) -> int:
-    """Returns 0, or if the work was not completed the signal's exit code: SIGTERM's if another process got it."""
-    return 0 if completed else exit_code(self.signum or signal.SIGTERM)
+    """Returns 0, or the signal's exit code if there was one before the work was completed.
+
+    In a training of several processes another one may have got the signal: then it is SIGTERM's.
+    """
+    from playground.hardware.distributed import is_multiprocess  # imports JAX, which a sweep goes without
+
+    signum = signal.SIGTERM if self.signum is None and is_multiprocess() else self.signum
+    return 0 if signum is None or completed else exit_code(signum)
 
   def _handle(self, signum: int, frame: FrameType | None) -> None:
     again, self.signum = self.signum is not None, signum

@@ -69,6 +69,37 @@ def test_processes_with_different_checkpoints_are_refused(tmp_path: Path) -> Non
   assert all(out.strip().endswith(sentence) for out in said), said
 
 
+SHORT_CALLS = """
+import os, signal
+from playground.hardware.distributed import is_main
+from playground.learning import loop
+
+loop.CALL_S = 0.0  # each call is of one training step
+should_stop, calls = loop.Loop._should_stop, []
+
+def asked(self):
+  calls.append(0)
+  if len(calls) == 3 and not is_main():
+    os.kill(os.getpid(), signal.SIGTERM)
+  return should_stop(self)
+
+loop.Loop._should_stop = asked
+"""
+
+
+def test_a_signal_to_one_process_stops_all_between_two_rows(tmp_path: Path) -> None:
+  line = [*LINE, "agent.num_timesteps=160000", "agent.num_evals=2"]  # rows are 10 training steps apart
+  processes = two_processes(tmp_path, SHORT_CALLS + COMMAND, *line)
+  said = [process.communicate(timeout=200)[0] for process in processes]
+  assert [process.returncode for process in processes] == [143, 143], said
+  run = RunDirectory(tmp_path / "run")
+  assert run.status["status"] == "preempted"
+  saved, table = int(find_checkpoints(run.path)[0].name), pd.read_csv(run.metrics_csv)
+  assert 0 < saved < 1600 and list(table["step"]) == [0, saved]
+  ended(two_processes(tmp_path, COMMAND, "resume=run"))
+  assert (run.status["status"], run.summary["steps"]) == ("finished", 160_000)
+
+
 SLOW_HEARTBEATS = """
 import time
 from playground.hardware.distributed import _Watch
