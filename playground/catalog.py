@@ -167,6 +167,11 @@ def by_seed(runs: Sequence[dict[str, str]], value: Callable[[dict[str, str]], fl
   return [fmean(values) for values in seeds.values()]
 
 
+def value_of(setting: str, key: str) -> str:
+  """Returns the value of a key in the setting of a row, the last one if there are several; "" without it."""
+  return next((word.partition("=")[2] for word in reversed(setting.split()) if word.startswith(f"{key}=")), "")
+
+
 def run_name(row: dict[str, str]) -> str:
   """Returns a run's agent with what sets it apart: a chain's stage, its first policy's task, Warp, set, data."""
   setting = row["setting"]
@@ -177,7 +182,7 @@ def run_name(row: dict[str, str]) -> str:
     + chain
     + (f", from {start.group(1)}" if start else "")
     + ", on Warp" * ("env.impl=warp" in setting)
-    + (f", tuned={tuned.group(1)}" if (tuned := re.search(r"(?<!\S)tuned=(\S+)", setting)) else "")
+    + (f", tuned={tuned}" if (tuned := value_of(setting, "tuned")) else "")
     + ", mirrored data" * ("agent.mirror_augmentation=true" in setting)
     + ", without mirrored data" * ("agent.mirror_augmentation=false" in setting)
     + ", no pushes, nothing randomised" * bool(_NO_PUSHES.search(setting))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from playground.benchmark.schema import COLUMNS, QUANTITIES
+from playground.catalog import value_of
 from playground.errors import ConfigError
 from playground.reporting.page import mean_and_ci95
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
@@ -111,11 +112,6 @@ def number(where: str, name: str, text: str, positive: bool = False) -> float:
 
 def _short(text: str) -> str:
   return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
-
-
-def value_of(setting: str, key: str) -> str:
-  """Returns the value of a key in the setting of a row, the last one if there are several; "" without it."""
-  return next((word.partition("=")[2] for word in reversed(setting.split()) if word.startswith(f"{key}=")), "")
 
 
 def _rows(lines: Mapping[str, dict[str, str]], path: Path) -> Iterable[Row]:

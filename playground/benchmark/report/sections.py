@@ -4,7 +4,8 @@ import functools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from playground.benchmark.report.evidence import Evidence, Figure, value_of
+from playground.benchmark.report.evidence import Evidence, Figure
+from playground.catalog import value_of
 from playground.config import compose, options, task_names
 from playground.paper import SUITES, paper_table
 from playground.reporting import figures
