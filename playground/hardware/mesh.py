@@ -20,6 +20,7 @@ from playground.pytree import PyTree
 AXIS = "data"  # the mesh's axis, which collectives name
 AGENTS = "agents"  # the axis over which agents are divided
 GROUP = "group"  # the axis of the agents that share a device, inside a mapped function
+_SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
 
 
 def make_mesh(num_devices: int) -> Mesh:
@@ -89,6 +90,18 @@ def device_memory(mesh: Mesh) -> int | None:
   limits = [(device.memory_stats() or {}).get("bytes_limit") for device in mesh.devices.flat]
   known = [limit for limit in limits if limit is not None]
   return min(known) if len(known) == len(limits) else None
+
+
+def compiler_options(mesh: Mesh, impl: str) -> dict[str, str]:
+  """Returns XLA's options for programs on a mesh, with this physics backend (measured: docs/results-profile.md).
+
+  On one GPU, kernels that do not depend on each other run at the same time. Warp's run at half the rate with it. An
+  exported XLA_FLAGS wins.
+  """
+  on_gpu = mesh.size == 1 and mesh.devices.flat[0].platform == "gpu"
+  if not on_gpu or impl == "warp" or _SCHEDULING in os.environ.get("XLA_FLAGS", ""):
+    return {}
+  return {_SCHEDULING: "CONCURRENT"}
 
 
 def jit_on_mesh(

@@ -21,7 +21,7 @@ from jax.stages import Compiled, Traced, Wrapped
 from playground.envs.wrappers import ModelFields
 from playground.gc_pause import gc_paused
 from playground.hardware.distributed import any_process, is_multiprocess, share
-from playground.hardware.mesh import local_shard, put, shard
+from playground.hardware.mesh import compiler_options, local_shard, put, shard
 from playground.learning.algorithm import Policy
 from playground.learning.evaluation import Evaluate, Recording
 from playground.learning.population import PARENT, Population
@@ -142,17 +142,18 @@ def compile_program(
     resets: whether the schedule resets all environments; without, `reset` is compiled if it is called at all.
   """
   start, notices = time.perf_counter(), []
+  options = compiler_options(trainer.mesh, trainer.env.unwrapped.impl)
   kernels = trainer.env.unwrapped.physics.compile_ahead()
   pool = ThreadPoolExecutor(thread_name_prefix=COMPILER)
   try:
     if stored is not None:
       try:
-        if loaded := _compile_stored(trainer, draw, stored, pool):
+        if loaded := _compile_stored(trainer, draw, stored, options, pool):
           return loaded
       except UnusableProgramError as error:
         notices.append(str(error))
     with gc_paused():  # tracing makes millions of objects
-      futures = _trace(trainer, evaluate, draw, policy, stored, resets, pool)
+      futures = _trace(trainer, evaluate, draw, policy, stored, resets, options, pool)
       trace_s = time.perf_counter() - start
       model, eval_model = shard(draw(), trainer.mesh)  # takes seconds, which XLA needs anyway
       results = {name: future.result() for name, future in futures.items()}
@@ -177,14 +178,14 @@ def compile_program(
 
 
 def _compile_stored(
-  trainer: Trainer, draw: Draw, stored: StoredProgram, pool: ThreadPoolExecutor
+  trainer: Trainer, draw: Draw, stored: StoredProgram, options: dict[str, str], pool: ThreadPoolExecutor
 ) -> CompiledFunctions | None:
   """Compiles stored functions, None without any; raises UnusableProgramError."""
   start = time.perf_counter()
   functions = stored.load()
   if functions is None:
     return None
-  futures = {name: pool.submit(function.compile, trainer.mesh) for name, function in functions.items()}
+  futures = {name: pool.submit(function.compile, trainer.mesh, options) for name, function in functions.items()}
   model, eval_model = shard(draw(), trainer.mesh)
   try:
     compiled = _uncompiled(trainer) | {name: future.result() for name, future in futures.items()}
@@ -208,6 +209,7 @@ def _trace(
   policy: Policy | None,
   stored: StoredProgram | None,
   resets: bool,
+  options: dict[str, str],
   pool: ThreadPoolExecutor,
 ) -> dict[str, Future[tuple[Compiled, LoweredFunction | None]]]:
   """Traces all functions and compiles them in the pool; returns each by name with its storable form."""
@@ -218,8 +220,8 @@ def _trace(
     if stored is not None:
       with contextlib.suppress(ValueError, NotImplementedError):  # it calls code that JAX does not serialise
         lowered = LoweredFunction.of(function, traced, *args)
-        return lowered.compile(trainer.mesh), lowered
-    return traced.lower().compile(), None
+        return lowered.compile(trainer.mesh, options), lowered
+    return traced.lower().compile(dict(options)), None
 
   def submit(function: Wrapped, *args: PyTree) -> Future[tuple[Compiled, LoweredFunction | None]]:
     return pool.submit(compile_traced, function, function.trace(*args), *args)

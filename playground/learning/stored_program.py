@@ -61,8 +61,8 @@ class LoweredFunction:
     module = dataclasses.replace(exported, **trees).serialize()
     return cls(bytes(module), exported.in_tree, exported.out_tree, donated)
 
-  def compile(self, mesh: Mesh) -> Compiled:
-    """Compiles the function for the devices that it was lowered for."""
+  def compile(self, mesh: Mesh, options: Mapping[str, str]) -> Compiled:
+    """Compiles the function for the devices that it was lowered for, with XLA's `options`."""
     exported = export.deserialize(bytearray(self.module))
     args, _ = self.in_tree.unflatten([jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in exported.in_avals])
     shardings, _ = self.in_tree.unflatten(exported.in_shardings_jax(mesh))
@@ -77,7 +77,7 @@ class LoweredFunction:
       out_shardings=self.out_tree.unflatten(exported.out_shardings_jax(mesh)),
       donate_argnums=self.donated,
     )
-    return jitted.lower(*args).compile()
+    return jitted.lower(*args).compile(dict(options))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from jax.sharding import Mesh
+
+from playground.hardware.mesh import compiler_options
 
 EMPTY = """
 import json
@@ -38,3 +46,25 @@ def test_arrays_of_no_elements_cross():
     "sum": ["float32"], "empty": [0, "bool"],
   }  # fmt: skip
   assert pos == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]] and total == 28.0
+
+
+CONCURRENT = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+
+
+@pytest.mark.parametrize(
+  ("platform", "devices", "impl", "flags", "options"),
+  [
+    ("gpu", 1, "jax", "", CONCURRENT),
+    ("gpu", 1, "jax", "--xla_gpu_deterministic_ops=true", CONCURRENT),
+    ("gpu", 1, "jax", "--xla_gpu_command_buffer_scheduling_mode=SERIALIZE", {}),
+    ("gpu", 1, "warp", "", {}),
+    ("gpu", 2, "jax", "", {}),
+    ("cpu", 1, "jax", "", {}),
+  ],
+)
+def test_kernels_run_at_the_same_time_where_that_is_faster(
+  monkeypatch: pytest.MonkeyPatch, platform: str, devices: int, impl: str, flags: str, options: dict[str, str]
+):
+  monkeypatch.setenv("XLA_FLAGS", flags)
+  mesh = SimpleNamespace(size=devices, devices=np.array([SimpleNamespace(platform=platform)] * devices))
+  assert compiler_options(cast(Mesh, mesh), impl) == options

@@ -49,10 +49,15 @@ def test_what_is_loaded_computes_the_same_and_takes_buffers_over(stored: StoredP
   assert loaded is not None
   copied = lambda: jax.tree.map(jnp.copy, ARGUMENTS)
   given = copied()
-  ours, theirs = loaded["scale"].compile(MESH)(*given), scaled()(*copied())
+  ours, theirs = loaded["scale"].compile(MESH, {})(*given), scaled()(*copied())
   assert jax.tree.structure(ours) == jax.tree.structure(theirs)
   jax.tree.map(np.testing.assert_array_equal, ours, theirs)
   assert given[0]["x"].is_deleted() and not given[1].is_deleted()
+
+
+def test_it_is_compiled_with_xlas_options():
+  with pytest.raises(Exception, match="no_such_option"):
+    lowered().compile(MESH, {"no_such_option": "1"})
 
 
 @pytest.mark.parametrize("damage", [lambda content: content[:-1], lambda content: b"", lambda content: content[::-1]])
@@ -95,7 +100,7 @@ from playground.learning.stored_program import LoweredFunction
 
 mesh, tree = make_mesh(2), {"x": jnp.arange(4.0), "empty": jnp.zeros((4, 0))}
 function = jit_on_mesh(lambda tree: tree | {"x": 2 * tree["x"]}, mesh, (P(AXIS),), P(AXIS), donate_argnums=0)
-stored = LoweredFunction.of(function, function.trace(tree), tree).compile(mesh)
+stored = LoweredFunction.of(function, function.trace(tree), tree).compile(mesh, {})
 result = stored(stored(put(tree, mesh, P(AXIS))))
 np.testing.assert_array_equal(result["x"], 4 * np.arange(4.0))
 assert result["empty"].shape == (4, 0) and result["empty"].sharding.spec == P(AXIS)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 from typing import Any, cast
 
 import jax
@@ -24,6 +25,7 @@ from playground.learning.evaluation import make_evaluator
 from playground.learning.hyperparameters import PPOConfig
 from playground.learning.loop import CompiledFunctions, Loop, compile_program, schedule
 from playground.learning.ppo import PPO
+from playground.learning.stored_program import StoredProgram
 from playground.learning.trainer import Trainer, trainer_settings
 from playground.mdp.context import StepContext
 from playground.mdp.managers import RewardManager
@@ -55,6 +57,15 @@ def built(config: Config, **events: Any) -> tuple[Trainer, CompiledFunctions]:
   others = other_acts(trainer.algorithm)
   evaluate = make_evaluator(trainer.env.unwrapped, trainer.act, config.num_eval_envs, trainer.mesh, 1, others)
   return trainer, compile_program(trainer, evaluate, lambda: ({}, {}))
+
+
+@pytest.mark.parametrize("is_stored", [True, False])
+def test_programs_are_compiled_with_xlas_options(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_stored: bool):
+  monkeypatch.setattr(loop_module, "compiler_options", lambda *_: {"no_such_option": "1"})
+  trainer, stored = point_trainer(SMALL["ppo"]), StoredProgram(tmp_path / "one.program") if is_stored else None
+  evaluate = jax.jit(lambda policy, key, model, settings: ())
+  with pytest.raises(Exception, match="no_such_option"):
+    compile_program(trainer, evaluate, lambda: ({}, {}), stored=stored)
 
 
 def run(

@@ -12,6 +12,7 @@ from playground.benchmark.measures.subject import Subject, alone, emit_peak, rat
 from playground.benchmark.worker import Rows
 from playground.envs.base import PIXELS
 from playground.envs.wrappers import ModelFields, Vectorize, Wrapper, wrap_for_training
+from playground.hardware.mesh import compiler_options
 from playground.learning.rollout import Environments, unroll
 from playground.learning.trainer import TrainState
 from playground.physics.backend import WORLDS, PhysicsData
@@ -77,7 +78,7 @@ def measure(
 
 def _repeat(subject: Subject, run: Run, carry: PyTree) -> Callable[[int], PyTree]:
   """Returns a function that repeats `run`, each time from the last carry."""
-  run = jax.jit(run, donate_argnums=0)
+  run = jax.jit(run, donate_argnums=0, compiler_options=_options(subject))
   carry = jax.tree.map(jnp.copy, carry)  # parts start from the same state, and each donates the buffers of its carry
 
   def call(count: int) -> PyTree:
@@ -92,15 +93,21 @@ def _repeat(subject: Subject, run: Run, carry: PyTree) -> Callable[[int], PyTree
 
 def _train(subject: Subject, state: TrainState) -> Callable[[int], PyTree]:
   """Returns a function that makes a number of training steps."""
-  trainer = subject.trainer
+  lowered = subject.trainer.train.lower(state, subject.model, np.int32(1))
+  train = lowered.compile(_options(subject))
 
   def call(count: int) -> PyTree:
     nonlocal state
-    state, metrics = trainer.train(state, subject.model, np.int32(count))
+    state, metrics = train(state, subject.model, np.int32(count))
     return metrics
 
-  call(1 + trainer.config.prefill_updates)
+  call(1 + subject.trainer.config.prefill_updates)
   return call
+
+
+def _options(subject: Subject) -> dict[str, str | bool]:
+  """Returns the options of XLA that a run's programs are compiled with."""
+  return {**compiler_options(subject.trainer.mesh, subject.env.unwrapped.impl)}
 
 
 def _rolls(subject: Subject, state: TrainState, length: int) -> dict[str, tuple[Run, PyTree, int]]:
