@@ -179,6 +179,11 @@ class CheckpointStore:
     noted = episode_return if episode_return is not None and math.isfinite(episode_return) else None
     self._pending = self._thread.submit(self._write, step, policy, state, {**meta, "return": noted}, replay)
 
+  def check(self) -> None:
+    """Raises the error of a save that has failed."""
+    if self._pending is not None and self._pending.done():
+      self.wait()
+
   def wait(self) -> None:
     """Blocks until the save is on disk; raises its error."""
     if self._pending is not None:
@@ -213,7 +218,8 @@ class CheckpointStore:
       reason = _not_about_files(error) or (str(error) if isinstance(error, OSError) else "")
       if not reason:
         raise
-      raise CheckpointError(f"{self._folder} cannot be written: {reason}.") from error
+      way_on = f"resume={self._folder.parent} goes on from what is saved"
+      raise CheckpointError(f"{self._folder} cannot be written: {reason}. {way_on}.") from error
     if meta["return"] is not None:
       self._best = max(self._best, (meta["return"], step))
     # Orbax's own policies would remove the old best before the link points to the new one.

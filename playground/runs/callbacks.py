@@ -90,6 +90,7 @@ class RunCallbacks:
     return self._earlier_s + time.perf_counter() - self._began
 
   def on_metrics(self, step: int, metrics: Metrics, captured: Step | None, recording: Recording | None) -> None:
+    self._store.check()
     score = metrics.get(RETURN)
     # The policy before training is evaluated after the first training steps: without them its row has that time alone.
     seconds = self.wall_clock_s if step else metrics["time/eval_s"]
@@ -194,14 +195,14 @@ class RunCallbacks:
     last = lambda name: next((value for value in column(name)[::-1].tolist() if np.isfinite(value)), None)
     acts_by_mode = self._trainer.config.deterministic_eval or not self._trainer.algorithm.samples
     chosen = "mode" if acts_by_mode else "sampled"
-    own = np.isfinite(returns) & ~np.isfinite(column(PARENT))
-    scores = [(float(value), int(step)) for value, step in zip(returns[own], steps[own], strict=True)]
     best = self._run_dir.checkpoints / BEST
-    if best.is_dir():  # metrics.csv may have lost its row
+    if best.is_dir():  # the policy itself: metrics.csv may have lost its row, or have one of a checkpoint that is gone
       checkpoint = Checkpoint(find_checkpoints(best)[0])
-      scores.append((checkpoint.meta["return"], checkpoint.step))
-    # As for `checkpoints/best`: the last of equal returns, and no policy without a checkpoint (the untrained one).
-    best_return, best_step = max((score for score in scores if score[1] > 0), default=(None, None))
+      best_return, best_step = checkpoint.meta["return"], checkpoint.step
+    else:  # a file system without links; the last of equal returns, and none of the untrained policy
+      own = np.isfinite(returns) & ~np.isfinite(column(PARENT)) & (steps > 0)
+      scores = [(float(value), int(step)) for value, step in zip(returns[own], steps[own], strict=True)]
+      best_return, best_step = max(scores, default=(None, None))
     trained = np.isfinite(rate)
     taken = np.diff(steps, prepend=0)[trained]
     seconds = float((taken / rate[trained]).sum())

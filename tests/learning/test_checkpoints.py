@@ -8,6 +8,7 @@ import os
 import resource
 import shutil
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -297,6 +298,18 @@ def test_what_cannot_be_written_is_raised(tmp_path: Path) -> None:
     store.close()
 
 
+def test_a_save_that_failed_is_raised_before_the_next_one(tmp_path: Path) -> None:
+  store = CheckpointStore(tmp_path / "checkpoints")
+  store.check()
+  store.save(10, POLICY, STATE, {"bad": object()})
+  with pytest.raises(TypeError):
+    for _ in range(1000):
+      store.check()
+      time.sleep(0.01)
+  store.check()
+  store.close()
+
+
 def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
   save(tmp_path, 10)
 
@@ -307,7 +320,8 @@ def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path, monkeypatch: pytest
   monkeypatch.setattr(ocp.CheckpointManager, "save", half)
   with pytest.raises(CheckpointError) as error:
     save(tmp_path, 20)
-  one_sentence(error, f"{tmp_path / 'checkpoints'} cannot be written: No space left on device")
+  said = f"{tmp_path / 'checkpoints'} cannot be written: No space left on device. resume={tmp_path} goes on from what is"
+  one_sentence(error, said)
   assert numbers(find_checkpoints(tmp_path)) == [10]
   assert sorted(os.listdir(tmp_path / "checkpoints")) == ["000000000010"], "the space of the half is free again"
 

@@ -322,6 +322,17 @@ def test_lost_metrics_lose_not_the_best(whole: Path, copy: Path) -> None:
   assert (ours["best_return"], ours["best_step"]) == (theirs["best_return"], theirs["best_step"])
 
 
+def test_a_best_policy_that_is_gone_is_not_named(whole: Path, copy: Path) -> None:
+  gone, newest = RunDirectory(whole).summary["best_step"], find_checkpoints(copy)[0]
+  assert int(newest.name) > gone
+  shutil.rmtree(copy / "checkpoints" / f"{gone:012d}")
+  assert resume(copy) == 0
+  (best,) = find_checkpoints(copy / "checkpoints" / "best")
+  summary = RunDirectory(copy).summary
+  assert (summary["best_return"], summary["best_step"]) == (Checkpoint(best).meta["return"], int(best.name))
+  assert summary["best_step"] != gone
+
+
 def test_a_best_policy_whose_metrics_are_gone_is_named(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
   run = RunDirectory(copy)
   run.write_summary({"status": "finished", "final_return": 1.0, "steps": 1, "best_step": None, "best_return": None})
