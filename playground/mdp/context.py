@@ -57,7 +57,8 @@ class Robot:
     index = mujoco.mj_name2id(self.mj_model, mujoco.mju_str2Type(kind), name)
     if index < 0:
       names = [getattr(self.mj_model, kind)(i).name for i in range(getattr(self.mj_model, f"n{kind}"))]
-      raise UnknownNameError(f"{key} names the {kind} {name!r}, which the model does not have.{nearest(name, names)}")
+      what = "keyframe" if kind == "key" else kind
+      raise UnknownNameError(f"{key} names the {what} {name!r}, which the model does not have.{nearest(name, names)}")
     return index
 
   def rows(self, sensor: str, key: str = "sensor") -> np.ndarray:

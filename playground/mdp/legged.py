@@ -14,7 +14,20 @@ from playground.mdp.context import Robot, StepContext
 from playground.mdp.options import mirrors_as
 from playground.physics.backend import PhysicsData, mjx
 
-_VECTORS = ("linvel", "gyro", "accelerometer", "upvector", "global_linvel", "global_angvel")  # sensors of 3 numbers
+_KINDS = {  # of sensors, by their key in `env.robot` or in its `sensors`
+  "linvel": mujoco.mjtSensor.mjSENS_VELOCIMETER,
+  "gyro": mujoco.mjtSensor.mjSENS_GYRO,
+  "accelerometer": mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+  "upvector": mujoco.mjtSensor.mjSENS_FRAMEZAXIS,
+  "global_linvel": mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+  "global_angvel": mujoco.mjtSensor.mjSENS_FRAMEANGVEL,
+  "foot_linvel": mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+  "foot_pos": mujoco.mjtSensor.mjSENS_FRAMEPOS,
+  "foot_force": mujoco.mjtSensor.mjSENS_FORCE,
+}
+
+
+_ROUNDING = 1e-4  # rad, by which a keyframe may leave the joints' limits
 
 
 class LeggedRobot(Robot):
@@ -41,8 +54,8 @@ class LeggedRobot(Robot):
     """Looks up the names of `env.robot`.
 
     Raises:
-      ConfigError: the model lacks one, its joints come in another order, or a list does not have one entry for each
-        foot or joint.
+      ConfigError: the model lacks one, its joints come in another order, a list does not have one entry for each foot
+        or joint, a sensor is of another kind or at another foot, or the keyframe is outside the joints' limits.
     """
     joints = [mj_model.joint(i).name for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
@@ -59,11 +72,20 @@ class LeggedRobot(Robot):
     self.init_qpos = self.keyframe(config.keyframe)
     self.default_pose = self.init_qpos[7:]
     self.joint_range, self.target_range = _ranges(mj_model, joints, config.get("target_range"))
-    self.root, self.base_site = self.find("body", config.root), self.find("site", config.base_site)
+    for joint, angle, low, high in zip(joints, self.default_pose, *self.joint_range, strict=True):
+      if not low - _ROUNDING <= angle <= high + _ROUNDING:
+        outside = f"is at {angle:g}, outside its range of {low:g} to {high:g}"
+        raise ConfigError(f"env.robot.keyframe={config.keyframe}: the joint {joint} {outside}.")
+    self.root = self.find("body", config.root, "env.robot.root")
+    self.base_site = self.find("site", config.base_site, "env.robot.base_site")
     self.foot_names = tuple(config.feet)
-    self.feet = np.array([self.find("site", name) for name in config.feet])
+    self.feet = np.array([self.find("site", name, "env.robot.feet") for name in config.feet])
     self.pose_weights = jnp.array(config.get("pose_weights", [1.0] * len(joints)))
-    self.joint_groups = {group: list(config[group]) for group in ("hips", "hip_rolls", "knees") if config.get(group)}
+    groups = {group: list(config[group]) for group in ("hips", "hip_rolls", "knees") if config.get(group)}
+    for group, names in groups.items():
+      for name in names:
+        self.find_joints(name, f"env.robot.{group}")
+    self.joint_groups = groups
     self.contact_groups: dict[str, np.ndarray] = {}
     for group in ("self_contact", "fatal_contact"):
       self.add_contact_group(group, config.get(group, ()))
@@ -72,11 +94,16 @@ class LeggedRobot(Robot):
       key: np.array([self.rows(name, f"env.robot.{key}") for name in config.get(key, ())])
       for key in ("foot_linvel", "foot_pos", "foot_force")
     }
-    vectors = {f"sensors.{name}": [sensor] for name, sensor in config.sensors.items() if name in _VECTORS}
-    for key, sensors in (vectors | {name: config.get(name, ()) for name in self._foot_rows}).items():
+    for name, sensor in config.sensors.items():
+      if name in _KINDS:
+        self._check_kind(sensor, f"env.robot.sensors.{name}", _KINDS[name])
+    for key in self._foot_rows:
+      for foot, sensor in zip(self.feet, config.get(key, ()), strict=False):  # some robots have none
+        self._check_kind(sensor, f"env.robot.{key}", _KINDS[key])
+        self._check_foot(sensor, f"env.robot.{key}", foot)
+    for foot, sensors in zip(self.feet, config.foot_contact, strict=True):
       for sensor in sensors:
-        if (size := len(self.rows(sensor))) != 3:
-          raise ConfigError(f"env.robot.{key}: the sensor {sensor} has {size} numbers, and must have 3.")
+        self._check_foot(sensor, "env.robot.foot_contact", foot)
     self._subtree = [self.root]  # a child's id is always above its parent's
     for body in range(self.root + 1, mj_model.nbody):
       if mj_model.body_parentid[body] in self._subtree:
@@ -86,7 +113,7 @@ class LeggedRobot(Robot):
 
   def keyframe(self, name: str) -> jax.Array:
     """Returns the configuration of a keyframe, shape [nq]; raises UnknownNameError if there is none of that name."""
-    return jnp.array(self.mj_model.key_qpos[self.find("key", name)])
+    return jnp.array(self.mj_model.key_qpos[self.find("key", name, "env.robot.keyframe")])
 
   def add_contact_group(self, name: str, sensors: Sequence[str]) -> None:
     """Names a group of contact sensors for `touching`."""
@@ -94,6 +121,24 @@ class LeggedRobot(Robot):
 
   def _addresses(self, sensors: Sequence[str], key: str) -> np.ndarray:
     return np.array([self.rows(sensor, f"env.robot.{key}")[0] for sensor in sensors], int)
+
+  def _check_kind(self, sensor: str, key: str, kind: mujoco.mjtSensor) -> None:
+    """Raises ConfigError where a sensor of the model is of another kind."""
+    found = mujoco.mjtSensor(self.mj_model.sensor_type[self.find("sensor", sensor, key)])
+    if found != kind:
+      is_kind, needed = (it.name.removeprefix("mjSENS_").lower() for it in (found, kind))
+      raise ConfigError(f"{key}: the sensor {sensor} is a {is_kind}, and must be a {needed}.")
+
+  def _check_foot(self, sensor: str, key: str, foot: int) -> None:
+    """Raises ConfigError where a sensor is on the body of another foot than that of the site `foot`."""
+    model, index = self.mj_model, self.find("sensor", sensor, key)
+    kind, part = mujoco.mjtObj(model.sensor_objtype[index]), model.sensor_objid[index]
+    bodies = {mujoco.mjtObj.mjOBJ_SITE: model.site_bodyid, mujoco.mjtObj.mjOBJ_GEOM: model.geom_bodyid}
+    body = bodies[kind][part] if kind in bodies else part
+    others = {model.site_bodyid[site]: name for site, name in zip(self.feet, self.foot_names, strict=True)}
+    if body in others and body != model.site_bodyid[foot]:
+      needed = model.site(foot).name
+      raise ConfigError(f"{key}: the sensor {sensor} is at the foot {others[body]}, and must be at {needed}.")
 
   def find_feet(self, feet: Sequence[str], key: str = "feet") -> np.ndarray:
     """Returns the indices of feet in `feet` by their names; raises UnknownNameError."""

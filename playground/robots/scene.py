@@ -33,6 +33,8 @@ GROUND = "studio/groundplane"  # material of the floor
 # Contacts MJX's JAX implementation keeps with self-collision (the closest ones); C MuJoCo and Warp ignore these.
 _SELF_COLLISION_LIMITS = {"max_contact_points": 30, "max_geom_pairs": 12}
 
+_GROUNDS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+
 # Height of the bumps that the robots' own `_rough` keyframes clear, m.
 _ROUGH = 0.05
 
@@ -132,6 +134,10 @@ def build_scene(
   _check_qpos(spec, mjcf)
   if any(geom.name == "floor" for geom in spec.geoms):
     raise ConfigError(f"env.robot.mjcf={mjcf} has a geom named floor: remove it, the scene adds the ground.")
+  for geom in spec.worldbody.geoms:
+    if geom.type in _GROUNDS and (geom.contype or geom.conaffinity):
+      ground = f"the geom {geom.name}" if geom.name else "a geom without a name"
+      raise ConfigError(f"env.robot.mjcf={mjcf} has a ground, {ground}: remove it, the scene adds one.")
   if collision != "feet" and not _full_geoms(spec):
     feet_only = f"{Path(mjcf).stem} has collision geoms for the feet only"
     remedy = "choose env.scene.collision=feet, or give more geoms the class full"
@@ -172,6 +178,8 @@ def _check_qpos(spec: mujoco.MjSpec, mjcf: str) -> None:
       raise ConfigError(f"env.robot.mjcf={mjcf}: {needed}, but the keyframe {key.name} has {len(key.qpos)}.")
     if not np.isfinite(key.qpos).all():
       raise ConfigError(f"env.robot.mjcf={mjcf}: the keyframe {key.name} has a qpos that is not finite.")
+    if len(key.qpos) and not np.array(key.qpos)[3:7].any():  # MuJoCo normalises others
+      raise ConfigError(f"env.robot.mjcf={mjcf}: the keyframe {key.name} has no quaternion (w x y z), but zeros.")
     for joint, position in zip(spec.joints, np.split(key.qpos, np.cumsum(sizes)[:-1]), strict=True):
       if joint.type == mujoco.mjtJoint.mjJNT_HINGE and np.abs(position).max(initial=0.0) > 2 * np.pi:
         turned = f"the keyframe {key.name} turns the joint {joint.name} to {position[0]:g} rad"

@@ -287,7 +287,7 @@ def test_legs_have_contacts_by_group_only() -> None:
 
 def test_a_keyframe_is_checked_when_the_task_is_built() -> None:
   event = {"mode": "reset", "func": "reset_to_keyframe", "params": {"probability": 1.0, "keyframe": "hom"}}
-  with pytest.raises(UnknownNameError, match=r"params\.keyframe names the key 'hom'.*Did you mean 'home'"):
+  with pytest.raises(UnknownNameError, match=r"params\.keyframe names the keyframe 'hom'.*Did you mean 'home'"):
     load_task(TASK, {"events.mine": event})
 
 
@@ -396,6 +396,56 @@ def test_servos_with_a_time_constant_hold_the_pose_that_an_episode_starts_in(tmp
   data = on_c_physics(load_task(TASK, {"robot.mjcf": str(robot)})).reset(jax.random.PRNGKey(0)).data
   np.testing.assert_array_equal(data.act, data.ctrl)
   np.testing.assert_allclose(data.actuator_force, 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+  ("changed", "message"),
+  [
+    (
+      {"robot.foot_linvel": ["FL_global_linvel", "FR_global_linvel", "RR_global_linvel", "RL_global_linvel"]},
+      "env.robot.foot_linvel: the sensor FL_global_linvel is at the foot FL, and must be at FR.",
+    ),
+    (
+      {"robot.foot_contact": [["FR_floor_found"], ["FR_floor_found"], ["RR_floor_found"], ["RL_floor_found"]]},
+      "env.robot.foot_contact: the sensor FR_floor_found is at the foot FR, and must be at FL.",
+    ),
+    (
+      {"robot.sensors.upvector": "gyro"},
+      "env.robot.sensors.upvector: the sensor gyro is a gyro, and must be a framezaxis.",
+    ),
+    (
+      {"robot.sensors.linvel": "global_linvel"},
+      "env.robot.sensors.linvel: the sensor global_linvel is a framelinvel, and must be a velocimeter.",
+    ),
+    ({"robot.feet": ["FR", "FL", "RR", "RLx"]}, "env.robot.feet names the site 'RLx', which the model does not have."),
+    ({"robot.keyframe": "hom"}, "env.robot.keyframe names the keyframe 'hom', which the model does not have."),
+  ],
+)
+def test_parts_of_a_robot_that_are_others_than_they_must_be(changed: dict[str, Any], message: str) -> None:
+  with pytest.raises(ConfigError, match=rf"^{re.escape(message)}"):
+    load_task(TASK, changed)
+
+
+def test_each_name_of_a_group_of_joints_is_one() -> None:
+  hips = ["left_hip_roll_joint", "right_hip_rol_joint"]
+  with pytest.raises(UnknownNameError, match=r"^env\.robot\.hips='right_hip_rol_joint' matches no .*'right_hip_roll_j"):
+    load_task("G1JoystickFlatTerrain", {"robot.hips": hips})
+
+
+def test_a_servo_that_holds_another_angle_than_its_target(tmp_path: Path) -> None:
+  robot, text = tmp_path / "robot.xml", find_mjcf("go1").read_text()
+  servo = '<general gaintype="fixed" biastype="affine" gainprm="30" biasprm="0 -15 -1" ctrlrange="-1 1" name='
+  robot.write_text(text.replace("<position name=", servo))
+  with pytest.raises(ConfigError, match="the actuator FR_hip is no position servo"):
+    load_task(TASK, {"robot.mjcf": str(robot), "robot.pd": None})
+
+
+def test_a_keyframe_is_within_the_limits_of_the_joints(tmp_path: Path) -> None:
+  robot, text = tmp_path / "robot.xml", find_mjcf("go1").read_text()
+  robot.write_text(text.replace('qpos="0 0 0.278 1 0 0 0 0.1', 'qpos="0 0 0.278 1 0 0 0 1.5'))
+  outside = r"keyframe=home: the joint FR_hip_joint is at 1\.5, outside its range of -0\.863 to 0\.863\.$"
+  with pytest.raises(ConfigError, match=outside):
+    load_task(TASK, {"robot.mjcf": str(robot)})
 
 
 def test_a_keyframe_may_be_empty(tmp_path: Path) -> None:

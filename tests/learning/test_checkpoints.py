@@ -320,7 +320,7 @@ def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path, monkeypatch: pytest
   monkeypatch.setattr(ocp.CheckpointManager, "save", half)
   with pytest.raises(CheckpointError) as error:
     save(tmp_path, 20)
-  said = f"{tmp_path / 'checkpoints'} cannot be written: No space left on device. resume={tmp_path} goes on from what is"
+  said = f"{tmp_path / 'checkpoints'} cannot be written: No space left on device. resume={tmp_path} goes on from"
   one_sentence(error, said)
   assert numbers(find_checkpoints(tmp_path)) == [10]
   assert sorted(os.listdir(tmp_path / "checkpoints")) == ["000000000010"], "the space of the half is free again"

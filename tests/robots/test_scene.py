@@ -133,6 +133,16 @@ def test_a_robot_is_ours_or_in_a_file_or_in_a_package(tmp_path: Path, monkeypatc
       'qpos="0 0 0.278 1 0 0 0 45',
       "the keyframe home turns the joint FR_hip_joint to 45 rad: write positions in rad, not in degrees.",
     ),
+    (
+      'qpos="0 0 0.278 1 0 0 0',
+      'qpos="0 0 0.278 0 0 0 0',
+      "the keyframe home has no quaternion (w x y z), but zeros.",
+    ),
+    (
+      "<worldbody>",
+      '<worldbody><geom name="ground" type="plane" size="0 0 1"/>',
+      "has a ground, the geom ground: remove it, the scene adds one.",
+    ),
     ('name="footstand"', 'name="pronk_rough"', "the keyframe pronk_rough is pronk on rough ground: add pronk."),
     ("<sensor>", '<asset><material name="studio/groundplane"/></asset><sensor>', "repeated name 'studio/groundplane'"),
     (

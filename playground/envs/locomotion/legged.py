@@ -61,7 +61,7 @@ class LeggedTask(Task):
     if config.restricted_joint_range:
       if "restricted_range" not in config.robot:
         raise ConfigError(f"env.restricted_joint_range: robot={config.robot.get('name')} has no restricted_range.")
-      joints = {joint.name: joint for joint in spec.joints}
+      joints = {joint.name: joint for joint in spec.joints if joint.name}
       for name, limits in config.robot.restricted_range.items():
         joint = lookup(joints, name, "env.robot.restricted_range")
         in_degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE  # the unit of the MJCF's angles
@@ -109,7 +109,8 @@ def _need_servos(mj_model: mujoco.MjModel, mjcf: str) -> None:
     name, gear = mj_model.actuator(i).name or f"number {i}", mj_model.actuator_gear[i, 0]
     affine = mj_model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE  # a motor ignores the bias of `pd.kp`
     integrates = mj_model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_INTEGRATOR  # <intvelocity>: `ctrl` is a velocity
-    if not (affine and mj_model.actuator_biasprm[i, 1] < 0) or integrates:
+    kp, bias = mj_model.actuator_gainprm[i, 0], mj_model.actuator_biasprm[i]
+    if not (affine and kp > 0 and bias[0] == 0 and bias[1] == -kp) or integrates:
       raise ConfigError(
         f"env.robot.mjcf={mjcf}: the actuator {name} is no position servo, and an action is a joint's target: "
         'use <position inheritrange="1">, or a task with its own action_to_ctrl.'
