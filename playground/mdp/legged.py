@@ -27,9 +27,6 @@ _KINDS = {  # of sensors, by their key in `env.robot` or in its `sensors`
 }
 
 
-_ROUNDING = 1e-4  # rad, by which a keyframe may leave the joints' limits
-
-
 class LeggedRobot(Robot):
   """A robot on legs, whose YAML (`configs/robot/`) names the parts of its model.
 
@@ -55,7 +52,7 @@ class LeggedRobot(Robot):
 
     Raises:
       ConfigError: the model lacks one, its joints come in another order, a list does not have one entry for each foot
-        or joint, a sensor is of another kind or at another foot, or the keyframe is outside the joints' limits.
+        or joint, or a sensor is of another kind or at another foot.
     """
     joints = [mj_model.joint(i).name for i in range(1, mj_model.njnt)]
     if joints != list(config.joints):
@@ -72,10 +69,6 @@ class LeggedRobot(Robot):
     self.init_qpos = self.keyframe(config.keyframe)
     self.default_pose = self.init_qpos[7:]
     self.joint_range, self.target_range = _ranges(mj_model, joints, config.get("target_range"))
-    for joint, angle, low, high in zip(joints, self.default_pose, *self.joint_range, strict=True):
-      if not low - _ROUNDING <= angle <= high + _ROUNDING:
-        outside = f"is at {angle:g}, outside its range of {low:g} to {high:g}"
-        raise ConfigError(f"env.robot.keyframe={config.keyframe}: the joint {joint} {outside}.")
     self.root = self.find("body", config.root, "env.robot.root")
     self.base_site = self.find("site", config.base_site, "env.robot.base_site")
     self.foot_names = tuple(config.feet)

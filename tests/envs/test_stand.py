@@ -142,7 +142,7 @@ def test_crouched_start() -> None:
       {"robot.feet": ["FR", "FL", "RX", "RL"]},
       r"^env\.robot\.feet: 'RX' is unknown; choose from .*Did you mean 'RR'\?",
     ),
-    ({"robot.keyframe": "hom"}, r"the key 'hom', which the model does not have.*Did you mean 'home'\?"),
+    ({"robot.keyframe": "hom"}, r"the keyframe 'hom', which the model does not have.*Did you mean 'home'\?"),
     ({"rewards.lifted_leg_deviation_l2.func": "joint_deviation"}, "Did you mean 'joint_deviation_l"),
   ],
 )

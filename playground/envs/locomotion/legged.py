@@ -27,6 +27,7 @@ _KEYS = ("mjcf", "root", "base_site", "feet", "keyframe", "joints", "pd", "senso
 _KEYS += ("foot_linvel", "foot_contact", "floor_contacts")
 _OPTIONAL = ("name", "mirror", "gaits", "pose_weights", "target_range", "restricted_range", "hips", "hip_rolls")
 _OPTIONAL += ("knees", "foot_pos", "foot_force", "self_contact", "fatal_contact")
+_ROUNDING = 1e-4  # rad, by which a keyframe may leave the joints' limits
 
 
 class LeggedTask(Task):
@@ -75,6 +76,8 @@ class LeggedTask(Task):
 
   def make_robot(self, mj_model: mujoco.MjModel, config: Any) -> LeggedRobot:
     robot = LeggedRobot(mj_model, config.robot)
+    if not config.restricted_joint_range:  # which may exclude the pose
+      _check_pose(robot, config.robot.keyframe)
     robot.ground_peak = ground_peak(mj_model)
     return robot
 
@@ -101,6 +104,14 @@ class LeggedTask(Task):
       "tracking_error/lin_vel": jnp.linalg.norm(c.command[:2] - linvel[:2]),
       "tracking_error/ang_vel": jnp.abs(c.command[2] - gyro[2]),
     }
+
+
+def _check_pose(robot: LeggedRobot, keyframe: str) -> None:
+  """Raises ConfigError where the pose in which episodes start is outside a joint's range."""
+  for joint, at, low, high in zip(robot.joint_names, robot.default_pose, *robot.joint_range, strict=True):
+    if not low - _ROUNDING <= at <= high + _ROUNDING:
+      outside = f"is at {at:g}, outside its range of {low:g} to {high:g}"
+      raise ConfigError(f"env.robot.keyframe={keyframe}: the joint {joint} {outside}.")
 
 
 def _need_servos(mj_model: mujoco.MjModel, mjcf: str) -> None:
