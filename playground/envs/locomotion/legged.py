@@ -108,7 +108,8 @@ class LeggedTask(Task):
 
 def _check_pose(robot: LeggedRobot, keyframe: str) -> None:
   """Raises ConfigError where the pose in which episodes start is outside a joint's range."""
-  for joint, at, low, high in zip(robot.joint_names, robot.default_pose, *robot.joint_range, strict=True):
+  pose, (lower, upper) = np.asarray(robot.default_pose), np.asarray(robot.joint_range)  # else each one is a JAX program
+  for joint, at, low, high in zip(robot.joint_names, pose, lower, upper, strict=True):
     if not low - _ROUNDING <= at <= high + _ROUNDING:
       outside = f"is at {at:g}, outside its range of {low:g} to {high:g}"
       raise ConfigError(f"env.robot.keyframe={keyframe}: the joint {joint} {outside}.")
