@@ -47,6 +47,7 @@ QUANTITIES = {
   "final_mode_return": "mean return of the last evaluation of the policy's mode",
   "golden_metric": "last value of the column of metrics.csv that setting names",
   "steps": "control steps trained",
+  "command_s": "from the start of the command to its end: imports, compiling, training, evaluations, saving",
   "wall_clock_s": "of a run with evaluations, without compiling (unless conditions say otherwise)",
 }
 

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import subprocess
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -50,7 +51,9 @@ def whole(
   job = {"task": task, "agent": agent, "backend": backend, "seed": seed}
   job |= {"evaluate": True, "num_timesteps": num_timesteps}
   with alone(rows.lock):
+    begin = time.perf_counter()
     result = drive(rows, peer, job)
+    result["command_s"] = time.perf_counter() - begin
   when = "time from the end of the evaluation before training to that of the last, compiling the training in it"
   rows["conditions"] = f"a whole run, {when}; {result['settings']}"
   emit_returns(rows, result["evaluations"], setting, seed)

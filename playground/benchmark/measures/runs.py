@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -21,8 +22,9 @@ from playground.interpreter import PYTHON
 from playground.runs.csv_tracker import OTHER_RETURNS, RETURN
 from playground.runs.run_dir import RunDirectory
 
-RESULT = ("steps", "wall_clock_s", "training_steps_per_s", "best_return", "final_mode_return", "final_return")
-_UNITS = {"steps": "steps", "wall_clock_s": "s", "training_steps_per_s": "steps/s"}
+_SPEED = ("steps", "command_s", "wall_clock_s", "training_steps_per_s")
+RESULT = (*_SPEED, "best_return", "final_mode_return", "final_return")
+_UNITS = {"steps": "steps", "command_s": "s", "wall_clock_s": "s", "training_steps_per_s": "steps/s"}
 _TIME = "time/wall_clock_s"
 _CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH")  # environment variables that replace the run's own caches
 
@@ -61,14 +63,17 @@ def whole(rows: Rows, task: str, agent: str, overrides: list[str], setting: list
     run = RunDirectory(Path(folder) / "run")
     chosen = [f"env={task}", f"agent={agent}", *overrides, f"seed={seed}"]
     with alone(rows.lock):
+      begin = time.perf_counter()
       run_training([*chosen, "video.enable=false", "tracking=csv", f"run_dir={run.path}"])
+      taken = time.perf_counter() - begin
     rows.update(columns_of(run.manifest), conditions="a whole run, evaluations and saving in its time, compiling not")
     evaluations = pd.read_csv(run.metrics_csv).dropna(subset=[RETURN])
     emit_returns(rows, evaluations[["step", RETURN, _TIME]].itertuples(index=False), setting, seed)
     if run.summary.get("final_mode_return") is not None:
       mode = OTHER_RETURNS["mode"] if OTHER_RETURNS["mode"] in evaluations else RETURN
       emit_returns(rows, evaluations[["step", mode, _TIME]].itertuples(index=False), setting, seed, "mode_return")
-    result = {**run.summary, "training_steps_per_s": run.manifest["timings"]["steady_steps_per_second"]}
+    rate = run.manifest["timings"]["steady_steps_per_second"]
+    result = {**run.summary, "command_s": taken, "training_steps_per_s": rate}
     emit_result(rows, result, RESULT, seed=seed)
 
 
