@@ -230,7 +230,8 @@ def test_an_agent_of_an_earlier_version_is_refused(tmp_path: Path):
 
 
 def test_paper_values_of_go1():
-  agent = compose(["experiment=go1_joystick"]).agent
+  assert compose(["experiment=go1_joystick"]).agent.num_resets_per_eval == 10, "our set's own"
+  agent = compose(["experiment=go1_joystick", "agent=ppo_paper"]).agent
   assert (agent.num_timesteps, agent.num_evals, agent.num_resets_per_eval) == (200_000_000, 10, 1)
   assert (agent.num_envs, agent.batch_size, agent.unroll_length, agent.max_grad_norm) == (8192, 256, 20, 1.0)
   assert tuple(agent.network.policy_hidden_layer_sizes) == (512, 256, 128)
