@@ -19,7 +19,7 @@ from playground.hardware.setup import Hardware, setup
 from playground.learning.algorithm import Policy, other_acts
 from playground.learning.checkpoints import BEST
 from playground.learning.evaluation import make_evaluator
-from playground.learning.hyperparameters import AgentConfig
+from playground.learning.hyperparameters import SCHEDULE, AgentConfig
 from playground.learning.loop import (
   CompiledFunctions,
   Draw,
@@ -187,7 +187,8 @@ def prepare(
 
   num_updates = math.ceil(agent.num_timesteps / trainer.steps_per_update)
   events = schedule(num_updates, agent.num_evals, agent.num_resets_per_eval, math.ceil(num_updates / ROWS))
-  plan.notices += cut_short(agent, env.episode_length, events, trainer.steps_per_update)
+  if sets_schedule(config):
+    plan.notices += cut_short(agent, env.episode_length, events, trainer.steps_per_update)
   num_recorded = min(config.video.episodes, agent.num_eval_envs // trainer.num_devices) * config.video.enable
   others = other_acts(trainer.algorithm)
   evaluate = make_evaluator(env, trainer.act, agent.num_eval_envs, trainer.mesh, num_recorded, others)
@@ -255,6 +256,13 @@ def timings_of(program: CompiledFunctions, began_s: float) -> dict[str, float]:
   """Returns the manifest's times (seconds) up to the compiled program."""
   started = process_age_s() - began_s
   return {"start_to_compiled_s": started, "trace_s": program.trace_s, "compile_s": program.compile_s}
+
+
+def sets_schedule(config: RunConfig) -> bool:
+  """Returns whether overrides or a curriculum, not a set or experiment, say when all environments are reset."""
+  keys = tuple(f"agent.{key}=" for key in (*SCHEDULE, "num_envs"))
+  is_stage = "/" in str(config.name)  # <name of the chain>/<stage>
+  return is_stage or any(text.lstrip("+").startswith(keys) for text in config.overrides)
 
 
 def cut_short(

@@ -35,7 +35,7 @@ from playground.runs.callbacks import MAX_WAITING, RunCallbacks
 from playground.runs.loaded_policy import load_policy
 from playground.runs.restore_plan import RestorePlan, networks_of
 from playground.runs.run_dir import RunDirectory
-from playground.runs.train import cut_short, open_run, say_where, train
+from playground.runs.train import cut_short, open_run, say_where, sets_schedule, train
 from tests.processes import WITHOUT_WARP
 from tests.runs.helpers import TASK, make_run, resume, truncate
 
@@ -706,6 +706,14 @@ def test_what_its_weights_are_does_not_change_until_it_is_resumed(
 def test_a_pretrained_policy_keeps_its_name() -> None:
   config = compose([*TASK, "init_from=pretrained:CartpoleBalance"])
   assert RestorePlan.find(config).to_write(config)["init_from"] == "pretrained:CartpoleBalance"
+
+
+def test_a_run_with_the_schedule_of_its_set_says_nothing_of_it() -> None:
+  task = "env=Go1JoystickFlatTerrain"  # ten resets, which leave an episode 271 of 1000 steps
+  assert not sets_schedule(compose([task, "agent.learning_rate=1e-4"]))
+  assert sets_schedule(compose([task, "agent.num_timesteps=20e6"]))
+  chain = compose(["env=Go1Handstand", "curriculum=go1_handstand_chain"])
+  assert sets_schedule(chain.stages[2])  # its budget, without an override
 
 
 def test_a_run_whose_fresh_starts_end_every_episode_early_says_so() -> None:
