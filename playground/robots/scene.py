@@ -103,7 +103,7 @@ def check_keys(robot: Mapping[str, Any], keys: Sequence[str], what: str, optiona
     raise ConfigError(f"env.robot.{missing[0]} is missing: robot={name} is no {what}, or its YAML is not complete.")
   known = (*keys, *optional)
   for key in robot:
-    if key not in known and (like := difflib.get_close_matches(key, known, n=1, cutoff=0.85)):
+    if key not in known and (like := difflib.get_close_matches(key, known, n=1, cutoff=0.82)):
       raise UnknownNameError(f"env.robot.{key} does not exist. Did you mean {like[0]!r}?")
 
 

@@ -169,12 +169,11 @@ def test_a_model_that_is_no_robot_or_has_names_of_the_scene(
   assert message in str(caught.value)
 
 
-def test_a_misspelt_key_of_a_robot_is_named() -> None:
-  check_keys({"mjcf": "go1", "payload": 3}, ("mjcf",), "robot", ("pose_weights",))
-  with pytest.raises(
-    UnknownNameError, match=r"^env\.robot\.pose_weight does not exist\. Did you mean 'pose_weights'\?$"
-  ):
-    check_keys({"mjcf": "go1", "pose_weight": [1]}, ("mjcf",), "robot", ("pose_weights",))
+@pytest.mark.parametrize(("typo", "key"), [("pose_weight", "pose_weights"), ("mirorr", "mirror")])
+def test_a_misspelt_key_of_a_robot_is_named(typo: str, key: str) -> None:
+  check_keys({"mjcf": "go1", "payload": 3}, ("mjcf",), "robot", (key,))
+  with pytest.raises(UnknownNameError, match=rf"^env\.robot\.{typo} does not exist\. Did you mean '{key}'\?$"):
+    check_keys({"mjcf": "go1", typo: [1]}, ("mjcf",), "robot", (key,))
 
 
 def test_a_model_without_a_body(tmp_path: Path) -> None:
