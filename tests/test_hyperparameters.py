@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import functools
+import importlib.metadata
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -208,6 +209,14 @@ def test_a_variant_of_our_algorithm_has_its_tuned_set():
   assert (run.choices["tuned"], run.agent.num_timesteps) == ("ppo/CheetahRun", 60_000_000)
   assert run.resolved["agent"]["half_life"] == 20
   assert compose(["env=CheetahRun", "agent=own_ppo", "tuned=null"]).agent.num_timesteps == 50_000_000
+
+
+def test_an_algorithm_of_another_package_with_a_name_of_ours_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+  points = [EntryPoint(name, f"{__name__}:OwnPPOConfig", hyperparameters.ENTRY_POINTS) for name in ("ppo", "own_ppo")]
+  monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
+  with pytest.warns(match="^Entry point 'ppo' of playground.agents is not used: give it another name than ours"):
+    found = hyperparameters._entry_points.__wrapped__()
+  assert list(found) == ["ppo", "own_ppo"] and hyperparameters.config_class("ppo") is PPOConfig
 
 
 @pytest.mark.parametrize("option", options("tuned"))

@@ -489,3 +489,18 @@ def test_an_outside_package_adds_tasks(site: Path):
   assert [(row["task"], row["robot"], row["agent"], row["backend"]) for row in listed] == [
     ("TinyBalance", "", "ppo", "jax"), ("TinyWalk", "go1", "ppo", "jax"),
   ]  # fmt: skip
+
+
+def test_a_file_of_an_outside_package_with_a_name_of_ours_is_told(tmp_path: Path) -> None:
+  file = tmp_path / "site/env/CartpoleBalance.yaml"
+  file.parent.mkdir(parents=True)
+  file.write_text("task: mine:Mine\n")
+  (tmp_path / "mine.py").write_text(f"CONFIGS = {str(tmp_path / 'site')!r}\n")
+  info = tmp_path / "mine-1.0.dist-info"
+  info.mkdir()
+  (info / "entry_points.txt").write_text("[playground.tasks]\nmine = mine:CONFIGS\n")
+  (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+  code = f"import sys; sys.path.append({str(tmp_path)!r}); import playground; print(playground.registry.names('Cart'))"
+  done = subprocess.run([sys.executable, "-c", code], env=os.environ | WITHOUT_WARP, capture_output=True, text=True)
+  assert done.returncode == 0, done.stderr
+  assert "'mine' of playground.tasks: env/CartpoleBalance.yaml is not used, since another package has" in done.stderr

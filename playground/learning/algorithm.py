@@ -170,8 +170,14 @@ def gradient_step(
 
   Returns:
     Parameters and optimiser after it, the gradient's norm, and whether it was finite.
+
+  Raises:
+    ConfigError: the gradients are not of these parameters.
   """
-  flat = jax.lax.pmean(ravel_pytree(grads)[0], AXIS)
+  flat, _ = ravel_pytree(grads)
+  if flat.shape != params.shape:
+    raise ConfigError(f"gradient_step got {flat.size:,} gradients for {params.size:,} parameters: give it all of them.")
+  flat = jax.lax.pmean(flat, AXIS)
   norm = jnp.linalg.norm(flat)
   updates, new_opt_state = optimizer.update(flat, opt_state, params)
   finite = jnp.isfinite(norm)

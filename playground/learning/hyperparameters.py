@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import importlib.metadata
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar, Literal
 
@@ -528,4 +529,7 @@ _BUILT_IN: dict[str, type[AgentConfig]] = {
 
 @functools.cache
 def _entry_points() -> Mapping[str, importlib.metadata.EntryPoint]:
-  return {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+  points = {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+  for name in sorted(points.keys() & _BUILT_IN):
+    warnings.warn(f"Entry point {name!r} of {ENTRY_POINTS} is not used: give it another name than ours.", stacklevel=2)
+  return points

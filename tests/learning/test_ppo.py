@@ -36,6 +36,12 @@ def test_a_bad_gradient_is_left_out() -> None:
   assert finite and norm == pytest.approx(3**0.5) and (moved < params).all()
 
 
+def test_gradients_of_a_part_of_the_parameters_are_refused() -> None:
+  params, optimizer = jnp.arange(3.0), optax.adam(1e-3)
+  with pytest.raises(ConfigError, match=r"^gradient_step got 2 gradients for 3 parameters: give it"):
+    gradient_step(optimizer, {"policy": jnp.ones(2)}, params, optimizer.init(params))
+
+
 @pytest.mark.parametrize(
   ("change", "words"),
   [
