@@ -147,11 +147,8 @@ def _outside_roots() -> tuple[Path, ...]:
         root = root.parent.parent
       if not any(root.glob("*/**/*.yaml")):
         raise FileNotFoundError(f"{root} holds no file such as env/<TaskName>.yaml or robot/<name>.yaml")
-      taken = [
-        path.relative_to(root).as_posix()
-        for path in sorted(root.rglob("*.yaml"))
-        if any((above / path.relative_to(root)).is_file() for above in (shipped("configs"), *roots))
-      ]
+      names = [path.relative_to(root) for path in sorted(root.rglob("*.yaml"))]
+      taken = [name for name in names for above in (shipped("configs"), *roots) if (above / name).is_file()]
       if taken and root.resolve() not in roots:
         unused = f"{taken[0]} is not used, since another package has a file of this name: give it another name"
         warnings.warn(f"Entry point {point.name!r} of {ENTRY_POINTS}: {unused}.", stacklevel=2)
