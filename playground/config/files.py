@@ -145,9 +145,9 @@ def _outside_roots() -> tuple[Path, ...]:
       root = Path(str(target() if callable(target) else target))
       if root.suffix == ".yaml":  # <root>/env/<Task>.yaml
         root = root.parent.parent
-      if not any(root.glob("*/**/*.yaml")):
+      names = [path.relative_to(root) for path in sorted(root.glob("*/**/*.yaml"))]
+      if not names:
         raise FileNotFoundError(f"{root} holds no file such as env/<TaskName>.yaml or robot/<name>.yaml")
-      names = [path.relative_to(root) for path in sorted(root.rglob("*.yaml"))]
       taken = [name for name in names for above in (shipped("configs"), *roots) if (above / name).is_file()]
       if taken and root.resolve() not in roots:
         unused = f"{taken[0]} is not used, since another package has a file of this name: give it another name"

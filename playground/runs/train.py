@@ -261,7 +261,7 @@ def timings_of(program: CompiledFunctions, began_s: float) -> dict[str, float]:
 def sets_schedule(config: RunConfig) -> bool:
   """Returns whether overrides or a curriculum, not a set or experiment, say when all environments are reset."""
   keys = tuple(f"agent.{key}=" for key in (*SCHEDULE, "num_envs"))
-  is_stage = "/" in str(config.name)  # <name of the chain>/<stage>
+  is_stage = config.name != (config.choices.get("experiment") or config.choices["env"])  # a single run's name
   return is_stage or any(text.lstrip("+").startswith(keys) for text in config.overrides)
 
 

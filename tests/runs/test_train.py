@@ -711,6 +711,7 @@ def test_a_pretrained_policy_keeps_its_name() -> None:
 def test_a_run_with_the_schedule_of_its_set_says_nothing_of_it() -> None:
   task = "env=Go1JoystickFlatTerrain"  # ten resets, which leave an episode 271 of 1000 steps
   assert not sets_schedule(compose([task, "agent.learning_rate=1e-4"]))
+  assert not sets_schedule(compose(["env=v020/CartpoleBalance"]))
   assert sets_schedule(compose([task, "agent.num_timesteps=20e6"]))
   chain = compose(["env=Go1Handstand", "curriculum=go1_handstand_chain"])
   assert sets_schedule(chain.stages[2])  # its budget, without an override
