@@ -127,8 +127,9 @@ def test_falls_are_the_modes_where_a_run_that_samples_evaluates_it_too(reference
 
 
 def test_two_runs_have_two_curves_and_two_rows(reference: Path, make: Make) -> None:
-  first = make("env=Go1JoystickFlatTerrain", metrics=METRICS)
-  other = make("env=Go1JoystickFlatTerrain", "agent.discounting=0.9", metrics=METRICS.replace("27.125", "26"), name="b")
+  task = ("env=Go1JoystickFlatTerrain", "seed=77")  # a seed that the tables lack, whatever commit they are of
+  first = make(*task, metrics=METRICS)
+  other = make(*task, "agent.discounting=0.9", metrics=METRICS.replace("27.125", "26"), name="b")
   assert record.run(Options(runs=(str(first), str(other), str(first)), reference=str(reference))) == 0
   rows = [row["setting"] for row in read_csv(reference / "locomotion.csv")[-2:]]
   assert rows == ["", "agent.discounting=0.9"]
