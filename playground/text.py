@@ -2,7 +2,10 @@
 
 import hashlib
 import re
+import sys
+import traceback
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import yaml
 
@@ -71,6 +74,13 @@ _Dumper.add_representer(str, _represent_text)
 def dump_yaml(values: object) -> str:
   """Returns plain dicts, lists and scalars as YAML, which reads back the same."""
   return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
+def line_of(error: Exception, module: str) -> str:
+  """Returns 'file:line: ' of the innermost call in a module that an error went through, '' without one."""
+  file = getattr(sys.modules.get(module), "__file__", None)
+  lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+  return f"{Path(file).name}:{lines[-1]}: " if file and lines else ""
 
 
 def first_line(error: BaseException) -> str:

@@ -8,9 +8,12 @@ points of the group `playground.tasks`), and packages that the user names on thi
 
 import importlib
 import importlib.metadata
+import traceback
+from pathlib import Path
 from types import ModuleType
 
-from playground.errors import ConfigError, nearest
+from playground.errors import ConfigError, PlaygroundError, nearest
+from playground.text import first_line
 
 ENTRY_POINTS = "playground.tasks"
 _THIS = "playground"
@@ -60,13 +63,20 @@ def trusted_object(key: str, spec: object) -> object:
 
 
 def named_module(key: str, spec: object, name: str) -> ModuleType:
-  """Imports the module `name` of `<key>=<spec>`; raises ConfigError if there is none."""
+  """Imports the module `name` of `<key>=<spec>`; raises ConfigError if there is none, or importing it fails."""
   try:
     return importlib.import_module(name)
-  except ModuleNotFoundError as error:
-    if not f"{name}.".startswith(f"{error.name}."):  # the module is there, something that it needs is not
-      raise
-    raise ConfigError(f"{key}={spec}: there is no module {error.name} (installed, or on PYTHONPATH).") from None
+  except PlaygroundError:
+    raise
+  except Exception as error:  # of any type: it runs the module
+    if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+      raise ConfigError(f"{key}={spec}: there is no module {error.name} (installed, or on PYTHONPATH).") from None
+    frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    file, line = [frame for frame in frames if not frame[0].startswith("<frozen importlib")][-1]
+    if isinstance(error, SyntaxError) and error.filename:
+      file, line = error.filename, error.lineno
+    why = f"{type(error).__name__}: {getattr(error, 'msg', None) or first_line(error)}"
+    raise ConfigError(f"{key}={spec}: importing {name} fails in {Path(file).name}:{line}: {why}.") from error
 
 
 def _untrusted(key: str, spec: object, module: str) -> ConfigError:

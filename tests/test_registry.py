@@ -161,11 +161,20 @@ def test_a_task_that_cannot_be_imported(task: str, message: str):
 
 
 def test_an_import_error_inside_a_tasks_module_is_not_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-  (tmp_path / "needy_task.py").write_text("import surely_not_installed\n")
+  found = {
+    "import os\nimport surely_not_installed": "2: ModuleNotFoundError: No module named 'surely_not_installed'",
+    "\ndef broken(:": "2: SyntaxError: invalid syntax",
+    "import os\n\nos.nothing": "3: AttributeError: module 'os' has no attribute 'nothing'",
+  }
   monkeypatch.syspath_prepend(tmp_path)
-  monkeypatch.setattr(trust, "_named", {"needy_task"})
-  with pytest.raises(ModuleNotFoundError, match="surely_not_installed"):
-    registry.task_class("needy_task:Task")
+  for number, (text, why) in enumerate(found.items()):
+    name = f"needy_task_{number}"
+    (tmp_path / f"{name}.py").write_text(f"{text}\n")
+    monkeypatch.setattr(trust, "_named", {name})
+    with pytest.raises(ConfigError) as error:
+      registry.task_class(f"{name}:Task")
+    assert str(error.value) == f"env.task={name}:Task: importing {name} fails in {name}.py:{why}."
+    assert error.value.__cause__ is not None
 
 
 def test_domain_randomizer():
@@ -229,6 +238,43 @@ def test_terms_of_any_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
   env = built(override)
   assert (env.rewards.terms[-1].name, env.rewards.terms[-1].params) == ("mine", {"factor": 2})
   assert "reward/mine" in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
+
+
+@pytest.mark.parametrize(
+  ("method", "message"),
+  [
+    (
+      "def step(self, *args):\n    after = super().step(*args)\n    return after.replace(obs=after.obs[1:])",
+      "Wrong: obs of the state is float32[5] at the start of an episode, and float32[4] after a step: make",
+    ),
+    (
+      "def step(self, *args):\n    s = super().step(*args)\n    return s.replace(info={**s.info, 'age': s.done})",
+      "Wrong: info/age of the state is missing at the start of an episode, and float32[] after a step: make them the",
+    ),
+    (
+      "def action_to_ctrl(self, state, action):\n    return self.gain * action",
+      "env.task=wrong_task:Wrong: wrong_task.py:6: AttributeError: 'Wrong' object has no attribute 'gain'",
+    ),
+    (
+      "def action_to_ctrl(self, state, action):\n    return jnp.zeros(3)",
+      "Wrong.action_to_ctrl returns shape [3], and",
+    ),
+  ],
+)
+def test_mistakes_of_a_task_of_any_package_show_before_anything_is_compiled(
+  method: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+  begin = (
+    "import jax.numpy as jnp\nfrom playground.envs.dm_control.cartpole import Cartpole\n\nclass Wrong(Cartpole):\n"
+  )
+  (tmp_path / "wrong_task.py").write_text(f"{begin}  {method}\n")
+  monkeypatch.syspath_prepend(tmp_path)
+  monkeypatch.delitem(sys.modules, "wrong_task", raising=False)
+  monkeypatch.setattr(trust, "_named", {"wrong_task"})
+  env = registry.build(config_dict({**registry.config("CartpoleBalance").to_dict(), "task": "wrong_task:Wrong"}))
+  with pytest.raises(ConfigError) as error:
+    env.trace()
+  assert str(error.value).startswith(message)
 
 
 def test_a_task_of_any_package_limits_its_own_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

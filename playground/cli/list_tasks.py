@@ -42,13 +42,12 @@ def list_tasks(names: Iterable[str], filters: Mapping[str, str | None], as_json:
   if as_json:
     print(json.dumps(rows, indent=1))
     return 0
-  console = wide_console()
-  console.print(_table(rows))
+  wide_console().print(_table(rows))
   for row in rows:
     if "error" in row:
-      console.print(f"{row['task']}: {row['error']}", soft_wrap=True, markup=False, highlight=False)
+      print(f"{row['task']}: {row['error']}")
   count = f"{len(rows)} task{'s' * (len(rows) != 1)}"
-  console.print(f"{count}. Train one with playground train env=<task>.", soft_wrap=True)
+  print(f"{count}. Train one with playground train env=<task>.")
   return 0
 
 

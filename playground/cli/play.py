@@ -7,11 +7,12 @@ from pathlib import Path
 
 import jax
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from playground import config as configs
 from playground import registry
-from playground.cli.eval import described, save
+from playground.cli.eval import described, render, save
 from playground.cli.header import of_events_that_are_off
 from playground.deploy.contract import Contract
 from playground.deploy.menu import Menu
@@ -28,8 +29,7 @@ from playground.hardware.setup import setup, this_machine
 from playground.learning.checkpoints import of_a_better_one
 from playground.learning.evaluation import make_evaluator
 from playground.randomization import Randomizer
-from playground.rendering.video import need_camera, need_place, render_video
-from playground.runs.callbacks import episodes_of
+from playground.rendering.video import need_camera, need_place
 from playground.runs.csv_tracker import OTHER_RETURNS
 from playground.runs.loaded_policy import LoadedPolicy
 from playground.text import first_line
@@ -79,7 +79,6 @@ def play(
     PlaygroundError: no such run, policy or camera, no display for the viewer, no port for the browser, or a task
       without startup events to randomise by.
   """
-  console = Console()
   film = need_place(video, camera)
   if viewer:
     from playground.deploy.viewer import need_display
@@ -95,7 +94,7 @@ def play(
     opened = open_policy(path, overrides, interval_events, model_seed)
     if not randomize and (drawn := [text for text in overrides if text.startswith("randomization=")]):
       what = "the model is the nominal one, so that only events of mode reset act; --randomize draws it."
-      console.print(f"{drawn[-1]}: {what}", soft_wrap=True, markup=False, highlight=False)
+      print(f"{drawn[-1]}: {what}")
   else:
     _set_up_cpu()
     config = configs.compose(configs.of_task(path, overrides))
@@ -108,7 +107,7 @@ def play(
   unlike = [] if randomize else Randomizer(env.mj_model, events, impl=env.impl, in_c=True).without_nominal()
   unlike = [f"{sentence} --randomize plays on models like those of training." for sentence in unlike]
   for sentence in (*better, *of_events_that_are_off(env.config, overrides), *unlike):
-    console.print(sentence, soft_wrap=True, markup=False, highlight=False)
+    print(sentence)
   need_camera(env.mj_model, camera, "--camera")
   if film and camera is None and opened.trained:
     camera = opened.trained.config.video.camera
@@ -116,37 +115,29 @@ def play(
   if viewer:
     from playground.deploy.viewer import view
 
-    view(env, exported, seed, console)
+    view(env, exported, seed)
     return 0
   if web:
     from playground.deploy.web.server import watch
 
     given = Path(path).expanduser().absolute()
-    menu = _menu(given, opened.trained, console) if opened.trained else None
+    menu = _menu(given, opened.trained) if opened.trained else None
     following = None if given.parent.name == "checkpoints" else LATEST
-    watch(Session(env, exported, seed, menu, following, model_seed), host, port, console)
+    watch(Session(env, exported, seed, menu, following, model_seed), host, port)
     return 0
   models = draw_models(env, exported.contract["task"], episodes, seed) if randomize else {}
   scores, recording = measure(exported, env, episodes, seed, 1 if film else 0, models)
-  console.print(_table(exported.contract, agent, episodes, scores, overrides, randomize))
+  Console().print(_table(exported.contract, agent, episodes, scores, overrides, randomize))
   if opened.folder is not None:
     steps = exported.contract["origin"]["steps"]
     out = opened.folder / result_name(steps, seed, episodes, interval_events, overrides, randomize)
     result = result_of(exported, scores, episodes, seed, interval_events, overrides, randomize)
     run = opened.trained.run_dir.path if opened.trained else None
-    save(out, result, console, run)
+    save(out, result, run)
   if film:
     filmed = copy.copy(env.mj_model)
     set_fields(filmed, {name: values[0] for name, values in models.items()})
-    console.print(f"rendering {film}", soft_wrap=True, highlight=False, markup=False)
-    render_video(
-      filmed,
-      out_path=film,
-      dt=env.dt * env.action_repeat,
-      camera=camera,
-      notify=console.print,
-      **episodes_of(recording, 1),
-    )
+    render(film, filmed, env, camera, recording)
   return 0
 
 
@@ -225,10 +216,10 @@ def _task_of(
   return env
 
 
-def _menu(given: Path, trained: LoadedPolicy, console: Console) -> Menu:
+def _menu(given: Path, trained: LoadedPolicy) -> Menu:
   """Returns the checkpoints of the run at or above `given`, or of all stages of a chain."""
   run = trained.run_dir.path
-  return Menu(given if given == run.parent else run, trained, lambda message: console.print(message, soft_wrap=True))
+  return Menu(given if given == run.parent else run, trained, lambda message: print(message, flush=True))
 
 
 def _table(
@@ -239,7 +230,7 @@ def _table(
   origin = contract["origin"]
   trained = origin["evaluation"]
   title = f"{contract['task']}, {origin['steps']:,} steps trained{described(overrides)}"
-  table = Table("per episode", title=title)
+  table = Table("per episode", title=escape(title))
   table.add_column("C MuJoCo", justify="right")
   model = "randomised models" if randomized else "nominal model"
   acts = f"{agent} actions" if agent else "mode of the policy"

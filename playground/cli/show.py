@@ -63,14 +63,12 @@ def show(task: str, overrides: Sequence[str], *, views: str | None = None, num_v
 
 def describe(config: RunConfig, env: "Env") -> Iterator[RenderableType]:
   """Yields tables: sizes and rates, observations, rewards, terminations, commands, events, hyperparameters."""
-  import jax
-
   from playground.randomization import Randomizer
 
   section, choices = config.resolved["env"], config.choices
   # An event without a target raises before the first table.
   Randomizer(env.mj_model, config.env.get("events") or {}, impl=env.impl)
-  metrics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).metrics
+  metrics = env.trace().metrics
   yield _facts(choices["env"], _facts_of(env, section, choices))
   yield _table("observations", list(_observations(env)))
   yield _table("rewards", list(_rewards(env, metrics)))

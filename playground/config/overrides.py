@@ -162,6 +162,7 @@ def _check_option(group: str, option: object, roots: Sequence[Path]) -> None:
   shown = listed_options(group, roots)
   command = "playground list" if group == "env" else f"playground keys {group}"
   allowed = ", ".join(shown) if len(shown) <= 12 else f"the {len(shown)} that `{command}` shows"
+  allowed += ", or install the package that has it" * (group == "env")
   elsewhere = [f"{other}={option}" for other in ("experiment", "env", "robot") if option in options(other, roots)]
   alike = known if "/" in str(option) else shown  # v020/<Task> is not listed
   near = f" Did you mean {elsewhere[0]}?" if elsewhere else nearest(str(option), alike)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from rich.console import Console
 
 from playground.deploy.contract import Contract, read_contract
 from playground.deploy.policy import ExportedPolicy
@@ -59,13 +58,10 @@ def export_run(path: str, *, out: str | None = None) -> int:
   write_text(folder / "policy.yaml", _yaml(exported.contract))
   with replacing(folder / "policy.onnx") as temporary:
     temporary.write_bytes(exported.model)
-  console = Console()
   for sentence in of_a_better_one(path, trained.checkpoint):
-    console.print(sentence, soft_wrap=True, markup=False, highlight=False)
-  console.print(
-    _summary(exported.contract, len(actions), error, 1e6 * exported.latency(obs)), soft_wrap=True, markup=False
-  )
-  console.print(f"written to {folder / 'policy.onnx'} and policy.yaml", soft_wrap=True, markup=False)
+    print(sentence)
+  print(_summary(exported.contract, len(actions), error, 1e6 * exported.latency(obs)))
+  print(f"written to {folder / 'policy.onnx'} and policy.yaml")
   return 0
 
 

@@ -8,7 +8,6 @@ import time
 import warnings
 
 import numpy as np
-from rich.console import Console
 
 from playground.deploy.player import STEP, Player
 from playground.deploy.policy import ActingPolicy
@@ -52,7 +51,7 @@ def _opens_a_window() -> bool:
       glfw.terminate()
 
 
-def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
+def view(env: Env, exported: ActingPolicy, seed: int) -> None:
   """Shows a policy in real time until its window is closed, or until ctrl+c."""
   import mujoco.viewer
 
@@ -70,9 +69,9 @@ def view(env: Env, exported: ActingPolicy, seed: int, console: Console) -> None:
       component, sign = _STEERING[key]
       player.command = np.zeros(3) if player.command is None else player.command.copy()
       player.command[component] += sign * STEP
-      console.print(f"command {np.round(player.command, 1).tolist()}")
+      print(f"command {np.round(player.command, 1).tolist()}", flush=True)
 
-  console.print(_HELP, soft_wrap=True)
+  print(_HELP, flush=True)
   others = set(threading.enumerate())
   with noted_signals() as ended, mujoco.viewer.launch_passive(env.mj_model, data, key_callback=keys.put) as window:
     with window.lock():

@@ -14,15 +14,17 @@ from flax import struct
 from ml_collections import ConfigDict
 
 from playground.envs.options import auto_impl, uses_vision
-from playground.errors import ConfigError
+from playground.errors import ConfigError, PlaygroundError
 from playground.mdp.traced import traced_settings
 from playground.physics.backend import DERIVED_FIELDS, Physics, PhysicsData, mjx
 from playground.physics.warp_kernels import quiet_warp
 from playground.settings import Section, config_dict
+from playground.text import first_line, line_of
 
 Observation = jax.Array | dict[str, jax.Array]
 PIXELS = "pixels/"  # prefix of image groups of an observation: [height, width, channels] uint8
 T = TypeVar("T", bound=jax.Array | np.ndarray | int | tuple[int, ...])
+EnvT = TypeVar("EnvT", bound="Env")
 
 
 def observation_groups(obs: T | Mapping[str, T]) -> Mapping[str, T]:
@@ -204,10 +206,38 @@ class Env(abc.ABC):
   @property
   def observation_size(self) -> int | dict[str, tuple[int, ...]]:
     """Length of the observation vector, or the shape of each entry of a dict observation."""
-    shapes = copy.copy(self)
-    shapes.physics = self.physics.without_dynamics()
-    obs = jax.eval_shape(shapes.reset, jax.random.PRNGKey(0)).obs
+    still = _without_dynamics(self)
+    obs = jax.eval_shape(still.reset, jax.random.PRNGKey(0)).obs
     return {k: v.shape for k, v in obs.items()} if isinstance(obs, Mapping) else obs.shape[-1]
+
+  def trace(self) -> State:
+    """Returns shapes and types of an episode's first state, and runs the task's Python up to the second one.
+
+    Raises:
+      ConfigError: an observation, metric or entry of `info` of the second state has another shape or type; or an error
+        of a term, or of the code of a task of another package.
+    """
+    still = _without_dynamics(self)
+    try:
+      first = jax.eval_shape(still.reset, jax.random.PRNGKey(0))
+      second = jax.eval_shape(still.step, first, jax.ShapeDtypeStruct((self.action_size,), jnp.float32))
+    except PlaygroundError:
+      raise
+    except Exception as error:
+      if (module := type(self).__module__).startswith("playground."):
+        raise
+      why = f"{line_of(error, module)}{type(error).__name__}: {first_line(error)}"
+      raise ConfigError(f"env.task={module}:{type(self).__name__}: {why}") from error
+    old, new = (
+      {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in jax.tree.leaves_with_path(parts)}
+      for parts in ({"obs": state.obs, "metrics": state.metrics, "info": state.info} for state in (first, second))
+    )
+    describe = lambda leaf: f"{leaf.dtype}{list(leaf.shape)}" if leaf is not None else "missing"
+    for name in {**old, **new}:
+      if (was := describe(old.get(name))) != (then := describe(new.get(name))):
+        where = f"{type(self).__name__}: {name} of the state is {was} at the start of an episode"
+        raise ConfigError(f"{where}, and {then} after a step: make them the same.")
+    return first
 
   @property
   def observation_parts(self) -> dict[str, dict[str, int]]:
@@ -232,6 +262,13 @@ class Env(abc.ABC):
   @property
   def unwrapped(self) -> "Env":
     return self
+
+
+def _without_dynamics(env: EnvT) -> EnvT:
+  """Returns the same task where nothing moves."""
+  other = copy.copy(env)
+  other.physics = env.physics.without_dynamics()
+  return other
 
 
 def _build(cls: Callable[[ConfigDict], Env], config: Section) -> Env:

@@ -191,11 +191,14 @@ class CheckpointStore:
       pending.result()
 
   def close(self) -> None:
-    self.wait()
-    self._thread.shutdown()
-    self._manager.close()
-    self._alias.remove()
-    os.close(self._handle)
+    """Waits for the save, and frees what the store holds; raises the error of a save that has failed."""
+    try:
+      self.wait()
+    finally:
+      self._thread.shutdown()
+      self._manager.close()
+      self._alias.remove()
+      os.close(self._handle)
 
   def _write(self, step: int, policy: PyTree, state: PyTree, meta: dict[str, Plain], replay: np.ndarray | None) -> None:
     trees = {"policy": policy, "state": state} | ({} if replay is None else {"replay": replay})

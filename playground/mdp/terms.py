@@ -21,21 +21,19 @@ import functools
 import importlib
 import inspect
 import re
-import sys
-import traceback
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from playground.errors import ConfigError, UnknownNameError, nearest
+from playground.errors import ConfigError, PlaygroundError, UnknownNameError, nearest
+from playground.mdp.context import Robot
 from playground.mdp.options import OPTIONS, is_model_field, keys
 from playground.moved import renamed_function
 from playground.settings import below, members, problem
-from playground.text import first_line, format_value
+from playground.text import first_line, format_value, line_of
 from playground.trust import trusted_object
 
 # Modules whose public functions and classes are the registered terms of a kind.
@@ -97,8 +95,7 @@ class Term(NamedTuple):
   def reading(self, *args: Any) -> Iterator[None]:
     """Raises ConfigError, with the term's key, if it reads an attribute that task, robot or context in `args` lack.
 
-    So do arrays whose sizes do not match, in a term of this package, and Python's `if` or NumPy on values of the step,
-    in another's, whose other errors get the key as a note.
+    So do arrays whose sizes do not match, in a term of this package, and all errors in another's.
     """
     try:
       yield
@@ -113,12 +110,16 @@ class Term(NamedTuple):
       parts = [part for arg in args for part in (arg, getattr(arg, "env", arg), getattr(arg, "robot", arg))]
       if isinstance(error, AttributeError) and any(error.obj is part for part in parts):
         near = "" if ours else nearest(str(error.name), dir(error.obj))
+        if hasattr(Robot, str(error.name)) and not near:
+          near = f" It has a {type(error.obj).__name__}, and no {Robot.__module__}.Robot, as its robot."
         raise ConfigError(f"{self.key} needs {error.name!r}, which this task does not have.{near}") from error
       if ours and type(error) in (TypeError, ValueError):
         raise ConfigError(f"{self.key} does not fit this task: {first_line(error)}.") from error
-      if not ours and isinstance(error, jax.errors.JAXTypeError):
-        instead = "write jnp.where in place of `if`, and jnp in place of np and float()."
-        raise ConfigError(f"{self.key}: {_line(self.func, error)}{instead}") from error
+      if not ours and not isinstance(error, PlaygroundError):
+        why = f"{type(error).__name__}: {first_line(error)}"
+        if isinstance(error, jax.errors.JAXTypeError):
+          why = "write jnp.where in place of `if`, and jnp in place of np and float()."
+        raise ConfigError(f"{self.key}: {line_of(error, self.func.__module__)}{why}") from error
       error.add_note(f"in {self.key}")
       raise
 
@@ -143,13 +144,6 @@ class Term(NamedTuple):
     for name, value in params.items() if instance is not None else ():
       setattr(instance, name, value)
     return self._replace(params=self.params | params, options=self.options._replace(**options), instance=instance)
-
-
-def _line(func: object, error: Exception) -> str:
-  """Returns 'file:line: ' of the innermost call in a function's module that an error went through, '' without one."""
-  file = getattr(sys.modules.get(func.__module__), "__file__", None)
-  lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-  return f"{Path(file).name}:{lines[-1]}: " if file and lines else ""
 
 
 @functools.cache

@@ -151,9 +151,10 @@ class Physics:
     self._buffers = buffers
 
   def without_dynamics(self) -> "Physics":
-    """Returns the same with a `forward` that computes nothing: `jax.eval_shape` takes a fraction of the time."""
+    """Returns the same where nothing moves: `jax.eval_shape` takes a fraction of the time."""
     still = copy.copy(self)
     still._forward = lambda model, data: data
+    still.step = lambda model, data, ctrl, num_substeps: data.replace(ctrl=ctrl)
     return still
 
   def compile_ahead(self) -> KernelBuild | None:

@@ -1,5 +1,6 @@
 """Writes metrics, checkpoints and videos of one run, and its result at the end."""
 
+import contextlib
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -179,13 +180,12 @@ class RunCallbacks:
     """Ends what is being written, and videos and trackers, once; the default status is that of a run that failed."""
     if not self._closed:
       self._closed = True
-      if self._trace == "on":  # the run ended while it was traced
-        jax.profiler.stop_trace()
-      try:
-        self._store.close()
-      finally:
-        self._videos.shutdown(cancel_futures=True)
-        self._trackers.close(status)
+      with contextlib.ExitStack() as closing:  # all of them, from the last to the first, whatever one raises
+        closing.callback(self._trackers.close, status)
+        closing.callback(self._videos.shutdown, cancel_futures=True)
+        closing.callback(self._store.close)
+        if self._trace == "on":  # the run ended while it was traced
+          jax.profiler.stop_trace()
 
   def _scores(self) -> dict[str, float | None]:
     """Returns the result from metrics.csv, which covers all starts of the run, and the best checkpoint."""

@@ -162,6 +162,7 @@ def prepare(
   agent = config.agent
   agent.check(1 if together else hardware.mesh.size)
   env = registry.load(config.choices["env"], config=config.env)
+  env.trace()  # raises before there is a folder
   drawn = drawn_model(env, config.video.visuals)
   need_camera(drawn, config.video.camera, "video.camera")
   settings = [trainer_settings(each.agent, env.settings_of(each.env)) for each in configs]

@@ -55,7 +55,6 @@ class LocalLauncher:
     """See `runner.Launcher`; `slots` replace those of `config` on this machine."""
     with sweep.in_cwd():
       self.check(config, sweep.jobs)
-    self._mps = MultiProcessService(sweep.path) if config.mps else None
     cores = sorted(os.sched_getaffinity(0))
     self.slots = slots or make_slots(visible_gpus()[: config.gpus], config.slots_per_gpu, cores, config.cores_per_job)
     self._sweep = sweep
@@ -68,6 +67,7 @@ class LocalLauncher:
       if folder.locked():
         numbers = folder.record.get("slots", [])
         self._taken[job.name] = [slot for slot in self.slots if slot.number in numbers]
+    self._mps = MultiProcessService(sweep.path) if config.mps else None  # last: it is a process, which `kill` ends
 
   @staticmethod
   def check(config: LocalConfig, jobs: Sequence[Job]) -> None:

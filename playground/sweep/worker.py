@@ -181,7 +181,11 @@ class Worker:
 
   def _outcome(self, folder: JobFolder, code: int, why: str) -> tuple[str, str]:
     """Returns a job's status and its reason, in words."""
-    run = folder.run.status if folder.run.status != self._before[folder] else {}  # else of an earlier start
+    try:
+      status = folder.run.status
+    except CheckpointError as error:  # status.json is damaged
+      return "failed", str(error)
+    run = status if status != self._before[folder] else {}  # else of an earlier start
     if run.get("status") == "finished" or (code == 0 and len(self._records) == 1):
       return "finished", ""
     if run.get("status") == "failed" and run.get("reason"):  # before it was asked to stop, or while it saved

@@ -83,6 +83,14 @@ def test_other_values_of_the_task(
   assert json.loads(file.read_text())["overrides"] == ["env.sim_dt=0.005"]
 
 
+def test_brackets_in_a_title_are_no_markup(
+  command: Command, trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+  monkeypatch.setattr(eval_command, "described", lambda overrides: ", [push] [/x]")
+  assert command(str(trained)) == 0
+  assert "[push] [/x]" in capsys.readouterr().out
+
+
 def test_what_the_paper_measured_on_a_real_robot_stands_beside(
   command: Command, trained: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
+from playground.cli import eval as eval_command
 from playground.cli import play
 from playground.cli.main import main
 from playground.deploy import export
@@ -108,7 +109,7 @@ def test_play_on_randomised_models(
   measure = play.measure
   monkeypatch.setattr(play, "measure", lambda *args: (drawn.append(args[-1]), measure(*args))[1])
   films: list[Any] = []
-  monkeypatch.setattr(play, "render_video", lambda model, **_: films.append(model))
+  monkeypatch.setattr(eval_command, "render_video", lambda model, **_: films.append(model))
   assert command("play", str(run), "--episodes", "3", "--randomize", "--video", str(tmp_path / "a.mp4"), event) == 0
   assert "mean of 3 episodes, randomised models" in " ".join(capsys.readouterr().out.split())
   (masses,) = (np.asarray(models["body_mass"]) for models in drawn)
@@ -266,7 +267,8 @@ def test_a_video_by_the_camera_that_is_named(
   command: Command, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
   filmed: list[Any] = []
-  monkeypatch.setattr(play, "render_video", lambda model, **view: filmed.append((view["out_path"], view["camera"])))
+  film = lambda model, **view: filmed.append((view["out_path"], view["camera"]))
+  monkeypatch.setattr(eval_command, "render_video", film)
   monkeypatch.setenv("HOME", str(tmp_path))
   video = ["--episodes", "1", "--video=~/new/a.mp4"]
   assert command("play", str(run), *video, "--camera", "lookatcart") == 0

@@ -14,7 +14,6 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 import pytest
-from rich.console import Console
 
 from playground.deploy.player import Player
 from playground.deploy.viewer import view
@@ -123,7 +122,7 @@ def test_the_viewer_shows_the_policy(
 
   monkeypatch.setattr(mujoco.viewer, "launch_passive", window)
   full: Any = SimpleNamespace(actions=lambda obs: np.ones(env.action_size))
-  view(env, full, 0, Console(quiet=True))
+  view(env, full, 0)
   assert not drawing.is_alive()
   assert len(shown) == 3 and not np.array_equal(shown[0], shown[2])
   assert followed or shown[0][0] < shown[1][0] < shown[2][0]  # the cart drives off

@@ -296,6 +296,9 @@ def test_what_cannot_be_written_is_raised(tmp_path: Path) -> None:
   store.save(10, POLICY, STATE, {"bad": object()})
   with pytest.raises(TypeError):
     store.close()
+  opened = {os.path.realpath(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd")}
+  assert str(tmp_path / "checkpoints") not in opened
+  assert not any(thread.name.startswith("checkpoint") for thread in threading.enumerate())
 
 
 def test_a_save_that_failed_is_raised_before_the_next_one(tmp_path: Path) -> None:

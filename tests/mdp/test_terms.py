@@ -1,12 +1,13 @@
 """Terms of a config: the functions that they name, what they may say, and those of the shipped tasks."""
 
+import copy
 import functools
 import inspect
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -237,11 +238,13 @@ def test_an_error_inside_a_term_is_its_own() -> None:
   (term,) = rewards({"joint_vel_l2": {"weight": 1.0}})
   with pytest.raises(ConfigError, match=r"env\.rewards\.joint_vel_l2 needs 'joint_vel', which this task does not have"):
     term(SimpleNamespace())
-  with pytest.raises(AttributeError, match="shape"):
+  with pytest.raises(
+    ConfigError, match=r"joint_vel_l2: test_terms\.py:\d+: AttributeError: 'list' .* attribute 'shape'$"
+  ):
     term._replace(func=lambda c: [].shape)(SimpleNamespace())  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_sizes_that_do_not_fit_are_an_error_of_the_config_in_our_terms_only() -> None:
+def test_sizes_that_do_not_fit_are_an_error_of_the_config() -> None:
   c = context(data={"actuator_force": jnp.zeros(3)})  # of two joints
   (term,) = rewards({"power": {"func": "joint_power_l1", "weight": 1.0}})
   with pytest.raises(ConfigError, match=r"^env\.rewards\.power does not fit this task: .*\(2,\).*\(3,\)\.$") as raised:
@@ -251,7 +254,9 @@ def test_sizes_that_do_not_fit_are_an_error_of_the_config_in_our_terms_only() ->
   (ending,) = rewards({"is_terminated": {"weight": 1.0}})
   c.env.terminations.any = theirs  # pyright: ignore[reportAttributeAccessIssue]
   for func in (theirs, ending):
-    with pytest.raises(TypeError, match="incompatible shapes"):
+    with pytest.raises(
+      ConfigError, match=r"^env\.rewards\.power: test_terms\.py:\d+: TypeError: .*incompatible shapes"
+    ):
       func(c)
 
 
@@ -359,11 +364,38 @@ def test_what_a_function_of_another_package_does_wrong(func: Any, message: str, 
     jax.eval_shape(at, arm.data.qpos)
 
 
-def test_another_error_of_a_function_of_another_package_has_the_terms_key_as_a_note(arm: ArmContext) -> None:
+def test_another_error_of_a_function_of_another_package_is_one_sentence_with_its_place(arm: ArmContext) -> None:
   term = bind("rewards", {"action_rate_l2": {"weight": 1.0}})[0]._replace(func=lambda c: c.action / {}["missing"])
+  with pytest.raises(
+    ConfigError, match=r"^env\.rewards\.action_rate_l2: test_terms\.py:\d+: KeyError: 'missing'$"
+  ) as error:
+    term(arm)
+  assert isinstance(error.value.__cause__, KeyError)
+
+
+def test_a_bug_of_our_own_has_the_terms_key_as_a_note(arm: ArmContext) -> None:
+  def ours(c: ArmContext) -> Any:
+    return c.action / {}["missing"]
+
+  ours.__module__ = "playground.mdp.rewards"
+  term = bind("rewards", {"action_rate_l2": {"weight": 1.0}})[0]._replace(func=ours)
   with pytest.raises(KeyError, match="missing") as error:
     term(arm)
   assert error.value.__notes__ == ["in env.rewards.action_rate_l2"]
+
+
+def test_a_task_whose_robot_is_of_another_type(arm: ArmContext) -> None:
+  class Cart(NamedTuple):
+    qpos: slice = slice(0, 1)
+
+  other = copy.copy(arm)
+  other.robot = Cart()
+  term = bind("rewards", {"action_rate_l2": {"weight": 1.0}})[0]._replace(func=lambda c: c.sensor("gyro"))
+  said = (
+    r"needs 'sensor', which this task does not have\. It has a Cart, and no playground\.mdp\.context\.Robot, as its"
+  )
+  with pytest.raises(ConfigError, match=rf"^env\.rewards\.action_rate_l2 {said} robot\.$"):
+    term(other)
 
 
 def test_nothing_is_registered_that_cannot_be_a_term_of_its_kind() -> None:

@@ -585,6 +585,18 @@ def test_a_camera_that_is_not_there(
   assert not (tmp_path / "run").exists()
 
 
+def test_a_mistake_in_a_term_shows_before_there_is_a_folder(
+  tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+  (tmp_path / "my_terms.py").write_text("def mine(c):\n  return open('/missing/file').read()\n")
+  monkeypatch.syspath_prepend(tmp_path)
+  monkeypatch.setattr(train_module, "compile_program", pytest.fail)
+  override = "env.rewards.mine={func: 'my_terms:mine', weight: 1}"
+  sentence = refused(*TASK, override, "trust=my_terms", f"run_dir={tmp_path / 'run'}")
+  assert "env.rewards.mine: my_terms.py:2: FileNotFoundError: [Errno 2] No such file or directory:" in sentence
+  assert not (tmp_path / "run").exists()
+
+
 # Starting from weights
 
 

@@ -59,7 +59,8 @@ def used_memory(rows: Rows, seed: int | None = None) -> Iterator[None]:
   A thread queries the driver twice a second, so that memory outside JAX (Warp's arrays, compiled code) counts.
   """
   ask = lambda: float(_query_gpu("memory.used") or "nan")
-  before, most, ended = ask(), 0.0, threading.Event()
+  before = most = ask()
+  ended = threading.Event()
 
   def watch() -> None:
     nonlocal most

@@ -2,8 +2,6 @@
 
 import time
 
-from rich.console import Console
-
 from playground.deploy.session import Session
 from playground.deploy.web.gate import Gate, need_port
 from playground.deploy.web.panel import Panel
@@ -55,12 +53,12 @@ class Watch:
     self._gate.close()
 
 
-def watch(session: Session, host: str, port: int, console: Console) -> None:
+def watch(session: Session, host: str, port: int) -> None:
   """Serves a session until it is interrupted."""
   with noted_signals() as ended:
     watching = Watch(session, host, port)
     try:
-      console.print(f"Watch it at {watching.url} (ctrl+c here ends it).", soft_wrap=True)
+      print(f"Watch it at {watching.url} (ctrl+c here ends it).", flush=True)
       while not ended.is_set():
         watching.frame()
     finally:

@@ -62,3 +62,8 @@ def test_used_memory_is_the_most_beyond_what_was_there(monkeypatch: pytest.Monke
   with machine.used_memory(Rows()):
     assert enough.wait(10)
   assert found == {"used_memory_gib": 3.0}
+  monkeypatch.setattr(machine, "_query_gpu", lambda field: "1024")
+  monkeypatch.setattr(machine, "INTERVAL_S", 60)
+  with machine.used_memory(Rows()):
+    pass
+  assert found == {"used_memory_gib": 0.0}, "a block that ends before the first query"

@@ -1,4 +1,4 @@
-"""A reward, an observation and an event for robots on legs."""
+"""A reward, an observation, a termination and an event for robots on legs."""
 
 import dataclasses
 from typing import Any
@@ -21,6 +21,11 @@ def roll_pitch(c: LeggedContext) -> jax.Array:
   """Roll and pitch of the base, rad [2]."""
   x, y, z = -c.gravity
   return jnp.array([jnp.arctan2(y, z), jnp.arctan2(-x, jnp.sqrt(y**2 + z**2))])
+
+
+def too_low(c: LeggedContext, height: Positive) -> jax.Array:
+  """Whether the base site is below `height`, m."""
+  return c.base_height < height
 
 
 @dataclasses.dataclass
