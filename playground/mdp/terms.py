@@ -110,7 +110,8 @@ class Term(NamedTuple):
       parts = [part for arg in args for part in (arg, getattr(arg, "env", arg), getattr(arg, "robot", arg))]
       if isinstance(error, AttributeError) and any(error.obj is part for part in parts):
         near = "" if ours else nearest(str(error.name), dir(error.obj))
-        if hasattr(Robot, str(error.name)) and not near:
+        robots = [getattr(arg, "robot", None) for arg in args]
+        if any(error.obj is robot for robot in robots) and hasattr(Robot, str(error.name)):
           near = f" It has a {type(error.obj).__name__}, and no {Robot.__module__}.Robot, as its robot."
         raise ConfigError(f"{self.key} needs {error.name!r}, which this task does not have.{near}") from error
       if ours and type(error) in (TypeError, ValueError):

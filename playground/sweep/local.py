@@ -67,7 +67,7 @@ class LocalLauncher:
       if folder.locked():
         numbers = folder.record.get("slots", [])
         self._taken[job.name] = [slot for slot in self.slots if slot.number in numbers]
-    self._mps = MultiProcessService(sweep.path) if config.mps else None  # last: it is a process, which `kill` ends
+    self._mps = MultiProcessService(sweep.path) if config.mps else None  # last: `close` ends it
 
   @staticmethod
   def check(config: LocalConfig, jobs: Sequence[Job]) -> None:

@@ -396,6 +396,10 @@ def test_a_task_whose_robot_is_of_another_type(arm: ArmContext) -> None:
   )
   with pytest.raises(ConfigError, match=rf"^env\.rewards\.action_rate_l2 {said} robot\.$"):
     term(other)
+  with pytest.raises(
+    ConfigError, match=r"^env\.rewards\.action_rate_l2 needs 'rows', which this task does not have\.$"
+  ):
+    term._replace(func=lambda c: c.rows)(other)  # of the step, which has a robot
 
 
 def test_nothing_is_registered_that_cannot_be_a_term_of_its_kind() -> None:
