@@ -137,10 +137,11 @@ def _stage_of(row: dict[str, str]) -> str:
 
 
 def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]:
-  """Returns our runs of a task with the agent, setting, backend and steps of the highest mean of `reached_return`.
+  """Returns our runs of a task with the agent, setting and backend of the highest mean of `reached_return`.
 
-  Runs of fewer than three seeds count only if there are no others. Of several within 2 % of the highest, those with the
-  most seeds count. A chain counts by its last stage. Runs without pushes count only if there are no others.
+  Runs of fewer than three seeds count only if there are no others. Of runs that differ only in their number of steps
+  the longest count, as the others were stopped; of several within 2 % of the highest, those with the most seeds. A
+  chain counts by its last stage. Runs without pushes count only if there are no others.
   """
   ours = our_runs(rows, task)
   groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
@@ -148,9 +149,11 @@ def best_runs(rows: Sequence[dict[str, str]], task: str) -> list[dict[str, str]]
     groups.setdefault((row["agent"], row["setting"], row["backend"], row["steps"]), []).append(row)
   mean = lambda runs: fmean(by_seed(runs, reached_return))
   seeds = lambda runs: len({row["seed"] for row in runs})
-  found = [runs for runs in groups.values() if seeds(runs) >= _SEEDS] or list(groups.values())
-  highest = max(map(mean, found), default=0.0)
-  close = [runs for runs in found if mean(runs) >= highest - 0.02 * abs(highest)]
+  by_steps = sorted(groups.values(), key=lambda runs: int(runs[0]["steps"]))
+  found = [runs for runs in by_steps if seeds(runs) >= _SEEDS] or by_steps
+  longest = {tuple(runs[0][key] for key in ("agent", "setting", "backend")): runs for runs in found}.values()
+  highest = max(map(mean, longest), default=0.0)
+  close = [runs for runs in longest if mean(runs) >= highest - 0.02 * abs(highest)]
   return max(close, key=lambda runs: (seeds(runs), mean(runs)), default=[])
 
 

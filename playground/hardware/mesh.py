@@ -88,7 +88,7 @@ def device_memory(mesh: Mesh) -> int | None:
   if mesh.devices.flat[0].platform == "cpu":
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // len(mesh.local_devices)
   limits = [(device.memory_stats() or {}).get("bytes_limit") for device in mesh.devices.flat]
-  known = [limit for limit in limits if limit is not None]
+  known = [limit for limit in limits if limit]  # CUDA's own pool, XLA_PYTHON_CLIENT_ALLOCATOR=cuda_async, says 0
   return min(known) if len(known) == len(limits) else None
 
 

@@ -43,6 +43,14 @@ def test_runs_of_three_seeds_count_before_a_lucky_one():
   assert best_runs(rows[:3], TASK) == rows[:1]
 
 
+def test_of_runs_that_were_stopped_the_longest_count():
+  ended = [(300, "5"), (290, "20"), (310, "10")]
+  rows = [run(value, seed=seed, steps=steps) for seed in "123" for value, steps in ended]
+  assert best_runs(rows, TASK) == rows[1::3]
+  assert best_runs(rows[:-2], TASK) == rows[::3], "two seeds are too few"
+  assert best_runs([*rows, run(320, agent="sac")], TASK) == rows[1::3]
+
+
 def test_a_chain_counts_by_its_last_stage():
   rows = [run(20, experiment="chain", setting="stage=a"), run(9, experiment="chain", setting="stage=b")]
   assert best_runs(rows, TASK) == rows[1:]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh
 
-from playground.hardware.mesh import compiler_options
+from playground.hardware.mesh import compiler_options, device_memory
 
 EMPTY = """
 import json
@@ -68,3 +68,17 @@ def test_kernels_run_at_the_same_time_where_that_is_faster(
   monkeypatch.setenv("XLA_FLAGS", flags)
   mesh = SimpleNamespace(size=devices, devices=np.array([SimpleNamespace(platform=platform)] * devices))
   assert compiler_options(cast(Mesh, mesh), impl) == options
+
+
+@pytest.mark.parametrize(
+  ("limits", "known"),
+  [
+    ([{"bytes_limit": 80}, {"bytes_limit": 40}], 40),
+    ([{"bytes_limit": 80}, {"bytes_limit": 0}], None),  # as with XLA_PYTHON_CLIENT_ALLOCATOR=cuda_async
+    ([{"bytes_limit": 80}, {}], None),
+    ([None], None),
+  ],
+)
+def test_memory_is_that_of_the_smallest_gpu_if_all_say(limits: list[dict[str, int] | None], known: int | None):
+  gpus = [SimpleNamespace(platform="gpu", memory_stats=lambda stats=stats: stats) for stats in limits]
+  assert device_memory(cast(Mesh, SimpleNamespace(devices=np.array(gpus)))) == known
