@@ -58,7 +58,9 @@ def setup(config: HardwareConfig) -> Hardware:
     )
   count = len(devices) if config.devices is None else config.devices
   if not 1 <= count <= len(devices):
-    raise HardwareError(f"hardware.devices={count}, but this machine has {len(devices)} ({devices[0].device_kind}).")
+    divide = f": JAX_NUM_CPU_DEVICES={count} divides the CPU" if devices[0].platform == "cpu" and count > 0 else ""
+    found = f"{len(devices)} ({devices[0].device_kind})"
+    raise HardwareError(f"hardware.devices={count}, but this machine has {found}{divide}.")
   if config.kind is not None and config.kind.lower() not in devices[0].device_kind.lower():
     raise HardwareError(
       f"hardware.kind={config.kind}, but this machine has {devices[0].device_kind}: hardware=gpu takes any GPU."

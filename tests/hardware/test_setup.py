@@ -151,7 +151,9 @@ def test_more_than_there_are_is_one_sentence() -> None:
   env = os.environ | WITHOUT_WARP | {"JAX_PLATFORMS": "cpu"}
   done = subprocess.run(command, capture_output=True, text=True, env=env, timeout=120)
   assert done.returncode == 2
-  assert done.stderr.splitlines()[-1] == "error: hardware.devices=2, but this machine has 1 (cpu)."
+  assert done.stderr.splitlines()[-1] == (
+    "error: hardware.devices=2, but this machine has 1 (cpu): JAX_NUM_CPU_DEVICES=2 divides the CPU."
+  )
 
 
 @pytest.mark.parametrize(
